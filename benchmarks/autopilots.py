@@ -1,17 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flies real autopilots in software and writes docs/evidence/autopilots-*.csv: gains, engagements, signs, pose, releases.
+"""Flies real autopilots in software and writes docs/evidence/autopilots-*.csv: gains, engagements,
+signs, pose, releases.
 
     python -m benchmarks.autopilots --sitl KIT                       # everything, about 80 minutes
-    python -m benchmarks.autopilots --sitl KIT --only signs          # one measurement; the others keep their figures
+    python -m benchmarks.autopilots --sitl KIT --only signs
+        # one measurement; the others keep their figures
 
-The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has the results and the runs.
+The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has the results and the
+runs.
 
-Age limits of y and u are 1 s, for the host. The identified gains fly the scenario that `identify` writes: pulses of 50 mrad/s
-in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V. The errors of PX4's airplane are those of y, with
-the low-pass of the map; the true errors are by the rates of the simulator. The time of a release begins with the release in the
-bridge's log, the time of any event beside a release with the event. The sticks act by RC_CHANNELS in the autopilot's log, each
-0.1 s; PX4's own law by nav_state.
+Age limits of y and u are 1 s, for the host. The identified gains fly the scenario that `identify`
+writes: pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s
+in V. The errors of PX4's airplane are those of y, with the low-pass of the map; the true errors are
+by the rates of the simulator. The time of a release begins with the release in the bridge's log,
+the time of any event beside a release with the event. The sticks act by RC_CHANNELS in the
+autopilot's log, each 0.1 s; PX4's own law by nav_state.
 """
 
 import argparse
@@ -61,15 +65,33 @@ PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
 PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
-"""s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of it at SIM_WIND_TURB 0.5."""
+"""s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of
+it at SIM_WIND_TURB 0.5."""
 STRONGER_ELEVATOR = 2.0  # `rise-di check` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
-TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+TURBULENCE = (
+    0.25,
+    0.5,
+    0.25,
+    0.5,
+    1.0,
+)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
 EXCITED = 35.0  # s, of an experiment on signs at least
 EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
 MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
-GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
-OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = 0.025, 0.5, 2  # s beyond the identified delay; SIM_WIND_TURB; flights
-FASTER, FASTER_THROTTLE = 25.3, (30.0, 85.0)  # m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
+GUIDED, EACH, SETTLED = (
+    300.0,
+    60.0,
+    45.0,
+)  # s: engaged under guidance, each turn, and from its command until it counts as held
+OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = (
+    0.025,
+    0.5,
+    2,
+)  # s beyond the identified delay; SIM_WIND_TURB; flights
+FASTER, FASTER_THROTTLE = (
+    25.3,
+    (30.0, 85.0),
+)  # m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
 TRUE = 1.049  # of true over equivalent airspeed at the kit's place
 WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
@@ -144,7 +166,10 @@ def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
     """The rms of the simulator's own rates less y_m while commanded, rad/s."""
     log = read_run(autopilot.run)
     (one,) = log.engagements or []
-    tape = replace(log.tape, signals={"y": truth.within([(one.start_ns, one.stop_ns or 2**62)]), "y_m": log.tape["y_m"]})
+    tape = replace(
+        log.tape,
+        signals={"y": truth.within([(one.start_ns, one.stop_ns or 2**62)]), "y_m": log.tape["y_m"]},
+    )
     events = transients(load_scenario(autopilot.run / "scenario.yaml"), log.tape)
     return {name: parts["command"].rms for name, parts in errors_by_part(tape, events).items()}
 
@@ -156,24 +181,46 @@ def identified(
     speed: float,
     log: Path | None,
 ) -> dict[str, Any]:
-    """Experiment, gains, flight, replay: the commands of docs/autopilots.md. The log is read on the ground.
+    """Experiment, gains, flight, replay: the commands of docs/autopilots.md. The log is read on the
+    ground.
 
     With the log of an experiment that this command flew before, there is no new one.
     """
     found, channel_map = place / "found", place / f"{Path(map_name).stem}.yaml"
-    command = ("identify", "--bridge", str(channel_map), "--speed", f"{speed:g}", "--write", str(found))
+    command = (
+        "identify",
+        "--bridge",
+        str(channel_map),
+        "--speed",
+        f"{speed:g}",
+        "--write",
+        str(found),
+    )
     if log is None:
         with flying() as autopilot:
             autopilot.patient_map(map_name)
             autopilot.experiment(*command)
-    read = _on_the_ground(*command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
+    read = _on_the_ground(
+        *command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json"
+    )
     if read.returncode:
         return {"refused": read.stderr}
     result = json.loads(read.stdout)
-    with flying() as autopilot, autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight:
+    with (
+        flying() as autopilot,
+        autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight,
+    ):
         flight.end(150.0)
-    kept = {key: result["controller"][key] for key in ("outputs", "k_g", "k_d", "Lambda", "delay", "lag")}
-    return {"controller": kept, "channels": result["channels"], "delay_margin": result["delay_margin"], **tracking(autopilot)}
+    kept = {
+        key: result["controller"][key]
+        for key in ("outputs", "k_g", "k_d", "Lambda", "delay", "lag")
+    }
+    return {
+        "controller": kept,
+        "channels": result["channels"],
+        "delay_margin": result["delay_margin"],
+        **tracking(autopilot),
+    }
 
 
 def _on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -183,15 +230,23 @@ def _on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def tracking(autopilot: "Autopilot") -> dict[str, Any]:
-    """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a limit, whether it replays."""
+    """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a
+    limit, whether it replays.
+    """
     summary, log = autopilot.summary(), read_run(autopilot.run)
     replayed = _on_the_ground("replay", str(autopilot.run)).returncode == 0
     return {
         "engaged": summary["engagements"],
         "outcome": summary["outcome"],
         "rms": {name: error["command"]["rms"] for name, error in summary["errors"].items()},
-        "behind": {name: behind(log.tape, name, span) for span in log.engagements or [] for name in log.tape["y"].names},
-        "limited": {name: values["limited"]["magnitude"] for name, values in summary["inputs"].items()},
+        "behind": {
+            name: behind(log.tape, name, span)
+            for span in log.engagements or []
+            for name in log.tape["y"].names
+        },
+        "limited": {
+            name: values["limited"]["magnitude"] for name, values in summary["inputs"].items()
+        },
         "replayed": replayed,
     }
 
@@ -199,16 +254,23 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
 def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     """The delay of y behind y_m with the smallest error, s."""
     y, y_m = tape["y"], tape["y_m"]
-    t = np.arange(engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100)
+    t = np.arange(
+        engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100
+    )
     measured = np.interp(t, y.stamp_ns, y[name])
-    errors = [float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name]))) for delay in DELAYS]
+    errors = [
+        float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name])))
+        for delay in DELAYS
+    ]
     return float(DELAYS[int(np.argmin(errors))])
 
 
 def own_log() -> dict[str, Any]:
-    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind: errors by its own log, and Omega by it.
+    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind: errors by its
+    own log, and Omega by it.
 
-    Each with gains of its own experiment. The autopilot's DataFlash log of the experiment is imported and identified too.
+    Each with gains of its own experiment. The autopilot's DataFlash log of the experiment is
+    imported and identified too.
     """
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
@@ -216,9 +278,18 @@ def own_log() -> dict[str, Any]:
     for name in ("ardupilot", "ardupilot_mavlink"):
         plane = ArduPlane(FOLDER / f"own_log_{name}")
         plane.throttle = FASTER_THROTTLE
-        with _flying(plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME):
-            narrower = ("    upper: 0.3\n", "    upper: 0.2\n")  # of the thrust, whose trim is 0.63 to 0.75 there
-            channel_map = plane.patient_map(name, narrower) if name == "ardupilot" else plane.mavlink_map(narrower)
+        with _flying(
+            plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME
+        ):
+            narrower = (
+                "    upper: 0.3\n",
+                "    upper: 0.2\n",
+            )  # of the thrust, whose trim is 0.63 to 0.75 there
+            channel_map = (
+                plane.patient_map(name, narrower)
+                if name == "ardupilot"
+                else plane.mavlink_map(narrower)
+            )
             found = plane.folder / "found"
             command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
             plane.experiment(*command, "--write", str(found)).succeed(300.0)
@@ -228,16 +299,22 @@ def own_log() -> dict[str, Any]:
             for wind, (speed, turbulence) in WINDS.items():
                 plane.say("param", "SIM_WIND_SPD", f"{speed:g}")
                 plane.say("param", "SIM_WIND_TURB", f"{turbulence:g}")
-                with plane.engaged(found / "scenario.yaml", str(found / "map.yaml"), 90.0) as flight:
+                with plane.engaged(
+                    found / "scenario.yaml", str(found / "map.yaml"), 90.0
+                ) as flight:
                     flight.end(150.0)
                 own = plane.own_errors(TRUE if name == "ardupilot" else 1.0)
-                results[name]["flights"][wind] = tracking(plane) | {"own": {channel: rms for channel, (rms, _) in own.items()}}
+                results[name]["flights"][wind] = tracking(plane) | {
+                    "own": {channel: rms for channel, (rms, _) in own.items()}
+                }
         results[name] |= imported_beside(command, log, run, plane.folder)
     return results
 
 
 def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -> dict[str, Any]:
-    """Omega by channel from the autopilot's own log of an experiment, beside that from the log of the stack."""
+    """Omega by channel from the autopilot's own log of an experiment, beside that from the log of
+    the stack.
+    """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
     done = _on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
@@ -245,37 +322,56 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
         return {"refused": done.stderr}
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
-        read = _on_the_ground(*command, str(source), "--write", str(place / f"of_{name}"), "--set", "accept", "--json")
+        read = _on_the_ground(
+            *command, str(source), "--write", str(place / f"of_{name}"), "--set", "accept", "--json"
+        )
         if read.returncode:
             return {"refused": f"{name}: {read.stderr}"}
         result = json.loads(read.stdout)
         Omega = np.array(result["channels"]["Omega"])
-        omega[name] = dict(zip(result["inputs"], (np.diag(Omega) if Omega.ndim > 1 else Omega).tolist(), strict=True))
-    ratios = {name: abs(value / omega["stack"][name] - 1.0) for name, value in omega["imported"].items()}
+        omega[name] = dict(
+            zip(
+                result["inputs"],
+                (np.diag(Omega) if Omega.ndim > 1 else Omega).tolist(),
+                strict=True,
+            )
+        )
+    ratios = {
+        name: abs(value / omega["stack"][name] - 1.0) for name, value in omega["imported"].items()
+    }
     return {"Omega": omega, "difference": ratios}
 
 
 def guided() -> dict[str, Any]:
-    """Minutes engaged under guidance by rule, with the gains of the last identification: turns, climbs, changes of V."""
+    """Minutes engaged under guidance by rule, with the gains of the last identification: turns,
+    climbs, changes of V.
+    """
     from tests.sitl.kit import ALTITUDE, guided_scenario  # noqa: PLC0415 - after the kit's place is known
 
     starts = np.arange(15.0, GUIDED, EACH).tolist()
     with arduplane(0.03) as plane:
         found, scenario = plane.folder / "found", plane.folder / "guided.yaml"
         program = plane.turns(starts, ALTITUDE + 20.0, 24.0)
-        scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0), encoding="utf-8")
+        scenario.write_text(
+            guided_scenario(found / "scenario.yaml", program, 24.0), encoding="utf-8"
+        )
         with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
             flight.end(GUIDED + 100.0)
     return held_figures(plane.run, starts)
 
 
 def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
-    """How well a guided flight of turns at these times holds what it is commanded, and whether it replays."""
+    """How well a guided flight of turns at these times holds what it is commanded, and whether it
+    replays.
+    """
     (one,) = json.loads((run / "summary.json").read_text(encoding="utf-8"))["engagements"]
     tape = read_run(run).tape
     t, errors = tape.time("guidance"), control_errors(tape)
     stop = one["stop"] or GUIDED
-    held = in_spans(t, [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop])
+    held = in_spans(
+        t,
+        [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop],
+    )
     return {
         "seconds": stop - one["start"],
         "reason": one["reason"],
@@ -287,7 +383,9 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
 
 
 def observed() -> dict[str, Any]:
-    """The last identified gains without and with an extended-state observer of the identified Omega and lags, in turbulence."""
+    """The last identified gains without and with an extended-state observer of the identified Omega
+    and lags, in turbulence.
+    """
     found, results = FOLDER / "arduplane" / "found", []
     alone = load_scenario(found / "scenario.yaml")
     controller = alone.rise_di()
@@ -297,7 +395,9 @@ def observed() -> dict[str, Any]:
     rows = [model.states.index(name) for name in controller.outputs]
     Omega = np.reshape(model.B, (len(model.states), -1))[rows]
     size = sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)
-    observer = with_extended_state_observer(controller, Omega, size / NOISE_SHARE, size, controller.delay + OBSERVER_MARGIN)
+    observer = with_extended_state_observer(
+        controller, Omega, size / NOISE_SHARE, size, controller.delay + OBSERVER_MARGIN
+    )
     scenarios = {"without": alone, "with": replace(alone, controller=observer.controller)}
     with arduplane(0.03) as plane:
         plane.say("param", "SIM_WIND_SPD", "5")
@@ -308,11 +408,16 @@ def observed() -> dict[str, Any]:
             with plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
                 flight.end(150.0)
             results.append({"observer": name, **tracking(plane)})
-    return {"flights": results, "relaxation": dict(zip(controller.outputs, observer.relaxation.tolist(), strict=True))}
+    return {
+        "flights": results,
+        "relaxation": dict(zip(controller.outputs, observer.relaxation.tolist(), strict=True)),
+    }
 
 
 def bumpless() -> dict[str, Any]:
-    """Engagements and releases in one flight: the largest step of a setpoint around each, of its range."""
+    """Engagements and releases in one flight: the largest step of a setpoint around each, of its
+    range.
+    """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
         flown = plane.fly(EXAMPLE, channel_map, 1000.0, "--send")
@@ -328,20 +433,29 @@ def bumpless() -> dict[str, Any]:
         flown.end(60.0)
         log, inputs = read_run(plane.run), load_map(channel_map).inputs.values()
         ranges = {f"{row.message}.{row.field}": row.range[1] - row.range[0] for row in inputs}
-        return {"steps": [step(log.tape["bridge/would_send"], ranges, engaged.start_ns) for engaged in log.engagements or []]}
+        return {
+            "steps": [
+                step(log.tape["bridge/would_send"], ranges, engaged.start_ns)
+                for engaged in log.engagements or []
+            ]
+        }
 
 
 def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
-    """The largest step from one setpoint to the next around an engagement, of its range. Before it, that is the stick."""
+    """The largest step from one setpoint to the next around an engagement, of its range. Before it,
+    that is the stick.
+    """
     begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
     around = sent.within([(begin, end)])
     return max(float(np.max(np.abs(np.diff(around[name])))) / size for name, size in ranges.items())
 
 
 def signs(experiments: int = 25) -> dict[str, Any]:
-    """Short experiments, open loop, each in other turbulence, and what `rise-di check` says of each; earlier ones are kept.
+    """Short experiments, open loop, each in other turbulence, and what `rise-di check` says of
+    each; earlier ones are kept.
 
-    The simulator draws its turbulence from one stream of random numbers without a seed: each experiment has another part of it.
+    The simulator draws its turbulence from one stream of random numbers without a seed: each
+    experiment has another part of it.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -361,7 +475,9 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
         flown.wait_for("DISENGAGED")
         begun, earlier = [], len(stored("signs").get("experiments", []))
-        winds = [TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)]
+        winds = [
+            TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)
+        ]
         for wind in winds:
             plane.say("param", "SIM_WIND_TURB", f"{wind:g}")
             begun.append(time.time_ns())
@@ -379,11 +495,15 @@ def signs(experiments: int = 25) -> dict[str, Any]:
     return signs_of_logs([plane.run], lambda _, engaged: winds[bisect(begun, engaged.start_ns) - 1])
 
 
-def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]) -> dict[str, Any]:
-    """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an engagement.
+def signs_of_logs(
+    runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]
+) -> dict[str, Any]:
+    """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an
+    engagement.
 
-    An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted, not judged. Those of a run in
-    strong turbulence are also judged together, as `rise-di check` judges a log with several.
+    An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted,
+    not judged. Those of a run in strong turbulence are also judged together, as `rise-di check`
+    judges a log with several.
     """
     earlier, channel_map = stored("signs"), load_map("ardupilot")
     found, ended, together = (earlier.get(key, []) for key in ("experiments", "ended", "together"))
@@ -405,8 +525,12 @@ def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], flo
     return {"experiments": found, "ended": ended, "together": together}
 
 
-def judged(channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]) -> dict[str, Any]:
-    """What `rise-di check` says of every sign, and of each flipped alone: its column of the recorded u has the other sign."""
+def judged(
+    channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]
+) -> dict[str, Any]:
+    """What `rise-di check` says of every sign, and of each flipped alone: its column of the
+    recorded u has the other sign.
+    """
     pairing, expected = channel_pairs(channel_map)
     columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
     rows = [list(channel_map.outputs).index(name) for name in pairing.outputs]
@@ -416,14 +540,22 @@ def judged(channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement
     spans = [(engaged.start_ns, engaged.stop_ns or end_ns) for engaged in engagements]
 
     def verdicts(flipped: str) -> dict[str, str]:
-        turned = Signal(u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names])
-        response = identify_response(tape["y"], turned, pairing.outputs, pairing.inputs, engaged=spans)
+        turned = Signal(
+            u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names]
+        )
+        response = identify_response(
+            tape["y"], turned, pairing.outputs, pairing.inputs, engaged=spans
+        )
         D = tuple(int(sign) for sign in expected)
         checked = check(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
         shown = (
-            (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect) for channel in checked.channels
+            (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect)
+            for channel in checked.channels
         )
-        return {name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong" for name, ratio, agrees in shown}
+        return {
+            name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong"
+            for name, ratio, agrees in shown
+        }
 
     return {
         "seconds": sum(seconds(stop - start) for start, stop in spans),
@@ -433,25 +565,40 @@ def judged(channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement
 
 
 def pose() -> dict[str, Any]:
-    """Rates and pose of the map `ardupilot` against the autopilot's own log, in turns and climbs."""
+    """Rates and pose of the map `ardupilot` against the autopilot's own log, in turns and
+    climbs.
+    """
     with arduplane(0.03) as plane:
         flown = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
         flown.wait_for("DISENGAGED")
         plane.wander(flown)
         fits = {name: fit._asdict() for name, fit in plane.compare().items()}
-    return fits | {"slopes of the rates, largest difference from 1": max(abs(fits[name]["slope"] - 1.0) for name in "pqr")}
+    return fits | {
+        "slopes of the rates, largest difference from 1": max(
+            abs(fits[name]["slope"] - 1.0) for name in "pqr"
+        )
+    }
 
 
 def releases() -> dict[str, Any]:
-    """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again, s."""
+    """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again,
+    s.
+    """
     report, python = FOLDER / "releases.xml", sys.executable
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
     subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
     suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now
-    times: dict[str, float | None] = dict.fromkeys(RELEASE_GOALS)  # a time that is missing misses its goal
-    times |= {timed.attrib["name"]: float(timed.attrib["value"]) for timed in suite.iter("property")}
+    times: dict[str, float | None] = dict.fromkeys(
+        RELEASE_GOALS
+    )  # a time that is missing misses its goal
+    times |= {
+        timed.attrib["name"]: float(timed.attrib["value"]) for timed in suite.iter("property")
+    }
     counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
-    return counts | {"failed": [case.attrib["name"] for case in suite.iter("testcase") if len(case)], "times": times}
+    return counts | {
+        "failed": [case.attrib["name"] for case in suite.iter("testcase") if len(case)],
+        "times": times,
+    }
 
 
 IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
@@ -473,9 +620,9 @@ MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
 
 # The rows
 
-# s, until the pilot or PX4's own law flies: one sample of ArduPlane's RC, 0.6 s of PX4, or what the autopilot's parameters say
-# and 0.1 s for a sample of its log: RC_OVERRIDE_TIME of 3 s, COM_OF_LOSS_T of 1 s or what the test sets. The age limit of u is
-# 1 s in the tests.
+# s, until the pilot or PX4's own law flies: one sample of ArduPlane's RC, 0.6 s of PX4, or what the
+# autopilot's parameters say and 0.1 s for a sample of its log: RC_OVERRIDE_TIME of 3 s,
+# COM_OF_LOSS_T of 1 s or what the test sets. The age limit of u is 1 s in the tests.
 RELEASE_GOALS = {
     "ArduPlane, release": 0.1,
     "ArduPlane, override by a switch": 0.1,
@@ -524,21 +671,28 @@ def counted(result: dict[str, Any]) -> dict[str, Any]:
         "experiments that ended early": len(result["ended"]),
         "experiments that show every sign, right": sum(map(shows_all, flown)),
         "experiments that find each flipped sign": sum(map(finds_each, flown)),
-        "experiments that call a right sign wrong": sum("wrong" in each["as flown"].values() for each in flown),
-        "moderate experiments that miss a sign": sum(not (shows_all(each) and finds_each(each)) for each in moderate),
+        "experiments that call a right sign wrong": sum(
+            "wrong" in each["as flown"].values() for each in flown
+        ),
+        "moderate experiments that miss a sign": sum(
+            not (shows_all(each) and finds_each(each)) for each in moderate
+        ),
     }
 
 
 GOALS: dict[str, dict[str, str]] = {
     **{
-        name: {f"^rms: {channel}": f"<= {limit:g}" for channel, limit in limits.items()} | {"refused": "<= 0"}
+        name: {f"^rms: {channel}": f"<= {limit:g}" for channel, limit in limits.items()}
+        | {"refused": "<= 0"}
         for name, limits in ERROR_GOALS.items()
     },
     "engagements": {"steps: .*": f"<= {LARGEST_STEP:g}"},
     "signs": {"right sign wrong": "<= 0", "miss a sign": "<= 0"},
     "pose": {"largest difference from 1": "<= 0.01"},
     "own_log": {"difference: (elevator|aileron)": f"<= {OMEGA_GOAL:g}"},
-    "releases": {f"times: {re.escape(name)}": f"<= {limit:g}" for name, limit in RELEASE_GOALS.items()}
+    "releases": {
+        f"times: {re.escape(name)}": f"<= {limit:g}" for name, limit in RELEASE_GOALS.items()
+    }
     | {"failures|errors": "<= 0"},
 }
 """By measurement: patterns of the end of a figure's name, SI."""
@@ -547,16 +701,27 @@ GOALS["arduplane"]["behind: .*"] = "<= 0.1"
 
 def main() -> None:
     """Measure, and write the rows and the page of evidence."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sitl", type=Path, help="folder of the kit")
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
-    parser.add_argument("--experiments", type=int, default=25, help="number of further ones on signs, a minute each")
-    parser.add_argument("--log", type=Path, action="append", help="with --only: a flown experiment in place of a new one")
+    parser.add_argument(
+        "--experiments", type=int, default=25, help="number of further ones on signs, a minute each"
+    )
+    parser.add_argument(
+        "--log",
+        type=Path,
+        action="append",
+        help="with --only: a flown experiment in place of a new one",
+    )
     arguments = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     if arguments.sitl is not None:
         os.environ["RISE_DI_SITL"] = str(arguments.sitl.resolve())
-    os.environ.pop("ROS_DOMAIN_ID", None)  # the autopilots are in domain 0, in networks of their own
+    os.environ.pop(
+        "ROS_DOMAIN_ID", None
+    )  # the autopilots are in domain 0, in networks of their own
     from tests.sitl.kit import missing  # noqa: PLC0415 - after the kit's place is known
 
     if reason := missing():
@@ -573,7 +738,9 @@ def main() -> None:
             result = IDENTIFICATIONS[name](arguments.log[0])
         else:
             result = MEASUREMENTS[name]()
-        (FOLDER / f"{name}.json").write_text(json.dumps({"result": result}, indent=1), encoding="utf-8")
+        (FOLDER / f"{name}.json").write_text(
+            json.dumps({"result": result}, indent=1), encoding="utf-8"
+        )
         print(name, json.dumps(result), flush=True)
         figures = counted(result) if name == "signs" else result
         evidence.write(f"autopilots-{name}", evidence.rows(figures, GOALS.get(name, {})), begun)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaign: speed relative to the simulation in one process, integration error, memory.
 
-python -m benchmarks.campaign                     # 10,000 aircraft of osprey_servo, a minute on two cores
+python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
 python -m benchmarks.campaign --scenario osprey_route --aircraft 2000 --exact 1        # missions
 """
 
@@ -42,7 +42,9 @@ class Speed(NamedTuple):
 def speed(scenario: Scenario, aircraft: int, chunk: int, workers: int) -> Speed:
     """Fly a campaign in threads of this process."""
     with TemporaryDirectory() as folder:
-        campaign = Campaign.begin(Path(folder), define(scenario, aircraft, UNCERTAINTY, SEED, chunk))
+        campaign = Campaign.begin(
+            Path(folder), define(scenario, aircraft, UNCERTAINTY, SEED, chunk)
+        )
         begin, process = time.perf_counter(), psutil.Process()
         done = [
             (time.perf_counter() - begin, flights, process.memory_info().rss / 1e6)
@@ -55,21 +57,27 @@ def speed(scenario: Scenario, aircraft: int, chunk: int, workers: int) -> Speed:
 
 
 def alone(scenario: Scenario) -> tuple[float, FloatArray]:
-    """One flight in one process: aircraft-seconds per second, and rms of the true error at the ticks, (m,)."""
+    """One flight in one process: aircraft-seconds per second, and rms of the true error at the
+    ticks, (m,).
+    """
     begin = time.perf_counter()
     tape = simulate(scenario)
     took = time.perf_counter() - begin
     error = true_error(tape)
     assert error is not None  # noqa: S101 - a simulated flight has the truth
     ticks = error.stamp_ns % round(1e9 / scenario.controller.rate) == 0
-    rms = np.array([np.sqrt(np.mean(error[name][ticks] ** 2)) for name in scenario.controller.outputs])
+    rms = np.array(
+        [np.sqrt(np.mean(error[name][ticks] ** 2)) for name in scenario.controller.outputs]
+    )
     return scenario.flight.duration / took, rms
 
 
 def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray]:
-    """Largest relative difference of rms between a fleet and the same aircraft with the step FINE, (m,).
+    """Largest relative difference of rms between a fleet and the same aircraft with the step FINE,
+    (m,).
 
-    The first result is the speed of the simulation in one process at the scenario's own step, aircraft-seconds per second.
+    The first result is the speed of the simulation in one process at the scenario's own step,
+    aircraft-seconds per second.
     """
     definition = define(scenario, count, UNCERTAINTY, SEED, count)
     figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures
@@ -79,24 +87,31 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
         sampled = definition.aircraft_scenario(number)
         single_speed = max(single_speed, alone(sampled)[0])
         _, rms = alone(sampled.vary(aircraft={"step": FINE}))
-        worst = np.maximum(worst, np.abs([figures[f"rms.{name}"][number] for name in outputs] / rms - 1.0))
+        worst = np.maximum(
+            worst, np.abs([figures[f"rms.{name}"][number] for name in outputs] / rms - 1.0)
+        )
     return single_speed, worst
 
 
 def main(
-    scenario: Annotated[str, typer.Option(help="Name of a scenario; one with guidance flies missions.")] = "osprey_servo",
+    scenario: Annotated[
+        str, typer.Option(help="Name of a scenario; one with guidance flies missions.")
+    ] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of the campaign.")] = 10_000,
     chunk: Annotated[int, typer.Option(min=1, help="How many fly at once.")] = 1000,
     workers: Annotated[int, typer.Option(min=1, help="Threads.")] = psutil.cpu_count() or 1,
     exact: Annotated[int, typer.Option(min=1, help="Aircraft whose integration is checked.")] = 4,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to a file.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to a file.")
+    ] = None,
 ) -> None:
     """Print speed, ratio to the simulation in one process, memory, and integration error."""
     chosen = find_scenario(scenario)
     many = speed(chosen, aircraft, chunk, workers)
     single_speed, errors = integration_error(chosen, exact)
     table = new_table(
-        f"{scenario}, {chosen.flight.duration:g} s, +-{100 * UNCERTAINTY:g} %, {workers} threads, chunks of {chunk}",
+        f"{scenario}, {chosen.flight.duration:g} s, +-{100 * UNCERTAINTY:g} %, {workers} "
+        f"threads, chunks of {chunk}",
         ("figure", "value"),
         texts=1,
     )
@@ -106,13 +121,21 @@ def main(
         "after the first chunks": f"{many.flown:,.0f} aircraft-s/s",
         "ratio to a simulation in one process": f"{many.flown / single_speed:,.0f} x",
         "memory after a third, at the end": f"{many.memory_early:,.0f} and {many.memory:,.0f} MB",
-        "integration error, share of rms": ", ".join(f"{name} {share:.1e}" for name, share in shares.items()),
+        "integration error, share of rms": ", ".join(
+            f"{name} {share:.1e}" for name, share in shares.items()
+        ),
     }
     for row in rows.items():
         table.add_row(*row)
     Console().print(table)
     if json_file is not None:
-        figures = {**many._asdict(), "aircraft": aircraft, "plain": single_speed, "exact": exact, "integration": shares}
+        figures = {
+            **many._asdict(),
+            "aircraft": aircraft,
+            "plain": single_speed,
+            "exact": exact,
+            "integration": shares,
+        }
         figures["memory_growth"] = many.memory / many.memory_early
         figures["1,000,000 aircraft of 60 s with gusts on a GPU"] = None  # s; no host has had a GPU
         json_file.write_text(json.dumps(figures, indent=1), encoding="utf-8")

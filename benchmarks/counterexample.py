@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Counterexample to Theorem 1 as a rule for gains: plots docs/images/counterexample.png, prints the table of the theory page.
+"""Counterexample to Theorem 1 as a rule for gains: plots docs/images/counterexample.png, prints the
+table of the theory page.
 
 python -m benchmarks.counterexample    # half a minute
 """
@@ -43,14 +44,17 @@ class Cycle(NamedTuple):
 
     @property
     def gamma_2(self) -> float:
-        """The smallest gamma_2 of (40) on this flight, 1/s: the ratio of the integrals of abs(e_dot) and abs(e)."""
+        """The smallest gamma_2 of (40) on this flight, 1/s: the ratio of the integrals of
+        abs(e_dot) and abs(e).
+        """
         return float(np.trapezoid(np.abs(self.e_dot), self.t) / np.trapezoid(self.e, self.t))
 
     @property
     def multipliers(self) -> FloatArray:
         """Growth of a small deviation over half a period with f as a function of time, two moduli.
 
-        Between the crossings d_ddot + K d_dot + K LAMBDA d = 0; at a crossing d_dot jumps by -2 beta d / abs(e_dot).
+        Between the crossings d_ddot + K d_dot + K LAMBDA d = 0; at a crossing d_dot jumps by -2
+        beta d / abs(e_dot).
         """
         between = expm(np.array([[0.0, 1.0], [-K * LAMBDA, -K]]) * self.t[-1])
         crossing = np.array([[1.0, 0.0], [-2.0 * self.beta / abs(self.e_dot[-1]), 1.0]])
@@ -63,9 +67,11 @@ def formula(beta: float) -> float:
 
 
 def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
-    """Solution of e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot from e = 0, e_dot = speed to the next e = 0.
+    """Solution of e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot from e = 0, e_dot = speed to
+    the next e = 0.
 
-    f_dot = BOUND sat(SLOPE e_dot / BOUND), or 0 with acts = 0. By symmetry the half period with e < 0 is the negative of it.
+    f_dot = BOUND sat(SLOPE e_dot / BOUND), or 0 with acts = 0. By symmetry the half period with e <
+    0 is the negative of it.
     """
 
     def w_dot(_: float, w: FloatArray) -> list[float]:
@@ -92,16 +98,25 @@ def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
 
 
 def limit_cycle(beta: float) -> Cycle:
-    """The cycle: the speed at e = 0 that half a period reproduces. It exists for beta > BOUND and SLOPE > K."""
+    """The cycle: the speed at e = 0 that half a period reproduces. It exists for beta > BOUND and
+    SLOPE > K.
+    """
     energy_balance = 1.5 * BOUND / K
-    speed = brentq(lambda v: float(-half_period(v, beta).y[1, -1] - v), 0.3 * energy_balance, 3.0 * energy_balance, xtol=1e-10)
+    speed = brentq(
+        lambda v: float(-half_period(v, beta).y[1, -1] - v),
+        0.3 * energy_balance,
+        3.0 * energy_balance,
+        xtol=1e-10,
+    )
     solved = half_period(speed, beta)
     t = np.linspace(0.0, solved.t[-1], 4001)
     return Cycle(beta, t, *solved.sol(t))
 
 
 def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
-    """Times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1, in which f is recorded."""
+    """Times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1, in which f is
+    recorded.
+    """
     t, speed, times, sizes = 0.0, 1.0, [], []
     while t < DURATION:
         solved = half_period(speed, beta, acts)
@@ -112,17 +127,29 @@ def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
 
 
 def plot(cycles: list[Cycle]) -> Figure:
-    """Two panels: peaks of abs(e) over time, with and without f, and their limit over beta beside the formula."""
+    """Two panels: peaks of abs(e) over time, with and without f, and their limit over beta beside
+    the formula.
+    """
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     over_time, over_beta = figure.subplots(1, 2)
     for (beta, acts), colour in zip(FLIGHTS, COLOURS, strict=True):
         t, e = peaks(beta, acts)
         label = f"beta = {beta:g}" + ("" if acts else ", f = 0")
-        over_time.semilogy(t, e, color=colour, linewidth=1.4, linestyle="-" if acts else "--", label=label)
+        over_time.semilogy(
+            t, e, color=colour, linewidth=1.4, linestyle="-" if acts else "--", label=label
+        )
     over_time.set_title("peaks of |e| over t in s", fontsize=10, loc="left")
     betas = np.array([cycle.beta for cycle in cycles])
-    over_beta.loglog(betas, [formula(beta) for beta in betas], color="black", linewidth=1.0, label="9 d²/(8 K² beta)")
-    over_beta.loglog(betas, [np.max(cycle.e) for cycle in cycles], "o", color=COLOURS[1], label="simulated")
+    over_beta.loglog(
+        betas,
+        [formula(beta) for beta in betas],
+        color="black",
+        linewidth=1.0,
+        label="9 d²/(8 K² beta)",
+    )
+    over_beta.loglog(
+        betas, [np.max(cycle.e) for cycle in cycles], "o", color=COLOURS[1], label="simulated"
+    )
     over_beta.set_title("limit of |e| over beta", fontsize=10, loc="left")
     for axis in (over_time, over_beta):
         axis.grid(color="#dddddd", linewidth=0.6)
@@ -141,8 +168,10 @@ def main() -> None:
         required = BOUND * (1.0 + cycle.gamma_2 / LAMBDA)
         slow, fast = cycle.multipliers
         print(
-            f"beta {cycle.beta:g}: limit of |e| {np.max(cycle.e):.4g}, formula {formula(cycle.beta):.4g}, (29) asks for"
-            f" beta >= {required:.0f}, half a period {cycle.t[-1]:.3g} s, multipliers {slow:.3f}, {fast:.3f}"
+            f"beta {cycle.beta:g}: limit of |e| {np.max(cycle.e):.4g}, formula "
+            f"{formula(cycle.beta):.4g}, (29) asks for"
+            f" beta >= {required:.0f}, half a period {cycle.t[-1]:.3g} s, multipliers "
+            f"{slow:.3f}, {fast:.3f}"
         )
 
 

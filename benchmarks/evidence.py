@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures: each measurement writes its figures to docs/evidence/NAME.csv, and docs/evidence.md is the table of these files.
+"""Measures: each measurement writes its figures to docs/evidence/NAME.csv, and docs/evidence.md is
+the table of these files.
 
     make evidence                              # what has no file yet
-    make evidence ARGS="--again faults"        # measure this again; "speed" is every name that begins so; repeatable
+    make evidence ARGS="--again faults"
+        # measure this again; "speed" is every name that begins so; repeatable
     make evidence ARGS="--again long"          # up to 80 min each, by name alone
 
 Goals are in benchmarks/evidence_goals.py. build/evidence/ has the logs.
@@ -28,9 +30,16 @@ import psutil
 from benchmarks.evidence_goals import COMMANDS, GOALS, LONG, SECTIONS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-FOLDER, PAGE, BUILD = REPOSITORY / "docs/evidence", REPOSITORY / "docs/evidence.md", REPOSITORY / "build/evidence"
+FOLDER, PAGE, BUILD = (
+    REPOSITORY / "docs/evidence",
+    REPOSITORY / "docs/evidence.md",
+    REPOSITORY / "build/evidence",
+)
 DIRTY = "-dirty"  # end of a revision with changes that are not committed
-BUSY, BUSY_SHARE = "busy with other work", 0.1  # end of a host on which times are longer; share of its processors
+BUSY, BUSY_SHARE = (
+    "busy with other work",
+    0.1,
+)  # end of a host on which times are longer; share of its processors
 BASELINE = " x baseline"  # end of a goal on a ratio
 HEAD = """\
 # Evidence
@@ -41,7 +50,7 @@ measurement, with goals, command, revision, host and date; `docs/evidence/tables
 autopilots write their files themselves. Limits of all measurements: one host, the loopback interface, simulated aircraft. In
 turbulence a figure is the worst of the seeds. A baseline is the least program that does the same on this host. Flights of real
 autopilots before 2026-11-23 take the times of their commands some seconds early: their rms is to be measured again.
-"""
+"""  # noqa: E501 - a text as it is written
 
 
 class Row(NamedTuple):
@@ -64,11 +73,22 @@ class Origin(NamedTuple):
 
 
 def row(
-    name: str, value: float | str | None, unit: str = "", *, at_most: float | None = None, at_least: float | None = None
+    name: str,
+    value: float | str | None,
+    unit: str = "",
+    *,
+    at_most: float | None = None,
+    at_least: float | None = None,
 ) -> Row:
     """A row from a number, words, or None where the host could not measure."""
     sign, limit = ("<=", at_most) if at_least is None else (">=", at_least)
-    text = "not measured" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = (
+        "not measured"
+        if value is None
+        else f"{value:.6g}"
+        if isinstance(value, float)
+        else str(value)
+    )
     return Row(name, text, unit, goal="" if limit is None else f"{sign} {limit:.6g}")
 
 
@@ -79,7 +99,9 @@ def split(name: str) -> tuple[str, str]:
 
 
 def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]:
-    """The rows of a JSON result: the path of keys is the name, and the first goal whose pattern ends the name holds."""
+    """The rows of a JSON result: the path of keys is the name, and the first goal whose pattern
+    ends the name holds.
+    """
     if isinstance(result, dict):
         for key, value in result.items():
             if not (name and isinstance(value, str)):  # words are part of the label
@@ -96,7 +118,11 @@ def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]
 
 def _label(result: Any) -> str:
     """The words of a JSON object, which tell it from its neighbours."""
-    return ", ".join(value for value in result.values() if isinstance(value, str)) if isinstance(result, dict) else ""
+    return (
+        ", ".join(value for value in result.values() if isinstance(value, str))
+        if isinstance(result, dict)
+        else ""
+    )
 
 
 def compared(figure: Row, figures: Mapping[str, Row]) -> float:
@@ -134,7 +160,12 @@ def write_page() -> None:
     """Write the page from the files."""
     lines = [HEAD]
     for section, titles in SECTIONS.items():
-        lines += [f"## {section}", "", "| measurement | goals met, and missed | date |", "|---|---|---|"]
+        lines += [
+            f"## {section}",
+            "",
+            "| measurement | goals met, and missed | date |",
+            "|---|---|---|",
+        ]
         lines += [_line(FOLDER / f"{name}.csv", title) for name, title in titles.items()] + [""]
     PAGE.write_text("\n".join(lines), encoding="utf-8")
 
@@ -146,13 +177,23 @@ def _line(path: Path, title: str) -> str:
         lines = list(csv.reader(stream))[1:]
     figures = {line[0]: Row(*line[:5]) for line in lines}
     origin = Origin(*lines[0][5:])
-    judged = sorted(((used(figure, figures), figure) for figure in figures.values() if figure.goal), reverse=True)
+    judged = sorted(
+        ((used(figure, figures), figure) for figure in figures.values() if figure.goal),
+        reverse=True,
+    )
     met = sum(share <= 1.0 for share, _ in judged)
     missed: dict[str, str] = {}  # of figures that differ by the subject alone the worst
     for _, figure in judged[: len(judged) - met]:
         value = compared(figure, figures)
-        text = figure.value if math.isnan(value) else f"{value:.3g}{'' if figure.baseline else ' ' + figure.unit}".strip()
-        missed.setdefault(figure.name.rpartition(": ")[2] + figure.goal, f"{figure.name} **{text}** ({figure.goal})")
+        text = (
+            figure.value
+            if math.isnan(value)
+            else f"{value:.3g}{'' if figure.baseline else ' ' + figure.unit}".strip()
+        )
+        missed.setdefault(
+            figure.name.rpartition(": ")[2] + figure.goal,
+            f"{figure.name} **{text}** ({figure.goal})",
+        )
     passed = f"{met} of {len(judged)}" if judged else "-"
     goals = "; ".join([passed, *missed.values()])
     busy = ", busy host" if BUSY in origin.host else ""
@@ -165,35 +206,53 @@ def origin(command: str) -> Origin:
 
 
 def revision(*paths: str) -> str:
-    """The commit, with DIRTY if any file but the evidence differs from the commit; of `paths` the last that touched them."""
-    changed = _git("status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))).strip()
-    commit = _git("log", "-1", "--format=%h", "--", *paths) if paths else _git("describe", "--always")
+    """The commit, with DIRTY if any file but the evidence differs from the commit; of `paths` the
+    last that touched them.
+    """
+    changed = _git(
+        "status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))
+    ).strip()
+    commit = (
+        _git("log", "-1", "--format=%h", "--", *paths) if paths else _git("describe", "--always")
+    )
     return commit.strip() + (DIRTY if changed else "")
 
 
 def _git(*arguments: str) -> str:
     command = ("git", *arguments)
-    return subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True).stdout  # noqa: S603 - this repository
+    return subprocess.run(  # noqa: S603 - this repository
+        command, cwd=REPOSITORY, check=False, capture_output=True, text=True
+    ).stdout
 
 
 def host() -> str:
     """Processor, cores, memory, system and Python of this host."""
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    cpuinfo = (
+        Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    )
     model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
     memory = round(psutil.virtual_memory().total / 2**30)
     system = f"{platform.system()} {platform.release()}, Python {platform.python_version()}"
-    return f"{model[1] if model else platform.machine()}, {os.cpu_count()} cores, {memory} GiB, {system}"
+    return (
+        f"{model[1] if model else platform.machine()}, {os.cpu_count()} cores, {memory} GiB, "
+        f"{system}"
+    )
 
 
 def measure(name: str) -> int:
     """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
     busy = psutil.cpu_percent(interval=2.0) / 100.0
     begun = origin(COMMANDS[name])  # before the run: a commit meanwhile is not what runs
-    with tempfile.TemporaryDirectory() as folder, (BUILD / f"{name}.log").open("w", encoding="utf-8") as log:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        (BUILD / f"{name}.log").open("w", encoding="utf-8") as log,
+    ):
         file = Path(folder) / "result.json"
         command = COMMANDS[name].replace("FILE", str(file)).replace("FOLDER", folder).split()
         command[0] = str(Path(sys.executable).parent / command[0])
-        done = subprocess.run(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True, check=False)  # noqa: S603
+        done = subprocess.run(  # noqa: S603
+            command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True, check=False
+        )
         log.write(done.stdout)
         text = file.read_text(encoding="utf-8") if file.exists() else done.stdout
     if COMMANDS[name].startswith("pytest"):
@@ -203,18 +262,41 @@ def measure(name: str) -> int:
         result = json.loads(text) if text.lstrip().startswith(("{", "[")) else {}
     if busy > BUSY_SHARE:
         begun = begun._replace(host=f"{begun.host}, {100 * busy:.0f} % {BUSY}")
-    failed = [row("exit status", done.returncode, at_most=0)] if done.returncode or not result else []
+    failed = (
+        [row("exit status", done.returncode, at_most=0)] if done.returncode or not result else []
+    )
     found = result["evidence"] if isinstance(result, dict) and "evidence" in result else None
-    write(name, [*failed, *(rows(result, GOALS.get(name, {})) if found is None else (Row(*each) for each in found))], begun)
+    write(
+        name,
+        [
+            *failed,
+            *(
+                rows(result, GOALS.get(name, {}))
+                if found is None
+                else (Row(*each) for each in found)
+            ),
+        ],
+        begun,
+    )
     return done.returncode
 
 
 def main() -> int:
     """Measure, write the rows, write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--again", action="append", default=[], metavar="NAME", help="only measure again what begins so")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--again",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only measure again what begins so",
+    )
     again = tuple(parser.parse_args().again)
-    missing = [name for name in COMMANDS if name not in LONG and not (FOLDER / f"{name}.csv").exists()]
+    missing = [
+        name for name in COMMANDS if name not in LONG and not (FOLDER / f"{name}.csv").exists()
+    ]
     todo = [name for name in COMMANDS if name.startswith(again)] if again else missing
     if again and not todo:
         parser.error(f"--again: found {again[0]!r}, expected one of {', '.join(COMMANDS)}")

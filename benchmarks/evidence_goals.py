@@ -1,13 +1,26 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What benchmarks/evidence.py measures: the command and the goals of each measurement, and the sections of the page."""
+"""What benchmarks/evidence.py measures: the command and the goals of each measurement, and the
+sections of the page.
+"""
 
 CAMPAIGN = "rise-di campaign --uncertainty 0.3 --seed 7 --set runs=FOLDER --json"
-COMPARE = "rise-di compare osprey_servo --tuning gust,gust_turbulence,delay --json FILE --aircraft 200"
+COMPARE = (
+    "rise-di compare osprey_servo --tuning gust,gust_turbulence,delay --json FILE --aircraft 200"
+)
 RANDOM_FAULTS = "python -m benchmarks.random_faults --json FILE --count"
 LONG_FLIGHT = "python -m benchmarks.long_flight --json FILE"
 ATTACKS = ("flight_ros/test_security.py", "flight_bringup/test_policy.py")
-SPEED = {"law": 10, "receiver": 10, "node": 10, "latency": 10, "ticks": 60, "flight": 10, "start": 10, "import": 10}
+SPEED = {
+    "law": 10,
+    "receiver": 10,
+    "node": 10,
+    "latency": 10,
+    "ticks": 60,
+    "flight": 10,
+    "start": 10,
+    "import": 10,
+}
 SPEED |= {"lockstep": 30, "recorder": 30}  # s a figure
 
 COMMANDS = {
@@ -16,7 +29,8 @@ COMMANDS = {
 } | {
     "faults": "python -m benchmarks.faults --times 10 --json FILE",
     "random-faults": f"{RANDOM_FAULTS} 20 --lockstep 2",
-    "security": f"pytest -q {' '.join(f'tests/{folder}/{file}' for folder in ('ros', 'nodes') for file in ATTACKS)}",
+    "security": "pytest -q "
+    f"{' '.join(f'tests/{folder}/{file}' for folder in ('ros', 'nodes') for file in ATTACKS)}",
     "fuzz": "pytest -q -n auto tests/fuzz",
     "fuzz-coverage": "python -m benchmarks.fuzz all --seconds 30",
     "campaign": "python -m benchmarks.campaign --json FILE",
@@ -38,7 +52,13 @@ LONG = {"long-faults", "long-fuzz", "long-lockstep", "long-real-time", "long-jsb
 """Half an hour and more each: measured by name alone."""
 
 FUZZED, DRAWN = {"status": "<= 0"}, {"draws that fail": "<= 0"}
-LOGGED = {"growth": "<= 0.02", "^lost": "<= 0", "differing": "<= 0", "written": "<= 10", "opened: .*figures.*": "<= 3"}
+LOGGED = {
+    "growth": "<= 0.02",
+    "^lost": "<= 0",
+    "differing": "<= 0",
+    "written": "<= 10",
+    "opened: .*figures.*": "<= 3",
+}
 COUNTED = {"missing samples: .*": "<= 0"}
 GOALS = {
     "faults": {
@@ -58,7 +78,12 @@ GOALS = {
     "long-lockstep": LOGGED | COUNTED,
     "long-jsbsim": LOGGED | COUNTED,
     "long-real-time": LOGGED | {"excluding host delays.*": "<= 0"},
-    "campaign": {"flown": ">= 150000", "memory_growth": "<= 1.1", "integration: .*": "<= 0.01", "on a GPU": "<= 10"},
+    "campaign": {
+        "flown": ">= 150000",
+        "memory_growth": "<= 1.1",
+        "integration: .*": "<= 0.01",
+        "on a GPU": "<= 10",
+    },
     "view": {
         "live: processor": "<= 0.03",
         "live: memory": "<= 80",
@@ -71,7 +96,8 @@ GOALS = {
     },
     "replay": {"differing": "<= 0"},
 }
-"""By measurement: patterns of the end of a figure's name, SI. The groups of `speed` have goals of their own."""
+"""By measurement: patterns of the end of a figure's name, SI. The groups of `speed` have goals of
+their own."""
 
 ROUTE_AIRCRAFT = ("osprey_servo", "c172p", "737", "f16", "c182", "A320", "F4N")
 SECTIONS = {
@@ -114,14 +140,22 @@ SECTIONS = {
         "margins": "the cost of a phase margin under five laws",
         "effectors": "each effector lost at a random time",
     },
-    "Learning in the air": {"learning": "uncertain aircraft that learn, in every air and with damage"},
+    "Learning in the air": {
+        "learning": "uncertain aircraft that learn, in every air and with damage"
+    },
     "Live view": {"view": "the page beside a flight, and with a log of one hour"},
-    "Guidance": {f"guidance-{name}": f"holds and paths, {name}" for name in ("osprey_servo", "c172p", "737", "f16")}
+    "Guidance": {
+        f"guidance-{name}": f"holds and paths, {name}"
+        for name in ("osprey_servo", "c172p", "737", "f16")
+    }
     | {"guidance-route": "another route, other aircraft"}
     | {f"guidance-grid-{name}": f"off the design point, {name}" for name in ("c172p", "737", "f16")}
     | {"guidance-rates": "errors of rates with guidance over those without"}
     | {f"guidance-routes-{name}": f"hard routes, {name}" for name in ROUTE_AIRCRAFT}
-    | {f"guidance-fence-{name}": f"fences in wind, {name}" for name in ("osprey", "c172p", "f16", "737")},
+    | {
+        f"guidance-fence-{name}": f"fences in wind, {name}"
+        for name in ("osprey", "c172p", "f16", "737")
+    },
     "Real autopilots": {
         "autopilots-arduplane": "ArduPlane, servos of 0.03 s, identified gains",
         "autopilots-slow_servos": "the same with default servos of 0.14 s",

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fault campaign of tests/ros/flight_bringup/faults, several times in a row, as a table.
 
-    .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE] [--only "killed or stopped"]
-    .venv/bin/python -m benchmarks.faults --only roll-in --guided jsbsim_c172p_route    # another aircraft under guidance
+    .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE]
+    [--only "killed or stopped"]
+    .venv/bin/python -m benchmarks.faults --only roll-in --guided jsbsim_c172p_route
+        # another aircraft under guidance
 
-Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a killed node: from ready)
-until the law flies again. An instant is the reception time of the message that shows the event. Host delay: the longest that a
-process of the flight, or the probe, waited for a processor; the times include it.
+Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a
+killed node: from ready) until the law flies again. An instant is the reception time of the message
+that shows the event. Host delay: the longest that a process of the flight, or the probe, waited for
+a processor; the times include it.
 """
 
 import json
@@ -31,33 +34,53 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
 
 STARTS = ("exec_to_ready", "start_run", "start_waited")
-"""From the start of a killed node to its being ready, and of this time: its main thread runs, or waits for a processor."""
+"""From the start of a killed node to its being ready, and of this time: its main thread runs, or
+waits for a processor."""
 
 TRAFFIC = ("exec_to_traffic", "ready_to_traffic", "ready_to_caught_up")  # of a killed node
 TIMES = ("reaction", "recovery", "longest_pause", "held_back", "page", *TRAFFIC, *STARTS)
-BANKS = ("bank_deg", "last_bank_deg")  # the largest after the loss of u_m, and that when the wings have to be level
+BANKS = (
+    "bank_deg",
+    "last_bank_deg",
+)  # the largest after the loss of u_m, and that when the wings have to be level
 
 Row = dict[str, Any]
 
 
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[list[Row], int]:
-    """Inject every case `times` times in a row; one row for each injection, and the exit status of the tests."""
+    """Inject every case `times` times in a row; one row for each injection, and the exit status of
+    the tests.
+    """
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
     words = only.replace(",", " ").split() or ["test"]
-    expression = only if {"and", "or", "not"} & set(words) else " and ".join(words)  # the name of a case has blanks
+    expression = (
+        only if {"and", "or", "not"} & set(words) else " and ".join(words)
+    )  # the name of a case has blanks
     options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}"]
     return run_campaign([*options, "-k", f"not random and ({expression} or log_holds)"])
 
 
 def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list[Row], int]:
-    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test matches.
+    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test
+    matches.
 
     `total` is the number of injections, for the progress bar; None where it is unknown.
     """
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
-        command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), f"--faults-table={table}", *options]
-        with subprocess.Popen(command, cwd=REPOSITORY, stdout=sys.stderr) as tests, progress_bar(*COUNT_COLUMNS) as bar:  # noqa: S603
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            str(CAMPAIGN),
+            f"--faults-table={table}",
+            *options,
+        ]
+        with (
+            subprocess.Popen(command, cwd=REPOSITORY, stdout=sys.stderr) as tests,  # noqa: S603
+            progress_bar(*COUNT_COLUMNS) as bar,
+        ):
             task = bar.add_task("faults", total=total)
             while tests.poll() is None:
                 time.sleep(1.0)
@@ -79,11 +102,18 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
 
 def _summary(case: str, rows: Sequence[Row]) -> Row:
     passed = [row for row in rows if row["passed"]]
-    summary: Row = {"case": case, "u": rows[0]["does"], "injected": len(rows), "passed": len(passed)}
+    summary: Row = {
+        "case": case,
+        "u": rows[0]["does"],
+        "injected": len(rows),
+        "passed": len(passed),
+    }
     summary["any_delay"] = sum(row["any_delay"] for row in passed)
     for key in (*TIMES, *BANKS):
         values = [row[key] for row in passed if row.get(key) is not None]
-        summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
+        summary[key] = (
+            {"median": statistics.median(values), "worst": max(values)} if values else None
+        )
     return summary
 
 
@@ -94,11 +124,21 @@ def milliseconds(times: Mapping[str, float] | None) -> str:
 
 def to_table(summaries: Sequence[Row]) -> Table:
     """The table for a terminal, ms."""
-    columns = ("fault", "injected", "passed", "reaction", "recovery", "traffic", "pause", "host delay")
+    columns = (
+        "fault",
+        "injected",
+        "passed",
+        "reaction",
+        "recovery",
+        "traffic",
+        "pause",
+        "host delay",
+    )
     table = new_table("Faults, times in ms, median / worst", columns, texts=1)
     for summary in summaries:
         times = [
-            milliseconds(summary[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause", "held_back")
+            milliseconds(summary[key])
+            for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause", "held_back")
         ]
         table.add_row(summary["case"], str(summary["injected"]), str(summary["passed"]), *times)
     table.caption = "traffic: from ready until a killed node publishes all its topics; "
@@ -109,20 +149,32 @@ def to_table(summaries: Sequence[Row]) -> Table:
 
 def main(
     times: Annotated[int, typer.Option(min=1, help="Number of injections of each fault.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first injection; the others count up.")] = 1,
-    scenario: Annotated[str, typer.Option(help="Scenario of the flight without guidance.")] = "osprey_gust",
-    guided: Annotated[str, typer.Option(help="Scenario of the flight under guidance.")] = "osprey_route",
-    only: Annotated[str, typer.Option(help="Cases by words of their names, or an expression of pytest's -k.")] = "",
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the first injection; the others count up.")
+    ] = 1,
+    scenario: Annotated[
+        str, typer.Option(help="Scenario of the flight without guidance.")
+    ] = "osprey_gust",
+    guided: Annotated[
+        str, typer.Option(help="Scenario of the flight under guidance.")
+    ] = "osprey_route",
+    only: Annotated[
+        str, typer.Option(help="Cases by words of their names, or an expression of pytest's -k.")
+    ] = "",
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
-    """Run the fault campaign and print its table; exit status 1 if a case did not pass each time, or a log lacks messages."""
+    """Run the fault campaign and print its table; exit status 1 if a case did not pass each time,
+    or a log lacks messages.
+    """
     rows, status = fly(times, seed, only, scenario, guided)
     summaries = summarise(rows)
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))
     for bank in (summary for summary in summaries if summary["bank_deg"]):
-        largest, last = (f"{bank[key]['median']:.1f} / {bank[key]['worst']:.1f} deg" for key in BANKS)
+        largest, last = (
+            f"{bank[key]['median']:.1f} / {bank[key]['worst']:.1f} deg" for key in BANKS
+        )
         print(f"{bank['case']}: largest bank {largest}, after ten seconds {last} (median / worst)")
     if status or any(summary["passed"] < times for summary in summaries):
         raise typer.Exit(1)

@@ -1,18 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave the fence, and how far.
+"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave
+the fence, and how far.
 
-    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--shapes square ell] [--aircraft 2000]
-    .venv/bin/python -m benchmarks.fence --from-outside [--aircraft 1]
+    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--shapes square ell]
+    [--aircraft 2000] .venv/bin/python -m benchmarks.fence --from-outside [--aircraft 1]
 
-The figures go to docs/evidence/guidance-fence-*.csv, where all fences and winds are flown. A row a shape and a wind. Of the
-osprey a fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
-An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The
-aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status
-1: an aircraft left the fence, or was lost.
+The figures go to docs/evidence/guidance-fence-*.csv, where all fences and winds are flown. A row a
+shape and a wind. Of the osprey a fleet flies: every entry of A and B is off by up to 30 %
+(`aircraft_sim.uncertainty`). An aircraft of JSBSim flies as it is, once. The turbulence is light
+(MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The aircraft starts at the origin to the
+north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status 1: an
+aircraft left the fence, or was lost.
 
-`--from-outside` starts ospreys outside of five fences, in a wind of 0.4 V from four sides; the figures are printed. A flight is
-home that is within HOME_RADII of home at the end. Exit status 1: an aircraft did not come home.
+`--from-outside` starts ospreys outside of five fences, in a wind of 0.4 V from four sides; the
+figures are printed. A flight is home that is within HOME_RADII of home at the end. Exit status 1:
+an aircraft did not come home.
 """
 
 import argparse
@@ -60,14 +63,30 @@ SHAPES: Mapping[str, tuple[Zone, ...]] = {
 OUTSIDE: Mapping[str, Fence] = {
     "square": Fence((Zone((-6.0, -1.0, -1.0, -6.0), (-2.0, -2.0, 3.0, 3.0)),), (-3.5, 0.5)),
     "slot of a U, home in the other arm": Fence(
-        (Zone((-3.0, 5.5, 5.5, -3.0, -3.0, 2.0, 2.0, -3.0), (-3.3, -3.3, 4.0, 4.0, 0.7, 0.7, -0.3, -0.3)),), (-0.5, 2.3)
+        (
+            Zone(
+                (-3.0, 5.5, 5.5, -3.0, -3.0, 2.0, 2.0, -3.0),
+                (-3.3, -3.3, 4.0, 4.0, 0.7, 0.7, -0.3, -0.3),
+            ),
+        ),
+        (-0.5, 2.3),
     ),
-    "notch of an L": Fence((Zone((-4.5, 3.5, 3.5, -0.4, -0.4, -4.5), (-5.0, -5.0, -0.4, -0.4, 4.0, 4.0)),), (1.5, -2.7)),
+    "notch of an L": Fence(
+        (Zone((-4.5, 3.5, 3.5, -0.4, -0.4, -4.5), (-5.0, -5.0, -0.4, -0.4, 4.0, 4.0)),), (1.5, -2.7)
+    ),
     "no-fly zone in a circle": Fence(
-        (Zone((0.0,), (0.0,), 6.0), Zone((-0.7, 0.7, 0.7, -0.7), (-1.0, -1.0, 0.4, 0.4), exclude=True)), (-3.0, -2.0)
+        (
+            Zone((0.0,), (0.0,), 6.0),
+            Zone((-0.7, 0.7, 0.7, -0.7), (-1.0, -1.0, 0.4, 0.4), exclude=True),
+        ),
+        (-3.0, -2.0),
     ),
     "two zones that touch": Fence(
-        (Zone((-1.0, 2.5, 2.5, -1.0), (0.6, 0.6, 5.0, 5.0)), Zone((2.5, 6.0, 6.0, 2.5), (0.6, 0.6, 5.0, 5.0))), (4.2, 2.8)
+        (
+            Zone((-1.0, 2.5, 2.5, -1.0), (0.6, 0.6, 5.0, 5.0)),
+            Zone((2.5, 6.0, 6.0, 2.5), (0.6, 0.6, 5.0, 5.0)),
+        ),
+        (4.2, 2.8),
     ),
 }
 """Fences that the origin is outside of, with home, in least radii of the aircraft in the wind."""
@@ -80,7 +99,8 @@ OUTSIDE_WINDS: Mapping[str, tuple[float, float]] = {
 }
 
 HOME_RADII = 1.5
-"""Largest distance from home, in radii of the orbit round home: the orbit, and half a radius to join it."""
+"""Largest distance from home, in radii of the orbit round home: the orbit, and half a radius to
+join it."""
 
 WINDS: Mapping[str, tuple[float, float]] = {
     "calm": (0.0, 0.0),
@@ -91,7 +111,8 @@ WINDS: Mapping[str, tuple[float, float]] = {
 """Where the air moves to: north and east, of V0."""
 
 DURATION, HOMEWARD_DURATION = 8.0, 25.0
-"""Radii at V0: 3 to the fence against the wind, a turn, and the way home; 14 round the U against 0.4 V."""
+"""Radii at V0: 3 to the fence against the wind, a turn, and the way home; 14 round the U against
+0.4 V."""
 
 
 class Row(NamedTuple):
@@ -122,13 +143,20 @@ def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
     def scaled(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(radius * value for value in values)
 
-    return tuple(zone._replace(north=scaled(zone.north), east=scaled(zone.east), radius=radius * zone.radius) for zone in zones)
+    return tuple(
+        zone._replace(north=scaled(zone.north), east=scaled(zone.east), radius=radius * zone.radius)
+        for zone in zones
+    )
 
 
 def windy(
-    scenario: Scenario, wind: tuple[float, float], home: tuple[float, float], radii: float = DURATION
+    scenario: Scenario,
+    wind: tuple[float, float],
+    home: tuple[float, float],
+    radii: float = DURATION,
 ) -> tuple[Scenario, GuidanceConfig, float]:
-    """A scenario in a wind, share of V0, without a route, that flies to the north; its section, and the least radius, m.
+    """A scenario in a wind, share of V0, without a route, that flies to the north; its section, and
+    the least radius, m.
 
     `home` in radii; `radii`: the duration, at V0.
     """
@@ -141,7 +169,11 @@ def windy(
     varied = scenario.vary(
         flight={"duration": float(math.ceil(radii * radius / speed))},
         aircraft={"wind": [north, east], "turbulence": turbulence(scenario, 1)},
-        guidance={"wind": section.wind, "route": None, "home": dict(zip(("north", "east"), at(home, radius), strict=True))},
+        guidance={
+            "wind": section.wind,
+            "route": None,
+            "home": dict(zip(("north", "east"), at(home, radius), strict=True)),
+        },
     )
     return varied, section, radius
 
@@ -151,10 +183,16 @@ def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
     return place[0] * radius, place[1] * radius
 
 
-def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: bool = False) -> Row:
-    """The row of uncertain ospreys. The fence is put round the mission afterwards, as guidance refuses a route out of it."""
+def fly_fleet(
+    shape: str, wind: str, aircraft: int, seed: int, *, from_outside: bool = False
+) -> Row:
+    """The row of uncertain ospreys. The fence is put round the mission afterwards, as guidance
+    refuses a route out of it.
+    """
     fence = OUTSIDE[shape] if from_outside else Fence(SHAPES[shape], HOME)
-    share, radii = (OUTSIDE_WINDS[wind], HOMEWARD_DURATION) if from_outside else (WINDS[wind], DURATION)
+    share, radii = (
+        (OUTSIDE_WINDS[wind], HOMEWARD_DURATION) if from_outside else (WINDS[wind], DURATION)
+    )
     scenario, _, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
     route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario, airframe = scenario.vary(guidance={"route": route}), load_airframe("osprey")
@@ -165,16 +203,22 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
     control_law, params = scenario.controller.tuned_law()
     beyond, banks, lost, home = [], [], 0, 0
     for first in range(0, aircraft, CHUNK):
-        A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
+        A, B = sampled_matrices(
+            airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first)
+        )
         directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
-        assembled = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
+        assembled = batch_matrices.assemble(
+            A, B, scenario.aircraft.plant(), course, gust_directions=directions
+        )
         result = batch.fly(assembled, vehicle, course, control_law, batch.shared(params), mission)
         figures = result.mission or {}
         beyond += np.asarray(figures["max.breach"]).tolist()
         banks += np.asarray(figures["max.phi"]).tolist()
         lost += int(np.sum(np.asarray(result.diverged)))
         home += int(np.sum(np.asarray(figures["home"]) <= HOME_RADII * radius))
-    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)._replace(home=home)
+    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)._replace(
+        home=home
+    )
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
@@ -182,7 +226,12 @@ def fly_alone(name: str, shape: str, wind: str) -> Row:
     scenario, section, radius = windy(aircraft_of(name), WINDS[wind], HOME)
     zones = of_radius(SHAPES[shape], radius)
     fence = {
-        f"zone{k}": {"north": zone.north, "east": zone.east, "radius": zone.radius or None, "exclude": zone.exclude}
+        f"zone{k}": {
+            "north": zone.north,
+            "east": zone.east,
+            "radius": zone.radius or None,
+            "exclude": zone.exclude,
+        }
         for k, zone in enumerate(zones)
     }
     program = {"course": {"start": [0.1], "value": [0.0]}}
@@ -206,21 +255,40 @@ def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]
     return homes
 
 
-def row_of(name: str, shape: str, wind: str, beyond: list[float], banks: list[float], lost: int, largest: float) -> Row:
+def row_of(
+    name: str,
+    shape: str,
+    wind: str,
+    beyond: list[float],
+    banks: list[float],
+    lost: int,
+    largest: float,
+) -> Row:
     """A row from the distances beyond the fence, m, and the largest banks of the flights."""
-    outside, turned = sum(distance > 0.0 for distance in beyond), sum(bank > 0.9 * largest for bank in banks)
+    outside, turned = (
+        sum(distance > 0.0 for distance in beyond),
+        sum(bank > 0.9 * largest for bank in banks),
+    )
     return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost, 0)
 
 
 def main() -> int:
     """Fly, print the rows and store them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=[*AIRCRAFT], help="aircraft")
-    parser.add_argument("--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences; not stored")
-    parser.add_argument("--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds; not stored")
+    parser.add_argument(
+        "--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences; not stored"
+    )
+    parser.add_argument(
+        "--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds; not stored"
+    )
     parser.add_argument("--aircraft", type=int, default=2000, help="ospreys in each row")
     parser.add_argument("--seed", type=int, default=7, help="of the ospreys")
-    parser.add_argument("--from-outside", action="store_true", help="start ospreys outside of a fence; not stored")
+    parser.add_argument(
+        "--from-outside", action="store_true", help="start ospreys outside of a fence; not stored"
+    )
     chosen = parser.parse_args()
     writer, failed = csv.writer(sys.stdout), False
     writer.writerow(Row._fields)
@@ -228,16 +296,25 @@ def main() -> int:
         return int(not all(fly_home(chosen.aircraft, chosen.seed, writer.writerow)))
     for name in chosen.only:
         options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
-        begun, flown = evidence.origin(f"python -m benchmarks.fence --only {name}{options}"), list[Row]()
+        begun, flown = (
+            evidence.origin(f"python -m benchmarks.fence --only {name}{options}"),
+            list[Row](),
+        )
         for shape, wind in product(chosen.shapes, chosen.winds):
             of_fleet = name == OSPREY
-            row = fly_fleet(shape, wind, chosen.aircraft, chosen.seed) if of_fleet else fly_alone(name, shape, wind)
+            row = (
+                fly_fleet(shape, wind, chosen.aircraft, chosen.seed)
+                if of_fleet
+                else fly_alone(name, shape, wind)
+            )
             flown.append(row)
             writer.writerow(row)
             sys.stdout.flush()
             failed |= bool(row.outside or row.lost)
         if len(flown) == len(SHAPES) * len(WINDS):
-            evidence.write(f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun)
+            evidence.write(
+                f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun
+            )
     return int(failed)
 
 

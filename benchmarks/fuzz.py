@@ -3,12 +3,13 @@
 """Coverage-guided fuzzing of all readers of external input (tests/fuzz/targets.py), with atheris.
 
 python -m benchmarks.fuzz mcap --seconds 60          # or any other target of tests/fuzz/targets.py
-python -m benchmarks.fuzz all --seconds 60           # every target, a core each; prints statistics as JSON
-python -m benchmarks.fuzz mcap --replay FILE ...     # each input once, under the same limits, without atheris
+python -m benchmarks.fuzz all --seconds 60  # every target, a core each; prints statistics as JSON
+python -m benchmarks.fuzz mcap --replay FILE ...
+    # each input once, under the same limits, without atheris
 
-A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input that raises, hangs or takes
-too much memory it ends with a status other than 0 and keeps the input in runs/fuzz/<target>/. Fix the reader and add the
-input to the corpus.
+A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input
+that raises, hangs or takes too much memory it ends with a status other than 0 and keeps the input
+in runs/fuzz/<target>/. Fix the reader and add the input to the corpus.
 """
 
 import argparse
@@ -35,18 +36,33 @@ TIMEOUT = 20  # s an input of a few kB; processor time in a replay, wall time wh
 MEMORY_MB = 1500  # of the process; the libraries of the readers take 250
 MAX_LENGTH = 16 * 1024  # bytes of an input
 STACK = [
-    *("aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_log", "flight_recorder", "flight_view"),
+    *(
+        "aircraft_sim",
+        "autopilot_bridge",
+        "flight_analysis",
+        "flight_core",
+        "flight_log",
+        "flight_recorder",
+        "flight_view",
+    ),
     *("flight_guidance", "rise_di_controller"),
 ]
 
 
 def main() -> None:
     """Fuzz, or replay."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, targets, control, page or all"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = (
+        "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, "
+        "targets, control, page or all"
+    )
     parser.add_argument("target", help=names)
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
-    parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")
+    parser.add_argument(
+        "--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing"
+    )
     arguments = parser.parse_args()
     if arguments.replay is not None:
         replay(arguments.target, arguments.replay)
@@ -78,7 +94,9 @@ def replay(target: str, files: list[Path]) -> None:
 
 
 def fuzz_all(seconds: int) -> None:
-    """Fuzz every target in a process of its own; print the statistics and the exit status of each fuzzer."""
+    """Fuzz every target in a process of its own; print the statistics and the exit status of each
+    fuzzer.
+    """
     from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - as above
 
     def statistics(target: str) -> dict[str, int]:
@@ -95,12 +113,18 @@ def fuzz_all(seconds: int) -> None:
 
 
 def fuzz(target: str, seconds: int) -> int:
-    """Fuzz for `seconds` in another process, whose files are removed afterwards. Returns its exit status."""
+    """Fuzz for `seconds` in another process, whose files are removed afterwards. Returns its exit
+    status.
+    """
     memory = Path("/dev/shm")  # noqa: S108 - for speed
-    with tempfile.TemporaryDirectory(prefix=f"fuzz-{target}-", dir=memory if memory.is_dir() else None) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix=f"fuzz-{target}-", dir=memory if memory.is_dir() else None
+    ) as folder:
         process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)))
         process.start()
-        with suppress(KeyboardInterrupt):  # Ctrl-C has reached the fuzzer too, which ends with its statistics
+        with suppress(
+            KeyboardInterrupt
+        ):  # Ctrl-C has reached the fuzzer too, which ends with its statistics
             process.join()
         process.join()
     return process.exitcode or 0
@@ -123,7 +147,12 @@ def _fuzz(target: str, seconds: int, scratch: Path) -> None:
     corpora = [str(path) for path in (inputs, CORPUS / target) if path.is_dir()]
     folder = scratch / "read"
     folder.mkdir()
-    limits = {"max_total_time": seconds, "timeout": TIMEOUT, "rss_limit_mb": MEMORY_MB, "max_len": MAX_LENGTH}
+    limits = {
+        "max_total_time": seconds,
+        "timeout": TIMEOUT,
+        "rss_limit_mb": MEMORY_MB,
+        "max_len": MAX_LENGTH,
+    }
     options = limits | {"artifact_prefix": f"{findings}/", "print_final_stats": 1}
     arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *corpora]
 

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone, in calm air and in turbulence of 1.5 m/s.
+"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone, in calm air and in
+turbulence of 1.5 m/s.
 
-    .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit] [--seeds 5]
-    .venv/bin/python -m benchmarks.guidance --route    # another route, on aircraft that guidance was not built with
+    .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit]
+    [--seeds 5]
+    .venv/bin/python -m benchmarks.guidance --route
+        # another route, on aircraft that guidance was not built with
 
-The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Flights in one process. Each row is
-a figure with its limit; in turbulence it is the worst of all seeds. The rectangle is flown without wind and with a wind of a
-fifth of the airspeed across its first leg. No number is tuned to an aircraft. The 737 is identified first, which takes some
-minutes.
+The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Flights
+in one process. Each row is a figure with its limit; in turbulence it is the worst of all seeds. The
+rectangle is flown without wind and with a wind of a fifth of the airspeed across its first leg. No
+number is tuned to an aircraft. The 737 is identified first, which takes some minutes.
 """
 
 import argparse
@@ -51,12 +54,17 @@ WIND = 0.2  # of V0
 RECTANGLE = ((0, 0, 0), (3, 0, 0), (3, 2.5, 0), (0, 2.5, 0), (0, 0, 0))
 ROUTE = ((0, 0, 0), (3, 0, 10), (5, 2, 10), (5, 5, 0), (2.5, 6.25, 0), (2.5, 3, 0), (0, 2.375, 0))
 """Waypoints as of `round_route`. The second route turns by 45, 45, 63, 117 and -76 deg."""
-LOW, LOW_WIND = 100.0, 10.9  # m and m/s at 20 ft, for an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C
+LOW, LOW_WIND = (
+    100.0,
+    10.9,
+)  # m and m/s at 20 ft, for an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C
 SWITCH_PERIOD = 5.0  # s
 FAULT = START + 10.0  # s, of a fault of pose, in a turn
 ANGLE_NOISE = math.radians(0.5)
 NOISE = dict.fromkeys(("phi", "theta", "beta"), ANGLE_NOISE) | {"psi": 2.0 * ANGLE_NOISE}
-NOISE |= dict.fromkeys(("north", "east", "altitude"), 0.5) | dict.fromkeys(("v_north", "v_east", "climb"), 0.2)
+NOISE |= dict.fromkeys(("north", "east", "altitude"), 0.5) | dict.fromkeys(
+    ("v_north", "v_east", "climb"), 0.2
+)
 """Standard deviations of a poor estimator, rad, m and m/s, white."""
 
 
@@ -82,7 +90,9 @@ class Figure(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """How guidance receives pose: `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on."""
+    """How guidance receives pose: `aircraft.pose` of the scenario, and a fault for `fault` s from
+    FAULT on.
+    """
 
     measured: Mapping[str, Any] = MappingProxyType({})
     fault: float = 0.0  # s
@@ -92,7 +102,9 @@ class Pose(NamedTuple):
 
 
 class FaultyPose(Guidance):
-    """Guidance that receives pose with the fault. As the node does, it refuses a sample that is not newer or stands still."""
+    """Guidance that receives pose with the fault. As the node does, it refuses a sample that is not
+    newer or stands still.
+    """
 
     def __init__(self, how: Pose, parameters: GuidanceConfig) -> None:
         super().__init__(parameters)
@@ -105,7 +117,9 @@ class FaultyPose(Guidance):
             if how.off is None:
                 sample = last._replace(stamp_ns=sample.stamp_ns) if how.stamped else last
             else:
-                off = dict(zip(POSE, sample.value + [how.off.get(name, 0.0) for name in POSE], strict=True))
+                off = dict(
+                    zip(POSE, sample.value + [how.off.get(name, 0.0) for name in POSE], strict=True)
+                )
                 off["psi"] = wrapped(off["psi"])
                 sample = sample._replace(value=np.array([*off.values()]))
         super().take_pose(sample, now_ns)
@@ -115,7 +129,9 @@ class Manoeuvre(NamedTuple):
     """A manoeuvre: the section of guidance and the duration, s; and its figures."""
 
     plan: Callable[[GuidanceConfig], tuple[dict[str, Any], float]]
-    figures: Callable[[Tape, GuidanceConfig, bool], Iterator[Figure]]  # the last: whether the air is calm
+    figures: Callable[
+        [Tape, GuidanceConfig, bool], Iterator[Figure]
+    ]  # the last: whether the air is calm
     winds: tuple[float, ...] = (0.0,)
     turbulent: bool = True
     pose: Pose = Pose()
@@ -146,10 +162,16 @@ def rms(values: FloatArray) -> float:
 def of_phi(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot and settling of a step of the bank; rms in turbulence."""
     if calm:
-        yield Figure("overshoot (%)", 100.0 * (tape["guidance"]["pose.phi"].max() / BANK - 1.0), 8.0)
-        yield Figure("settled to 1 deg (s)", settled(tape, "pose.phi", BANK, math.radians(1.0)), 4.0)
+        yield Figure(
+            "overshoot (%)", 100.0 * (tape["guidance"]["pose.phi"].max() / BANK - 1.0), 8.0
+        )
+        yield Figure(
+            "settled to 1 deg (s)", settled(tape, "pose.phi", BANK, math.radians(1.0)), 4.0
+        )
     else:
-        yield Figure("rms (deg)", math.degrees(rms(after(tape, START + 5.0, "pose.phi")[0] - BANK)), 3.0)
+        yield Figure(
+            "rms (deg)", math.degrees(rms(after(tape, START + 5.0, "pose.phi")[0] - BANK)), 3.0
+        )
 
 
 def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
@@ -161,22 +183,38 @@ def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figu
 
 
 def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Heading and altitude as received over the last 10 s, the true bank then, and how long the wings were levelled."""
+    """Heading and altitude as received over the last 10 s, the true bank then, and how long the
+    wings were levelled.
+    """
     end = tape.time("guidance")[-1] - 10.0
-    psi, altitude, wanted, lateral = after(tape, end, "pose.psi", "pose.altitude", "target.altitude", "mode.lateral")
+    psi, altitude, wanted, lateral = after(
+        tape, end, "pose.psi", "pose.altitude", "target.altitude", "mode.lateral"
+    )
     if lateral[0] == Lateral.HEADING:  # not after a loss of pose
-        yield Figure("heading (deg)", math.degrees(abs(float(np.mean(np.mod(psi, 2.0 * math.pi))) - math.pi)), 1.0)
+        yield Figure(
+            "heading (deg)",
+            math.degrees(abs(float(np.mean(np.mod(psi, 2.0 * math.pi))) - math.pi)),
+            1.0,
+        )
     yield Figure("altitude (m)", abs(float(np.mean(altitude - wanted))), 1.0)
-    yield Figure("bank at the end (deg)", math.degrees(np.abs(tape["truth"]["x.phi"][tape.time("truth") > end]).max()), 5.0)
+    yield Figure(
+        "bank at the end (deg)",
+        math.degrees(np.abs(tape["truth"]["x.phi"][tape.time("truth") > end]).max()),
+        5.0,
+    )
     stale = after(tape, 0.0, "mode")[0] != Mode.ENGAGED
-    yield Figure("pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf)
+    yield Figure(
+        "pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf
+    )
 
 
 def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot of a climb and what it costs in airspeed."""
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     start = tape["guidance"]["target.altitude"][0]
-    yield Figure("overshoot (%)", 100.0 * ((altitude.max() - start) / CLIMB - 1.0), 3.0 if calm else 20.0)
+    yield Figure(
+        "overshoot (%)", 100.0 * ((altitude.max() - start) / CLIMB - 1.0), 3.0 if calm else 20.0
+    )
     if calm:
         yield Figure("V (m/s)", np.abs(V).max(), 4.0)
     else:
@@ -184,7 +222,9 @@ def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Fig
 
 
 def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot of an acceleration and what it costs in altitude; rms of V in turbulence over that of the wind."""
+    """Overshoot of an acceleration and what it costs in altitude; rms of V in turbulence over that
+    of the wind.
+    """
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     step = FASTER * section.speed
     if calm:
@@ -208,15 +248,26 @@ def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) ->
 def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Rms of the cross-track error, in s of flight."""
     end = tape.time("guidance")[-1]
-    yield Figure("rms (s)", rms(after(tape, end - lap(section), "xtrack")[0]) / section.speed, 0.02 if calm else 0.15)
+    yield Figure(
+        "rms (s)",
+        rms(after(tape, end - lap(section), "xtrack")[0]) / section.speed,
+        0.02 if calm else 0.15,
+    )
 
 
 def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each input."""
+    """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each
+    input.
+    """
     t, u = tape.time("u"), tape["u"].values
     span = u.max(axis=0) - u.min(axis=0)
-    limits = np.array([RANGES.get(name, width) for name, width in zip(tape["u"].names, span, strict=True)])
-    jumps = [np.abs(u[at + 2] - u[at]) / limits for at in np.searchsorted(t, START + SWITCH_PERIOD * np.arange(len(SWITCHES)))]
+    limits = np.array(
+        [RANGES.get(name, width) for name, width in zip(tape["u"].names, span, strict=True)]
+    )
+    jumps = [
+        np.abs(u[at + 2] - u[at]) / limits
+        for at in np.searchsorted(t, START + SWITCH_PERIOD * np.arange(len(SWITCHES)))
+    ]
     yield Figure("jump of u (% of range)", 100.0 * float(np.max(jumps)), 2.0)
 
 
@@ -225,10 +276,16 @@ RANGES: dict[str, float] = {}
 
 
 def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
-    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any manoeuvre."""
+    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any
+    manoeuvre.
+    """
     phi, V = tape["truth"]["x.phi"], tape["guidance"]["y.V"]
     limit = 2.0 if calm else 3.0
-    yield Figure("bank beyond (deg)", math.degrees(np.abs(phi).max() - section.bank), limit if pose == Pose() else LATE)
+    yield Figure(
+        "bank beyond (deg)",
+        math.degrees(np.abs(phi).max() - section.bank),
+        limit if pose == Pose() else LATE,
+    )
     floor = section.params().limits.stall_speed * FLOOR
     yield Figure("V below 0.9 floor (m/s)", 0.9 * floor - (section.speed + V.min()), 0.0)
 
@@ -238,8 +295,12 @@ def lap(section: GuidanceConfig) -> float:
     return 2.0 * math.pi * section.least_radius() / section.speed
 
 
-def round_route(places: Sequence[tuple[float, float, float]], section: GuidanceConfig) -> tuple[dict[str, Any], float]:
-    """A route over places: north and east in least radii, which the fillets have, and altitude over that of trim, m."""
+def round_route(
+    places: Sequence[tuple[float, float, float]], section: GuidanceConfig
+) -> tuple[dict[str, Any], float]:
+    """A route over places: north and east in least radii, which the fillets have, and altitude over
+    that of trim, m.
+    """
     radius = float(math.ceil(least_radius(section.speed, section.wind, section.bank)))
     north, east, altitude = np.transpose(places) * [[radius], [radius], [1.0]]
     route = {"north": north.tolist(), "east": east.tolist(), "altitude": altitude.tolist()}
@@ -260,7 +321,9 @@ SWITCHES: tuple[dict[str, float], ...] = (
 def turn_round(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
     """A turn to the right onto the heading at which psi jumps, 180 deg."""
     duration = math.pi * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0
-    return {"program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}}, FAULT + duration
+    return {
+        "program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}
+    }, FAULT + duration
 
 
 POSES: Mapping[str, Pose] = {
@@ -271,8 +334,13 @@ POSES: Mapping[str, Pose] = {
     "frozen for 8 s": Pose(fault=8.0),
     "frozen for 8 s, new stamps": Pose(fault=8.0, stamped=True),
     "frozen for 20 s": Pose(fault=20.0),
-    "jump": Pose(fault=math.inf, off={"psi": math.radians(30.0), "north": 100.0, "east": 100.0, "altitude": 30.0}),
-    "one sample off": Pose(fault=0.02, off={"phi": 1.0, "theta": 0.3, "psi": math.pi, "altitude": 100.0, "climb": 20.0}),
+    "jump": Pose(
+        fault=math.inf,
+        off={"psi": math.radians(30.0), "north": 100.0, "east": 100.0, "altitude": 30.0},
+    ),
+    "one sample off": Pose(
+        fault=0.02, off={"phi": 1.0, "theta": 0.3, "psi": math.pi, "altitude": 100.0, "climb": 20.0}
+    ),
 }
 """A pose worse than the true one."""
 
@@ -298,31 +366,52 @@ MANOEUVRES: Mapping[str, Manoeuvre] = {
         of_heading,
     ),
     "altitude": Manoeuvre(
-        lambda section: ({"program": program(altitude=CLIMB)}, START + CLIMB / section.climb_limits()[0] + 60.0), of_altitude
+        lambda section: (
+            {"program": program(altitude=CLIMB)},
+            START + CLIMB / section.climb_limits()[0] + 60.0,
+        ),
+        of_altitude,
     ),
     "V": Manoeuvre(
         lambda section: (
             {"program": program(V=(1.0 + FASTER) * section.speed)},
-            START + FASTER * section.speed / section.params().slew[section.outputs.index("V")] + 80.0,
+            START
+            + FASTER * section.speed / section.params().slew[section.outputs.index("V")]
+            + 80.0,
         ),
         of_speed,
     ),
-    "rectangle": Manoeuvre(partial(round_route, RECTANGLE), partial(of_route, len(RECTANGLE)), (0.0, WIND)),
+    "rectangle": Manoeuvre(
+        partial(round_route, RECTANGLE), partial(of_route, len(RECTANGLE)), (0.0, WIND)
+    ),
     "orbit": Manoeuvre(
         lambda section: (
-            {"program": program(north=0.0, east=section.least_radius() + 1.0, radius=section.least_radius() + 1.0)},
+            {
+                "program": program(
+                    north=0.0,
+                    east=section.least_radius() + 1.0,
+                    radius=section.least_radius() + 1.0,
+                )
+            },
             2.0 * lap(section) + 30.0,
         ),
         of_orbit,
     ),
     "switch": Manoeuvre(switching, of_switch, turbulent=False),
-    **{f"pose: {name}": Manoeuvre(turn_round, of_pose, turbulent=False, pose=pose) for name, pose in POSES.items()},
+    **{
+        f"pose: {name}": Manoeuvre(turn_round, of_pose, turbulent=False, pose=pose)
+        for name, pose in POSES.items()
+    },
 }
-OTHER_ROUTE = {"route": Manoeuvre(partial(round_route, ROUTE), partial(of_route, len(ROUTE)), (0.0, WIND))}
+OTHER_ROUTE = {
+    "route": Manoeuvre(partial(round_route, ROUTE), partial(of_route, len(ROUTE)), (0.0, WIND))
+}
 
 
 def prepared(scenario: Scenario) -> Scenario:
-    """A scenario with guidance by rule in calm air, without the commands and the gusts of its own."""
+    """A scenario with guidance by rule in calm air, without the commands and the gusts of its
+    own.
+    """
     aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None}
     if not scenario.aircraft.is_jsbsim:
         aircraft |= {"kinematics": "euler"}
@@ -333,13 +422,17 @@ def prepared(scenario: Scenario) -> Scenario:
 
 @cache
 def aircraft_of(name: str) -> Scenario:
-    """The scenario of an aircraft, with guidance, and the stall speed as `rise-di identify --guidance` writes it."""
+    """The scenario of an aircraft, with guidance, and the stall speed as `rise-di identify
+    --guidance` writes it.
+    """
     scenario = prepared(original_of(name))
     if name not in CONDITIONS:
         return scenario
     from flight_design.identification.step_identification import slowest_trim  # noqa: PLC0415 - for these aircraft alone
 
-    return scenario.vary(guidance={"stall_speed": slowest_trim(scenario.aircraft.flight_condition())})
+    return scenario.vary(
+        guidance={"stall_speed": slowest_trim(scenario.aircraft.flight_condition())}
+    )
 
 
 @cache
@@ -352,12 +445,15 @@ def original_of(name: str) -> Scenario:
         return find_scenario(f"jsbsim_{name}")
     from flight_design.identification.step_identification import identify  # noqa: PLC0415 - for this aircraft alone
 
-    return parse_scenario(identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml"))
+    return parse_scenario(
+        identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml")
+    )
 
 
 AIRCRAFT = ("osprey_servo", "c172p", "737", "f16")
 OTHERS = {"c182": (56.6, 1219.0), "A320": (154.0, 6096.0), "F4N": (180.0, 4572.0)}
-"""Aircraft of JSBSim on which nothing of guidance was tried while it was built: a light aircraft, an airliner, a fighter."""
+"""Aircraft of JSBSim on which nothing of guidance was tried while it was built: a light aircraft,
+an airliner, a fighter."""
 
 CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0), **OTHERS}
 """Trim speed, m/s, and altitude, m, of the aircraft that are identified."""
@@ -374,10 +470,15 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     for name in ("altitude", "theta"):
         if name in section.get("program", {}):
             offset = altitude if name == "altitude" else trim_pitch(scenario)
-            section["program"][name]["value"] = [offset + value for value in section["program"][name]["value"]]
+            section["program"][name]["value"] = [
+                offset + value for value in section["program"][name]["value"]
+            ]
     if "route" in section:
         section["route"]["altitude"] = [altitude + above for above in section["route"]["altitude"]]
-    aircraft: dict[str, Any] = {"wind": [0.0, air.across * speed], "pose": dict(manoeuvre.pose.measured)}
+    aircraft: dict[str, Any] = {
+        "wind": [0.0, air.across * speed],
+        "pose": dict(manoeuvre.pose.measured),
+    }
     if manoeuvre.figures is of_switch:
         aircraft["sensors"] = {}  # noise moves u by itself
     if air.seed is not None:
@@ -387,7 +488,12 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     RANGES.clear()
     if controller.lower and controller.upper:
         RANGES.update(
-            {name: high - low for name, low, high in zip(controller.inputs, controller.lower, controller.upper, strict=True)}
+            {
+                name: high - low
+                for name, low, high in zip(
+                    controller.inputs, controller.lower, controller.upper, strict=True
+                )
+            }
         )
     tape = simulate(varied, guide=partial(FaultyPose, manoeuvre.pose))
     if tape.outcome != COMPLETED:
@@ -401,7 +507,11 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
 def turbulence(scenario: Scenario, seed: int) -> dict[str, Any]:
     """The section `aircraft.turbulence`, with SIGMA."""
     altitude = scenario.aircraft.altitude or 0.0
-    low = {"altitude": LOW, "wind": LOW_WIND} if altitude == 0.0 else {"altitude": altitude, "sigma": SIGMA}
+    low = (
+        {"altitude": LOW, "wind": LOW_WIND}
+        if altitude == 0.0
+        else {"altitude": altitude, "sigma": SIGMA}
+    )
     return low | {"seed": seed}
 
 
@@ -411,9 +521,11 @@ def trim_pitch(scenario: Scenario) -> float:
 
 
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
-"""Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
+"""Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back
+without a washout."""
 LATE = 5.0
-"""Limit of the bank beyond its limit with a poor pose, deg. A pose 0.4 s old costs 8 deg at p_max where nothing predicts."""
+"""Limit of the bank beyond its limit with a poor pose, deg. A pose 0.4 s old costs 8 deg at p_max
+where nothing predicts."""
 
 
 class Row(NamedTuple):
@@ -440,7 +552,9 @@ def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
             wind = f", wind {across:g} V" if across else ""
             yield Job(title, f"calm{wind}", Air("calm", None, across))
             for seed in range(seeds if manoeuvre.turbulent else 0):
-                yield Job(title, f"turbulence{wind}, {seeds} seeds", Air("turbulence", seed + 1, across))
+                yield Job(
+                    title, f"turbulence{wind}, {seeds} seeds", Air("turbulence", seed + 1, across)
+                )
 
 
 def fly(scenario: Scenario, job: Job) -> list[Figure]:
@@ -449,36 +563,61 @@ def fly(scenario: Scenario, job: Job) -> list[Figure]:
 
 
 def rows(
-    name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int, over: Callable[..., Iterable[list[Figure]]] = map
+    name: str,
+    manoeuvres: Mapping[str, Manoeuvre],
+    seeds: int,
+    over: Callable[..., Iterable[list[Figure]]] = map,
 ) -> Iterator[Row]:
-    """All rows of an aircraft, as they are flown by `over`, which is `map` or that of a pool of processes."""
+    """All rows of an aircraft, as they are flown by `over`, which is `map` or that of a pool of
+    processes.
+    """
     several = list(jobs(manoeuvres, seeds))
     done = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
     for (title, shown), those in groupby(done, key=lambda flight: flight[0][:2]):
         worst: dict[str, Figure] = {}
         for figure in (figure for _, figures in those for figure in figures):
             own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
-            worst[figure.name] = max(figure._replace(limit=own), worst.get(figure.name, figure), key=lambda same: same.value)
+            worst[figure.name] = max(
+                figure._replace(limit=own),
+                worst.get(figure.name, figure),
+                key=lambda same: same.value,
+            )
         yield from (Row(name, title, shown, figure) for figure in worst.values())
 
 
 def main() -> None:
-    """Fly, store the results and write the page; exit status 1 where a limit is not met or a point is lost."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Fly, store the results and write the page; exit status 1 where a limit is not met or a point
+    is lost.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")
-    parser.add_argument("--manoeuvres", nargs="*", choices=[*MANOEUVRES], default=[*MANOEUVRES], help="manoeuvres; not stored")
+    parser.add_argument(
+        "--manoeuvres",
+        nargs="*",
+        choices=[*MANOEUVRES],
+        default=[*MANOEUVRES],
+        help="manoeuvres; not stored",
+    )
     parser.add_argument("--seeds", type=int, default=5, help="of the turbulence")
-    parser.add_argument("--route", action="store_true", help=f"another route, on {', '.join(OTHERS)}, instead")
+    parser.add_argument(
+        "--route", action="store_true", help=f"another route, on {', '.join(OTHERS)}, instead"
+    )
     options = parser.parse_args()
     if options.route:
         begun = origin(f"--route --seeds {options.seeds}")
-        flown = [kept for name in OTHERS for kept in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)]
+        flown = [
+            kept for name in OTHERS for kept in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)
+        ]
         store("route", (figure_row(kept.aircraft, kept) for kept in flown), begun)
         sys.exit(any(kept.figure.missed for kept in flown))
     failed = 0
     for name in options.only:
         begun = origin(f"--only {name} --seeds {options.seeds}")
-        flown = fly_manoeuvres(name, {title: MANOEUVRES[title] for title in options.manoeuvres}, options.seeds)
+        flown = fly_manoeuvres(
+            name, {title: MANOEUVRES[title] for title in options.manoeuvres}, options.seeds
+        )
         if len(options.manoeuvres) == len(MANOEUVRES):
             store(name, (figure_row(kept.manoeuvre, kept) for kept in flown), begun)
         failed += any(kept.figure.missed for kept in flown)
@@ -504,13 +643,22 @@ def figure_row(about: str, flown: Row) -> evidence.Row:
 
 def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> list[Row]:
     """Fly the manoeuvres of an aircraft and print the table."""
-    table = new_table(f"Guidance by rule, {name}", ("manoeuvre", "air", "figure", "worst", "limit", ""), texts=3)
+    table = new_table(
+        f"Guidance by rule, {name}", ("manoeuvre", "air", "figure", "worst", "limit", ""), texts=3
+    )
     kept = []
     with ProcessPoolExecutor() as pool:
         for flown in rows(name, manoeuvres, seeds, pool.map):
             figure = flown.figure
             verdict = "missed" if figure.missed else ""
-            cells = (flown.manoeuvre, flown.air, figure.name, f"{figure.value:.3g}", f"{figure.limit:.3g}", verdict)
+            cells = (
+                flown.manoeuvre,
+                flown.air,
+                figure.name,
+                f"{figure.value:.3g}",
+                f"{figure.limit:.3g}",
+                verdict,
+            )
             print(name, *cells, sep="\t", file=sys.stderr, flush=True)
             table.add_row(*cells)
             kept.append(flown)

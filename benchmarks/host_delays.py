@@ -14,7 +14,8 @@ Intervals = Sequence[tuple[int, int]] | NDArray[np.int64]
 def missed_excluding_delays(skipped: Intervals, delays: Intervals, period_ns: int) -> int:
     """Missed deadlines, excluding host delays.
 
-    `skipped`: from the first missed deadline to the next tick. The rest of each skip counts in whole periods.
+    `skipped`: from the first missed deadline to the next tick. The rest of each skip counts in
+    whole periods.
     """
     return int(np.sum(excluding_delays(skipped, delays) // period_ns))
 
@@ -22,13 +23,18 @@ def missed_excluding_delays(skipped: Intervals, delays: Intervals, period_ns: in
 def excluding_delays(intervals: Intervals, delays: Intervals) -> NDArray[np.int64]:
     """Length of each interval outside of the host delays, ns, shape (N,).
 
-    `delays`: when a core ran none of our processes; they may overlap. All cores count, since the scheduler may run the process
-    on any.
+    `delays`: when a core ran none of our processes; they may overlap. All cores count, since the
+    scheduler may run the process on any.
     """
     begin, end = np.asarray(intervals, dtype=np.int64).reshape(-1, 2).T
     origin = int(begin.min(initial=np.iinfo(np.int64).max))
-    edges, total = [0], [0]  # of the disjoint delays: begins and ends after the origin, and the time in delays until each
-    for since, until in sorted((int(begin_ns) - origin, int(end_ns) - origin) for begin_ns, end_ns in delays):
+    edges, total = (
+        [0],
+        [0],
+    )  # of the disjoint delays: begins and ends after the origin, and the time in delays until each
+    for since, until in sorted(
+        (int(begin_ns) - origin, int(end_ns) - origin) for begin_ns, end_ns in delays
+    ):
         first = max(since, edges[-1])
         if until > first:
             edges += [first, until]

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/experiments.md.
+"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables
+of docs/experiments.md.
 
-.venv/bin/python -m benchmarks.jsbsim_fleet               the aircraft of FLEET, some ten seconds each
+.venv/bin/python -m benchmarks.jsbsim_fleet  the aircraft of FLEET, some ten seconds each
 .venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft
 """
 
@@ -26,16 +27,21 @@ KNOT, FOOT = 1852.0 / 3600.0, 0.3048  # m/s, m; exact
 
 # fmt: off
 FLEET = {
-    "c172p": (90, 4000), "c172x": (90, 4000), "J3Cub": (60, 2000), "DHC6": (130, 6000), "T37": (200, 8000),
+    "c172p": (90, 4000), "c172x": (90, 4000), "J3Cub": (60, 2000), "DHC6": (130, 6000),
+    "T37": (200, 8000),
     "F80C": (260, 12000), "A4": (300, 15000), "T38": (300, 12000), "f16": (300, 10000),
     "global5000": (330, 25000), "737": (300, 20000), "B747": (350, 25000),
 }
-"""Light and utility aircraft, trainers, fighters, business jet, airliners: a usual true airspeed, kt, and altitude, ft."""
+"""Light and utility aircraft, trainers, fighters, business jet, airliners: a usual true airspeed,
+kt, and altitude, ft."""
 
 # fmt: on
 DEFAULT = (100, 3000)
 
-LEARNED, LEARN_DURATION = 34.0, 94.0  # s: the model of the window that ends at 30 s flies; the next one flies at 64 s
+LEARNED, LEARN_DURATION = (
+    34.0,
+    94.0,
+)  # s: the model of the window that ends at 30 s flies; the next one flies at 64 s
 
 
 def main() -> None:
@@ -73,8 +79,13 @@ def _row(title: str, aircraft: IdentifiedAircraft) -> str:
             " ".join(f"{sign:+d}"[0] for sign in aircraft.D),
             " / ".join(f"{lag:.2g}" for lag in steps.lag),
             f"{aircraft.sideslip_zero:.2g}",
-            *(_errors(flight) for title in aircraft.flights for flight in (aircraft.flights[title], pi[title])),
-            " / ".join(f"{aircraft.flights['turbulence'].largest[name]:.2g}" for name in INPUTS) + " |",
+            *(
+                _errors(flight)
+                for title in aircraft.flights
+                for flight in (aircraft.flights[title], pi[title])
+            ),
+            " / ".join(f"{aircraft.flights['turbulence'].largest[name]:.2g}" for name in INPUTS)
+            + " |",
         )
     )
 

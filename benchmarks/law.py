@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy multiply-add of the same size.
+"""Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy
+multiply-add of the same size.
 
 python -m benchmarks.speed --only law
 """
@@ -37,14 +38,18 @@ FLOOR = "NumPy a * x + b"
 
 
 def measure() -> dict[str, tuple[float, float, float]]:
-    """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick, and the multiply-add."""
+    """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick,
+    and the multiply-add.
+    """
     controller = find_scenario("osprey_gust").controller
     law, tuned, limits = controller.law_params(), controller.tuned_law(), controller.guard()
     rng = np.random.default_rng(1)
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
     dt, zero = 0.01, np.zeros(4)
     law_state = engage(y[0], y_m)
-    engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, tuned)
+    engaged, _ = guard.tick(
+        guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, tuned
+    )
 
     def with_anti_windup(k: int) -> object:
         return step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
@@ -52,7 +57,9 @@ def measure() -> dict[str, tuple[float, float, float]]:
     def whole_tick(k: int) -> object:
         stamp_ns = limits.period_ns
         references = [StampedVector(0, y_m), StampedVector(stamp_ns, y_m)]
-        return guard.tick(engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
+        return guard.tick(
+            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
+        )
 
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),
@@ -69,11 +76,15 @@ def measure_observer() -> tuple[float, float, float]:
     rng = np.random.default_rng(1)
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, rng.normal(size=(REPEATS, 4)) * 0.01
     references = [StampedVector(0, y_m[0])]
-    engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), references, limits, tuned)
+    engaged, _ = guard.tick(
+        guard.initial_state(4), 0, StampedVector(0, y[0]), references, limits, tuned
+    )
     stamp_ns = limits.period_ns
 
     def tick(k: int) -> object:
         references = [StampedVector(0, y_m[0]), StampedVector(stamp_ns, y_m[k])]
-        return guard.tick(engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
+        return guard.tick(
+            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
+        )
 
     return percentiles(tick)

@@ -1,16 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's model and the true one.
+"""Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's
+model and the true one.
 
-python -m benchmarks.learning                                     # every cell, 50 aircraft: at most 90 min on two idle cores
-python -m benchmarks.learning --aircraft 6                        # with fewer; run again, it flies what is missing
+python -m benchmarks.learning  # every cell, 50 aircraft: at most 90 min on two idle cores
+python -m benchmarks.learning --aircraft 6  # with fewer; run again, it flies what is missing
 python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
 
-An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
-osprey_observer, as the others do, and as the laws of `rise-di compare` do with their gains for the airframe file. A row an
-aircraft goes to build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where
-the airs of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3 min of a core over
-all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each.
+An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the
+commands and the two gusts of osprey_observer, as the others do, and as the laws of `rise-di
+compare` do with their gains for the airframe file. A row an aircraft goes to build/learning.csv.
+The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where the airs
+of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3
+min of a core over all cells. For false alarms at most two aircraft fly 600 s without damage in each
+air, 2 min of a core each.
 """
 
 import csv
@@ -62,9 +65,15 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 REPOSITORY = Path(__file__).parents[1]
 IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
 SEED = 11  # of the aircraft
-LEARNED, DAMAGED, SETTLED, END = 64.0, 60.0, 75.0, 100.0  # s: when the last model flies; the fault, and what counts after it
+LEARNED, DAMAGED, SETTLED, END = (
+    64.0,
+    60.0,
+    75.0,
+    100.0,
+)  # s: when the last model flies; the fault, and what counts after it
 WINDOWS = ((0.0, 14.0), (14.0, 30.0), (30.0, DAMAGED), (DAMAGED, SETTLED), (SETTLED, END))
-"""s, of a flight with damage: before the first model, with the first ones, learned, from the damage on, and learned again."""
+"""s, of a flight with damage: before the first model, with the first ones, learned, from the damage
+on, and learned again."""
 UPDATE = 1.0  # s, of a core, for the two parts of the osprey
 LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
 REPEATED = 35.0  # s, after which the commands of osprey_learn come again
@@ -72,11 +81,19 @@ ROUGH = 0.6  # deviation of the logarithms of the entries of a rough prior
 WEAK, COUPLING = 0.5, 0.1
 ALARM_FLIGHT = 600.0  # s
 COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
-LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
+LABELS = {
+    "alone": "the law alone",
+    "file": "model of the file",
+    "learner": "learner",
+    "true": "true model",
+}
 PALETTE = 32  # colours of the picture
-RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"), "gust_turbulence"
-"""Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file in the loop of osprey_servo.
-MRAC measures the full state, and INDI the actuators too."""
+RIVALS, OBJECTIVE = (
+    ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"),
+    "gust_turbulence",
+)
+"""Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file
+in the loop of osprey_servo. MRAC measures the full state, and INDI the actuators too."""
 TRAIN = {  # m/s, m, s: a gust every 3 to 7 s
     "vertical": {"start": 1.0, "speed": 8.0, "length": 15.0, "every": 4.7},
     "lateral": {"start": 2.5, "speed": 5.0, "length": 12.0, "every": 6.1},
@@ -102,7 +119,11 @@ class Cell(NamedTuple):
     most: int = sys.maxsize  # aircraft
 
 
-CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbulence", "gusts", "calm") for p in (0.3, 0.5)} | {
+CELLS = {
+    f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p)
+    for air in ("turbulence", "gusts", "calm")
+    for p in (0.3, 0.5)
+} | {
     "rough prior": Cell("rough", "turbulence", 0.3, 0.5),
     "coupled": Cell("coupled", "turbulence", 0.3, 0.25),
     "u late": Cell("late", "turbulence", 0.3, 0.25),
@@ -112,11 +133,15 @@ CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbule
 }
 
 
-OSPREY = Cell("learn", "calm", 0.3)  # any cell with the airframe, the actuators and the noise of the library
+OSPREY = Cell(
+    "learn", "calm", 0.3
+)  # any cell with the airframe, the actuators and the noise of the library
 
 
 class Row(NamedTuple):
-    """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not flown."""
+    """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not
+    flown.
+    """
 
     cell: str
     number: int
@@ -139,7 +164,9 @@ class Row(NamedTuple):
     update: float = 0.0  # s of a core, mean: identification, test for a change and design
     longest: float = 0.0  # s of a core, the same
     replayed: int = 0
-    windows: str = ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
+    windows: str = (
+        ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
+    )
     events: str = ""
     revision: str = ""  # of the code that flew
 
@@ -163,7 +190,9 @@ class Timed:
 
 
 def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenario:
-    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again and again."""
+    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again
+    and again.
+    """
     shipped, seed = find_scenario("osprey_learn"), {"seed": 1000 + number}
     sampled = {"A": cell.uncertainty, "B": cell.uncertainty, "seed": SEED, "number": number}
     air = AIR[cell.air]
@@ -171,31 +200,56 @@ def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenar
     pulses: dict[str, dict[str, list[float]]] = {}
     for name, pulse in shipped.reference_model.pulses.items():
         begins = [REPEATED * k for k in range(math.ceil(duration / REPEATED))]
-        times = {key: [begin + t for begin in begins for t in getattr(pulse, key)] for key in ("start", "stop")}
+        times = {
+            key: [begin + t for begin in begins for t in getattr(pulse, key)]
+            for key in ("start", "stop")
+        }
         pulses[name] = times | {"value": list(pulse.value) * len(begins)}
-    sensors = shipped.aircraft.sensors.model_dump() | seed | ({"delay": LATE} if cell.kind == "late" else {})
-    aircraft = {"rate": 100.0, "step": 0.005, "uncertainty": sampled, "sensors": sensors} | air | changed
+    sensors = (
+        shipped.aircraft.sensors.model_dump()
+        | seed
+        | ({"delay": LATE} if cell.kind == "late" else {})
+    )
+    aircraft = (
+        {"rate": 100.0, "step": 0.005, "uncertainty": sampled, "sensors": sensors} | air | changed
+    )
     reference = {"rate": 100.0, "pulses": pulses}
     return shipped.vary(flight={"duration": duration}, aircraft=aircraft, reference_model=reference)
 
 
 def evaluation(flown: Scenario) -> Scenario:
-    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned and other noise."""
+    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned and
+    other noise.
+    """
     shipped = find_scenario("osprey_observer")
-    own = {key: getattr(flown.aircraft, key).model_dump() for key in ("uncertainty", "actuators", "sensors")}
+    own = {
+        key: getattr(flown.aircraft, key).model_dump()
+        for key in ("uncertainty", "actuators", "sensors")
+    }
     aircraft = own | {"airframe": flown.aircraft.airframe, "rate": 100.0, "step": 0.005}
     aircraft["sensors"]["seed"] += 5000
     return shipped.vary(aircraft=aircraft, reference_model={"rate": 100.0})
 
 
-def score(tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf) -> float:
-    """Sum over the outputs of the true rms error in units of a score; infinite for a flight that ended early."""
+def score(
+    tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf
+) -> float:
+    """Sum over the outputs of the true rms error in units of a score; infinite for a flight that
+    ended early.
+    """
     if tape.outcome != COMPLETED:
         return math.inf
     y_m, truth, t = tape["y_m"], tape["truth"], tape.time("y_m")
     outputs = tuple(name for name in y_m.names if name not in without)
-    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[(t >= first) & (t < end)]
-    return float(np.sum(np.sqrt(np.mean(e**2, axis=0)) / score_units(outputs, load_airframe("osprey").units_of_outputs())))
+    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[
+        (t >= first) & (t < end)
+    ]
+    return float(
+        np.sum(
+            np.sqrt(np.mean(e**2, axis=0))
+            / score_units(outputs, load_airframe("osprey").units_of_outputs())
+        )
+    )
 
 
 @lru_cache(maxsize=4)
@@ -205,8 +259,12 @@ def file_design(cell: Cell) -> RiseDiConfig | None:
     return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
 
 
-def designed(start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False) -> RiseDiConfig | None:
-    """The start with feedforward and observer of a model; None where no relaxation has the margins."""
+def designed(
+    start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False
+) -> RiseDiConfig | None:
+    """The start with feedforward and observer of a model; None where no relaxation has the
+    margins.
+    """
     try:
         return observed(start, scenario, model, MARGIN, uncertain=uncertain)[0]
     except ParameterError:
@@ -217,10 +275,16 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
     """1 where the linear loop of an aircraft is unstable with u LATE, else 0."""
     rows, columns = law_order(aircraft, controller)
     plant = LinearPlant(
-        aircraft.matrix_a() + aircraft.matrix_gravity(), aircraft.matrix_b()[:, columns], aircraft.matrix_c()[rows]
+        aircraft.matrix_a() + aircraft.matrix_gravity(),
+        aircraft.matrix_b()[:, columns],
+        aircraft.matrix_c()[rows],
     )
     loop, m = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate), len(columns)
-    return int(not is_stable(plant, linear_law(controller.tuned_law(), m, loop.period), loop, np.full(m, LATE)))
+    return int(
+        not is_stable(
+            plant, linear_law(controller.tuned_law(), m, loop.period), loop, np.full(m, LATE)
+        )
+    )
 
 
 class Learned(NamedTuple):
@@ -272,9 +336,15 @@ def start_of(chosen: Scenario) -> RiseDiConfig:
 
 @lru_cache(maxsize=4)
 def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
-    """Score in the flight with gusts, and whether unstable with u late, of what does not learn: the same in every air."""
+    """Score in the flight with gusts, and whether unstable with u late, of what does not learn: the
+    same in every air.
+    """
     chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
-    flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
+    flight, aircraft, start = (
+        evaluation(chosen),
+        chosen.aircraft.sampled_airframe(),
+        start_of(chosen),
+    )
     controllers = {
         "alone": start,
         "file": file_design(OSPREY),
@@ -283,7 +353,9 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
     return {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
 
 
-def frozen(controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe) -> tuple[float, int]:
+def frozen(
+    controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
+) -> tuple[float, int]:
     """Score of a controller in a flight, and whether it is unstable with u late."""
     if controller is None:
         return math.nan, 0
@@ -300,17 +372,29 @@ def learn(name: str, cell: Cell, number: int) -> Row:
             Path(folder, "prior.yaml").write_text(as_yaml(prior), encoding="utf-8")
             chosen = with_prior(chosen, folder)
         elif cell.kind == "coupled":
-            Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")), encoding="utf-8")
+            Path(folder, "prior.yaml").write_text(
+                as_yaml(load_airframe("osprey")), encoding="utf-8"
+            )
             Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)), encoding="utf-8")
-            chosen = with_prior(learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder)
+            chosen = with_prior(
+                learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder
+            )
         flown = fly(name, number, chosen)
-        flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
+        flight, aircraft, start = (
+            evaluation(chosen),
+            chosen.aircraft.sampled_airframe(),
+            start_of(chosen),
+        )
         if cell.kind == "rough":
             others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
         if cell.kind in {"coupled", "late"}:
             models = {"file": load_airframe("osprey"), "true": aircraft}
-            controllers = {"alone": start} | {key: designed(start, chosen, model) for key, model in models.items()}
-            others = {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
+            controllers = {"alone": start} | {
+                key: designed(start, chosen, model) for key, model in models.items()
+            }
+            others = {
+                key: frozen(controller, flight, aircraft) for key, controller in controllers.items()
+            }
         others = others | {"learner": frozen(flown.controller, flight, aircraft)}
     values: dict[str, Any] = {key: value for key, (value, _) in others.items()}
     values |= {f"late_{key}": late for key, (_, late) in others.items()}
@@ -324,32 +408,57 @@ def with_prior(chosen: Scenario, folder: str) -> Scenario:
 
 
 def rough(number: int) -> Airframe:
-    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of angles stay."""
+    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of
+    angles stay.
+    """
     airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number])
     A, B = airframe.matrix_a(), airframe.matrix_b()
     dynamic = np.array([[float(state not in {"theta", "phi"})] for state in airframe.states])
-    direct = np.array([[float(state in airframe.outputs)] for state in airframe.states]) * (np.abs(B) > 0.0)
+    direct = np.array([[float(state in airframe.outputs)] for state in airframe.states]) * (
+        np.abs(B) > 0.0
+    )
     of_A, of_B = (np.exp(ROUGH * dynamic * rng.standard_normal(matrix.shape)) for matrix in (A, B))
     of_B = np.where(direct > 0.0, 1.0 + rng.uniform(-0.3, 0.3, B.shape), of_B)
-    return airframe.with_matrices(A * of_A, B * of_B, wind_factors(airframe, (A * of_A)[None], AIR_RELATIVE)[0])
+    return airframe.with_matrices(
+        A * of_A, B * of_B, wind_factors(airframe, (A * of_A)[None], AIR_RELATIVE)[0]
+    )
 
 
 def coupled(number: int) -> Airframe:
-    """The osprey with entries between its two parts of up to COUPLING of the largest effect on the row, in units of motion."""
+    """The osprey with entries between its two parts of up to COUPLING of the largest effect on the
+    row, in units of motion.
+    """
     airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number, 1])
-    A, B, size = airframe.matrix_a(), airframe.matrix_b(), np.array([1.0 if name == "V" else 0.1 for name in airframe.states])
+    A, B, size = (
+        airframe.matrix_a(),
+        airframe.matrix_b(),
+        np.array([1.0 if name == "V" else 0.1 for name in airframe.states]),
+    )
     of_lon = np.array([name in {"V", "alpha", "q", "theta"} for name in airframe.states])
     other = of_lon[:, None] != of_lon[None, :]
-    other_input = of_lon[:, None] != np.array([name in {"elevator", "thrust"} for name in airframe.inputs])[None, :]
+    other_input = (
+        of_lon[:, None]
+        != np.array([name in {"elevator", "thrust"} for name in airframe.inputs])[None, :]
+    )
     dynamic = np.array([name not in {"theta", "phi"} for name in airframe.states])
     row_A, row_B = np.sqrt(np.sum((A * size) ** 2, axis=1)), np.abs(B).max(axis=1)
-    A = A + COUPLING * rng.uniform(-1.0, 1.0, A.shape) * (row_A * dynamic)[:, None] / size * other * dynamic[None, :]
+    A = (
+        A
+        + COUPLING
+        * rng.uniform(-1.0, 1.0, A.shape)
+        * (row_A * dynamic)[:, None]
+        / size
+        * other
+        * dynamic[None, :]
+    )
     B = B + COUPLING * rng.uniform(-1.0, 1.0, B.shape) * (row_B * dynamic)[:, None] * other_input
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
 def damage(name: str, cell: Cell, number: int) -> Row:
-    """A learner beside the others when elevator and aileron lose half of their effect, or one surface all of it."""
+    """A learner beside the others when elevator and aileron lose half of their effect, or one
+    surface all of it.
+    """
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
     dead = surfaces[number % len(surfaces)] if cell.kind == "dead" else ""
@@ -364,17 +473,32 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
     controllers = {"alone": start, "file": file_design(OSPREY)}
     controllers |= {} if dead else {"true": designed(start, chosen, damaged)}
-    tapes = {key: simulate(chosen.vary(controller=value)) for key, value in controllers.items() if value is not None}
+    tapes = {
+        key: simulate(chosen.vary(controller=value))
+        for key, value in controllers.items()
+        if value is not None
+    }
     without = {"elevator": "q", "aileron": "p", "rudder": "r"}.get(dead, "")
-    found: dict[str, Any] = {key: score(tape, SETTLED, (without,)) for key, tape in (tapes | {"learner": flown.tape}).items()}
+    found: dict[str, Any] = {
+        key: score(tape, SETTLED, (without,))
+        for key, tape in (tapes | {"learner": flown.tape}).items()
+    }
     lost = int(found["learner"] > LOSS_OF_TRACK_SCORE >= found["alone"])
-    windows = "" if dead else json.dumps(over_windows(tapes | {"learner": flown.tape}, chosen, aircraft))
+    windows = (
+        "" if dead else json.dumps(over_windows(tapes | {"learner": flown.tape}, chosen, aircraft))
+    )
     return flown.row._replace(**found, dead=dead, lost=lost, windows=windows)
 
 
-def over_windows(tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe) -> dict[str, list[float]]:
-    """Scores over WINDOWS; those of the true model until the damage with the model of the aircraft as it was."""
-    found = {key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()}
+def over_windows(
+    tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe
+) -> dict[str, list[float]]:
+    """Scores over WINDOWS; those of the true model until the damage with the model of the aircraft
+    as it was.
+    """
+    found = {
+        key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()
+    }
     before = designed(start_of(chosen), chosen, aircraft)
     if "true" in found and before is not None:
         whole = simulate(chosen.vary(controller=before))
@@ -390,7 +514,15 @@ def alarms(name: str, cell: Cell, number: int) -> Row:
     return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
 
 
-FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
+FLIGHTS = {
+    "learn": learn,
+    "rough": learn,
+    "coupled": learn,
+    "late": learn,
+    "weak": damage,
+    "dead": damage,
+    "alarm": alarms,
+}
 
 
 def count(name: str, aircraft: int) -> int:
@@ -404,24 +536,36 @@ def flown_rows(names: Sequence[str], number: int) -> list[Row]:
 
 
 def code() -> list[str]:
-    """The paths of the code that flies: this file, and the packages of this stack that it imports."""
+    """The paths of the code that flies: this file, and the packages of this stack that it
+    imports.
+    """
     sources = REPOSITORY / "ros_ws" / "src"
-    imported = {name.partition(".")[0] for name in sys.modules} & {folder.name for folder in sources.iterdir()}
-    return [f"benchmarks/{Path(__file__).name}", *(f"ros_ws/src/{name}" for name in sorted(imported))]
+    imported = {name.partition(".")[0] for name in sys.modules} & {
+        folder.name for folder in sources.iterdir()
+    }
+    return [
+        f"benchmarks/{Path(__file__).name}",
+        *(f"ros_ws/src/{name}" for name in sorted(imported)),
+    ]
 
 
 # The results
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file of results; none of a file with other columns, which an earlier version wrote."""
+    """The rows of a file of results; none of a file with other columns, which an earlier version
+    wrote.
+    """
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as stream:
         lines = csv.DictReader(stream)
         if tuple(lines.fieldnames or ()) != Row._fields:
             return []
-        return [Row(*(kind(value) for kind, value in zip(KINDS, line.values(), strict=True))) for line in lines]
+        return [
+            Row(*(kind(value) for kind, value in zip(KINDS, line.values(), strict=True)))
+            for line in lines
+        ]
 
 
 KINDS = tuple(Row.__annotations__.values())
@@ -432,7 +576,12 @@ def write(path: Path, rows: Sequence[Row]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerows((Row._fields, *sorted(rows, key=lambda each: (list(CELLS).index(each.cell), each.number))))
+        writer.writerows(
+            (
+                Row._fields,
+                *sorted(rows, key=lambda each: (list(CELLS).index(each.cell), each.number)),
+            )
+        )
 
 
 def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
@@ -441,8 +590,17 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
         chosen = [each for each in rows if each.cell == name]
         if chosen:
             yield row(f"{name}: aircraft", float(len(chosen)))
-            yield row(f"{name}: replay equal", float(np.mean([each.replayed for each in chosen])), at_least=1.0)
-            yield row(f"{name}: update, mean", float(np.mean([each.update for each in chosen])), "s", at_most=UPDATE)
+            yield row(
+                f"{name}: replay equal",
+                float(np.mean([each.replayed for each in chosen])),
+                at_least=1.0,
+            )
+            yield row(
+                f"{name}: update, mean",
+                float(np.mean([each.update for each in chosen])),
+                "s",
+                at_most=UPDATE,
+            )
             yield row(f"{name}: update, longest", max(each.longest for each in chosen), "s")
             yield from CELL_FIGURES[cell.kind](name, cell, chosen)
 
@@ -454,12 +612,22 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
     near = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "rough": 0.75}.get(cell.kind)
     within = COUPLED_WITHIN if cell.kind == "coupled" else WITHIN
     share = float(np.mean([each.learner <= within * each.true for each in known]))
-    yield row(f"{name}: share within {100 * (within - 1.0):.0f} % of the true model", share, at_least=near)
-    yield row(f"{name}: worse than the law alone", float(sum(each.learner > each.alone for each in chosen)), at_most=0.0)
+    yield row(
+        f"{name}: share within {100 * (within - 1.0):.0f} % of the true model", share, at_least=near
+    )
+    yield row(
+        f"{name}: worse than the law alone",
+        float(sum(each.learner > each.alone for each in chosen)),
+        at_most=0.0,
+    )
     for key, label in LABELS.items():
         unstable = float(np.mean([getattr(each, f"late_{key}") for each in chosen]))
         limit = (0.0 if cell.uncertainty < 0.5 else 0.01) if key == "learner" else None
-        yield row(f"{name}: share unstable with u {1e3 * LATE:.0f} ms late, {label}", unstable, at_most=limit)
+        yield row(
+            f"{name}: share unstable with u {1e3 * LATE:.0f} ms late, {label}",
+            unstable,
+            at_most=limit,
+        )
     begun = [each.first for each in chosen if not math.isnan(each.first)]
     yield row(f"{name}: without a model", float(len(chosen) - len(begun)))
     if begun:
@@ -483,18 +651,29 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
     """Scores from SETTLED on; whether a dead input was found in time."""
     yield from scores(name, chosen)
     yield row(
-        f"{name}: lost with the learner and not with the law alone", float(sum(each.lost for each in chosen)), at_most=0.0
+        f"{name}: lost with the learner and not with the law alone",
+        float(sum(each.lost for each in chosen)),
+        at_most=0.0,
     )
     if cell.kind == "weak":
         ratio = np.mean([each.learner for each in chosen]) / np.mean([each.true for each in chosen])
         yield row(f"{name}: mean over that of the true model", float(ratio), at_most=1.05)
-        yield row(f"{name}: share found to have changed", float(np.mean([each.alarms > 0 for each in chosen])))
+        yield row(
+            f"{name}: share found to have changed",
+            float(np.mean([each.alarms > 0 for each in chosen])),
+        )
         flown = [json.loads(each.windows) for each in chosen]
         for key, label in LABELS.items():
-            yield from window_figures(name, label, np.array([each[key] for each in flown if key in each]))
+            yield from window_figures(
+                name, label, np.array([each[key] for each in flown if key in each])
+            )
         return
     right = [each.found == each.dead and each.found_at <= SETTLED for each in chosen]
-    yield row(f"{name}: share found within {SETTLED - DAMAGED:.0f} s", float(np.mean(right)), at_least=0.95)
+    yield row(
+        f"{name}: share found within {SETTLED - DAMAGED:.0f} s",
+        float(np.mean(right)),
+        at_least=0.95,
+    )
     wrong = [each.found not in {"", each.dead} for each in chosen]
     yield row(f"{name}: another input found", float(sum(wrong)), at_most=0.0)
 
@@ -509,7 +688,11 @@ def window_figures(name: str, label: str, values: FloatArray) -> Iterator[eviden
 def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Alarms without damage."""
     yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
-    yield row(f"{name}: false alarms", float(sum(each.alarms + (each.found != "") for each in chosen)), at_most=0.0)
+    yield row(
+        f"{name}: false alarms",
+        float(sum(each.alarms + (each.found != "") for each in chosen)),
+        at_most=0.0,
+    )
 
 
 COUPLED_WITHIN = 1.15
@@ -525,13 +708,16 @@ CELL_FIGURES = {
 
 
 def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
-    """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there with u LATE.
+    """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there
+    with u LATE.
 
     All aircraft have the same noise. Each law has its model and gains by the airframe file.
     """
     benchmark = tuning.build_benchmark(find_scenario("osprey_observer"))
     tuned = load(tuned_file(find_scenario("osprey_servo")))
-    A, B = sampled_matrices(load_airframe("osprey"), uncertainty, uncertainty, SEED, 0, max(numbers) + 1)
+    A, B = sampled_matrices(
+        load_airframe("osprey"), uncertainty, uncertainty, SEED, 0, max(numbers) + 1
+    )
     of = np.tile(np.array(numbers), 2)
     late = np.repeat([0, round(LATE / benchmark.model.period)], len(numbers))
     flights = tuning.benchmark_fleet(A[of], B[of], late, tuning.GUST, benchmark)
@@ -539,7 +725,9 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         law = LAWS[name]
         params = law.params(tuning.as_gains(tuned[name][OBJECTIVE]), benchmark.model)
         course = benchmark.courses[tuning.GUST][law.feedforward]
-        flown = batch.fly(flights, benchmark.vehicle, course, law.control_law(benchmark.model), params)
+        flown = batch.fly(
+            flights, benchmark.vehicle, course, law.control_law(benchmark.model), params
+        )
         in_time, delayed = np.split(tuning.score(flown, benchmark.unit), 2)
         subject = f"rivals, +-{100 * uncertainty:.0f} %"
         yield row(f"{subject}: score, {law.title}", float(np.mean(in_time)))
@@ -549,7 +737,9 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
 
 
 def plot(rows: Sequence[Row]) -> Figure:
-    """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the mean."""
+    """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the
+    mean.
+    """
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     for axis, uncertainty in zip(figure.subplots(1, 2, sharey=True), (0.3, 0.5), strict=True):
         columns: dict[str, tuple[str, list[float]]] = {}
@@ -558,37 +748,55 @@ def plot(rows: Sequence[Row]) -> Figure:
                 chosen = [each for each in rows if each.cell == name]
                 for key in ("alone", "file", "true"):
                     columns.setdefault(
-                        LABELS[key].replace(" of", "\nof"), (COLOURS[key], [getattr(each, key) for each in chosen])
+                        LABELS[key].replace(" of", "\nof"),
+                        (COLOURS[key], [getattr(each, key) for each in chosen]),
                     )
-                columns[f"learned in\n{cell.air}"] = COLOURS["learner"], [each.learner for each in chosen]
+                columns[f"learned in\n{cell.air}"] = (
+                    COLOURS["learner"],
+                    [each.learner for each in chosen],
+                )
         for place, (colour, values) in enumerate(columns.values()):
             spread = place + 0.5 * (np.arange(len(values)) / max(len(values) - 1, 1) - 0.5)
             axis.plot(spread, values, ".", color=colour, markersize=3, alpha=0.6)
-            axis.plot([place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2)
+            axis.plot(
+                [place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2
+            )
         axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
         axis.set_title(f"A and B +-{100 * uncertainty:g} %: score", fontsize=10, loc="left")
         axis.grid(axis="y", color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
-    axis.set_ylim(bottom=0.0)  # of both panels, once all points are drawn: it ends the automatic limits
+    axis.set_ylim(
+        bottom=0.0
+    )  # of both panels, once all points are drawn: it ends the automatic limits
     return figure
 
 
 def main(
-    aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 50,
+    aircraft: Annotated[
+        int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")
+    ] = 50,
     cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
-    results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
+    results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY
+    / "build"
+    / "learning.csv",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Fly the aircraft that are missing in the results, and write the figures and the picture.
 
-    Rows that other code flew are flown again, and all where that code is not committed: the revision of a row is the last one
-    that touched the code that flies.
+    Rows that other code flew are flown again, and all where that code is not committed: the
+    revision of a row is the last one that touched the code that flies.
     """
     if unknown := [name for name in cell if name not in CELLS]:
-        raise typer.BadParameter(f"found {', '.join(unknown)}, expected cells among {', '.join(CELLS)}")
+        raise typer.BadParameter(
+            f"found {', '.join(unknown)}, expected cells among {', '.join(CELLS)}"
+        )
     begun = evidence.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
     flown_by = evidence.revision(*code())
-    rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence.DIRTY)]
+    rows = [
+        each
+        for each in read(results)
+        if each.revision == flown_by and not flown_by.endswith(evidence.DIRTY)
+    ]
     known = {(each.cell, each.number) for each in rows}
     # aircraft by aircraft, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
@@ -604,7 +812,9 @@ def main(
             rows += [each._replace(revision=flown_by) for each in future.result()]
             write(results, rows)
     rows = [each for each in rows if each.number < count(each.cell, aircraft)]
-    whole = [name for name in CELLS if sum(each.cell == name for each in rows) == count(name, aircraft)]
+    whole = [
+        name for name in CELLS if sum(each.cell == name for each in rows) == count(name, aircraft)
+    ]
     rows = [each for each in rows if each.cell in whole]
     found, airs = list(figures(rows)), [name for name in CELLS if CELLS[name].kind == "learn"]
     for uncertainty in sorted({CELLS[name].uncertainty for name in airs if name in whole}):

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed of a lockstep flight, compared with a bare echo of the same message on the same host.
 
-The scenario osprey_gust with aircraft and reference model at the 100 Hz of the controller (Runge-Kutta step 10 ms), recorded:
+The scenario osprey_gust with aircraft and reference model at the 100 Hz of the controller
+(Runge-Kutta step 10 ms), recorded:
 
     four processes   aircraft, reference model, controller, recorder
     one process      the same four as objects in one process
     without ROS      the same parts in one loop
-    bare echo        a vector of four channels to another process and back, by the same publisher and subscription
+    bare echo
+        a vector of four channels to another process and back, by the same publisher and
+        subscription
 
     .venv/bin/python -m benchmarks.speed --only lockstep
 """
@@ -38,8 +41,12 @@ FLOOR = "bare echo, to another process and back"
 
 
 def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
-    """Steps of the controller per second of a lockstep flight, between its first and its last u in the log."""
-    outcome = fly_over_topics(scenario, run, lambda t, u: None, lockstep=True, one_process=one_process)
+    """Steps of the controller per second of a lockstep flight, between its first and its last u in
+    the log.
+    """
+    outcome = fly_over_topics(
+        scenario, run, lambda t, u: None, lockstep=True, one_process=one_process
+    )
     if outcome != "completed":
         sys.exit(f"error: {outcome}")
     topics: dict[int, str] = {}
@@ -77,15 +84,25 @@ def echo_steps_per_second() -> float:
 
 
 def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
-    """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs, interleaved."""
+    """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs,
+    interleaved.
+    """
     aircraft, model = {"rate": RATE, "step": 1.0 / RATE}, {"rate": RATE}
-    scenario = find_scenario("osprey_gust").vary(flight={"duration": duration}, aircraft=aircraft, reference_model=model)
+    scenario = find_scenario("osprey_gust").vary(
+        flight={"duration": duration}, aircraft=aircraft, reference_model=model
+    )
     scenario = written(scenario, folder / "at_100_hz.yaml")
     measurements: dict[str, Callable[[Path], float]] = {
         FLOOR: lambda run: echo_steps_per_second(),
-        "lockstep, four processes": lambda run: flight_steps_per_second(scenario, run, one_process=False),
-        "lockstep, one process": lambda run: flight_steps_per_second(scenario, run, one_process=True),
+        "lockstep, four processes": lambda run: flight_steps_per_second(
+            scenario, run, one_process=False
+        ),
+        "lockstep, one process": lambda run: flight_steps_per_second(
+            scenario, run, one_process=True
+        ),
         "one loop without ROS": lambda run: loop_steps_per_second(scenario),
     }
-    rates = [[of(folder / f"{name} {k}") for name, of in measurements.items()] for k in range(repeat)]
+    rates = [
+        [of(folder / f"{name} {k}") for name, of in measurements.items()] for k in range(repeat)
+    ]
     return dict(zip(measurements, np.median(rates, axis=0).tolist(), strict=True))

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A long guided flight over topics, round a triangle in turbulence, watched by a client of the live page.
+"""A long guided flight over topics, round a triangle in turbulence, watched by a client of the live
+page.
 
-    .venv/bin/python -m benchmarks.long_flight                                  # the c172p of JSBSim, 60 min in lockstep
-    .venv/bin/python -m benchmarks.long_flight --observer                       # the osprey, with an observer beside the law
+    .venv/bin/python -m benchmarks.long_flight  # the c172p of JSBSim, 60 min in lockstep
+    .venv/bin/python -m benchmarks.long_flight --observer
+        # the osprey, with an observer beside the law
     .venv/bin/python -m benchmarks.long_flight --observer --real-time
     .venv/bin/python -m benchmarks.long_flight --observer --one-process --rate 100 --minutes 360
 
-Prints JSON: the outcome, the samples that the log lacks, missed ticks, the largest cross-track error, the memory of each
-process in the middle and at the end of the flight, and the times to write and to open the report.
+Prints JSON: the outcome, the samples that the log lacks, missed ticks, the largest cross-track
+error, the memory of each process in the middle and at the end of the flight, and the times to write
+and to open the report.
 """
 
 import argparse
@@ -44,42 +47,64 @@ from flight_log.bag import LOST_MESSAGES
 from flight_log.tape_reader import read_run
 
 SIDE = 6000.0  # m, of the triangle
-TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m above ground (MIL-F-8785C)
+# of 1.5 m/s: at the altitude of the c172p; moderate at 100 m above ground (MIL-F-8785C)
+TURBULENCE = {
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": MODERATE | {"seed": 1},
 }
-PERIOD, REPORT_PERIOD = 2.0, 0.1  # s between samples of the memory, in flight and while the report is written
+PERIOD, REPORT_PERIOD = (
+    2.0,
+    0.1,
+)  # s between samples of the memory, in flight and while the report is written
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
   const place = ({node}) => node.getBoundingClientRect(), all = typeof figures === "undefined" ? [] : figures;
   const found = all.filter(one => place(one).top < innerHeight && place(one).bottom > 0);
   return found.length > 0 && found.every(one => one.drawn);
-})()"""  # goes to the first figure; whether all figures in view are drawn
-MODES = {"in lockstep": ["--lockstep"], "in lockstep in one process": ["--lockstep", "--set", "composed"], "in real time": []}
+})()"""  # goes to the first figure; whether all figures in view are drawn  # noqa: E501 - a text as it is written
+MODES = {
+    "in lockstep": ["--lockstep"],
+    "in lockstep in one process": ["--lockstep", "--set", "composed"],
+    "in real time": [],
+}
 
 
 def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Scenario:
-    """The flight: laps round an equilateral triangle in turbulence, without wind; the scenario's own rates without `rate`."""
+    """The flight: laps round an equilateral triangle in turbulence, without wind; the scenario's
+    own rates without `rate`.
+    """
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
         base = replace(base, controller=find_scenario("osprey_observer").controller)
-    speed, altitude = base.aircraft.channels().speed, base.aircraft.altitude or 0.0  # above the start
+    speed, altitude = (
+        base.aircraft.channels().speed,
+        base.aircraft.altitude or 0.0,
+    )  # above the start
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
     corners = [(0.0, 0.0), (SIDE, 0.0), (SIDE / 2.0, SIDE * math.sqrt(0.75))] * laps
     north, east = (list(values) for values in zip(*corners, strict=True))
     rates = {} if rate is None else {"rate": rate}
     return base.vary(
         flight={"duration": 60.0 * minutes},
-        aircraft={"wind": [0.0, 0.0], "turbulence": TURBULENCE["osprey" if observer else "c172p"], **rates},
+        aircraft={
+            "wind": [0.0, 0.0],
+            "turbulence": TURBULENCE["osprey" if observer else "c172p"],
+            **rates,
+        },
         reference_model=rates,
-        guidance={"wind": 0.0, "route": {"north": north, "east": east, "altitude": [altitude] * len(north)}},
+        guidance={
+            "wind": 0.0,
+            "route": {"north": north, "east": east, "altitude": [altitude] * len(north)},
+        },
     )
 
 
 def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], int]:
-    """Fly, with a client of the page; the memory of each process by its command, until the nodes end, bytes every PERIOD.
+    """Fly, with a client of the page; the memory of each process by its command, until the nodes
+    end, bytes every PERIOD.
 
-    The second result is the most memory of `rise-di fly` after that, while it writes the report, bytes.
+    The second result is the most memory of `rise-di fly` after that, while it writes the report,
+    bytes.
     """
     within = real_time() if mode == "in real time" else ()
     command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--set", f"runs={runs}"]
@@ -98,7 +123,9 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
             for process in (flight, *nodes, server):
                 with suppress(psutil.Error, IndexError):  # of one that ends just now
                     words = process.cmdline()
-                    name = next((word for word in words if word.endswith(".main")), f"rise-di {words[2]}")
+                    name = next(
+                        (word for word in words if word.endswith(".main")), f"rise-di {words[2]}"
+                    )
                     memory.setdefault(name, []).append(process.memory_info().rss)
             time.sleep(PERIOD)
         most = memory["rise-di fly"][-1]
@@ -118,11 +145,13 @@ def end(flight: psutil.Popen) -> None:
         flight.wait()
 
 
-def skips(tape: Tape, scenario: Scenario, *, real_time: bool) -> dict[str, tuple[NDArray[np.int64], int]]:
+def skips(
+    tape: Tape, scenario: Scenario, *, real_time: bool
+) -> dict[str, tuple[NDArray[np.int64], int]]:
     """By topic, begin and end of each time without a sample in the flight, ns, and the period, ns.
 
-    What follows the flight is the end of the processes. In real time a late tick skips instants. It is late by 0 to 1 period,
-    so a skip ends half a period after the next stamp.
+    What follows the flight is the end of the processes. In real time a late tick skips instants. It
+    is late by 0 to 1 period, so a skip ends half a period after the next stamp.
     Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
     """
     guidance = scenario.guidance
@@ -140,12 +169,20 @@ def skips(tape: Tape, scenario: Scenario, *, real_time: bool) -> dict[str, tuple
     return found
 
 
-def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool) -> dict[str, dict[str, int]]:
+def missing(
+    tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool
+) -> dict[str, dict[str, int]]:
     """How many samples of each topic the log lacks, also excluding host delays where known."""
     skipped = skips(tape, scenario, real_time=real_time)
     return {
-        words: {name: missed_excluding_delays(ends, known, period) for name, (ends, period) in skipped.items()}
-        for words, known in (("missing samples", ()), ("missing samples, excluding host delays", delays))
+        words: {
+            name: missed_excluding_delays(ends, known, period)
+            for name, (ends, period) in skipped.items()
+        }
+        for words, known in (
+            ("missing samples", ()),
+            ("missing samples, excluding host delays", delays),
+        )
         if known is not None
     }
 
@@ -153,12 +190,15 @@ def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_ti
 def opened(report: Path) -> dict[str, float] | None:
     """Times from the address to the figures drawn in a browser, s; None without a browser.
 
-    The page draws the figures in view first, and then all others. The first time is that of a reader who goes to the first
-    figure at once, the second that of all figures, in view or not.
+    The page draws the figures in view first, and then all others. The first time is that of a
+    reader who goes to the first figure at once, the second that of all figures, in view or not.
     """
     if CHROMIUM is None:
         return None
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, Browser(Path(profile)) as browser:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        Browser(Path(profile)) as browser,
+    ):
         begin = time.monotonic()
         browser.open(report)
         browser.wait_for(IN_VIEW, limit=120.0)
@@ -167,11 +207,14 @@ def opened(report: Path) -> dict[str, float] | None:
         return {"figures in view": in_view, "all figures": time.monotonic() - begin}
 
 
-def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None, *, real_time: bool) -> dict[str, Any]:
-    """The figures of a flight from its run, SI; memory in bytes in the middle and at the end, ticks as `figures_of_ticks`.
+def figures(
+    run: Path, memory: Mapping[str, list[int]], delays: Intervals | None, *, real_time: bool
+) -> dict[str, Any]:
+    """The figures of a flight from its run, SI; memory in bytes in the middle and at the end, ticks
+    as `figures_of_ticks`.
 
-    `delays` are those of the host, by the clock of the stamps; None where unknown. Ticks are of flights in real time alone: in
-    lockstep they wait for their inputs.
+    `delays` are those of the host, by the clock of the stamps; None where unknown. Ticks are of
+    flights in real time alone: in lockstep they wait for their inputs.
     """
     begin = time.monotonic()
     write_report(run)
@@ -187,37 +230,64 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario, delays, real_time=real_time),
         "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
-        "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")) if real_time else {},
+        "ticks": figures_of_ticks(
+            tape["internals"], delays, period_ns(scenario.controller.rate, "rate")
+        )
+        if real_time
+        else {},
         "guidance": {"steps": replay.steps, "differing": replay.differing},
         "xtrack": float(np.abs(xtrack).max()),
         "bank_deg": math.degrees(float(np.abs(log["pose.phi"]).max())),
         "V": float(log["y.V"].min()) + scenario.aircraft.channels().speed,
         "memory": {
-            name: {"middle": values[len(values) // 2], "end": values[-1], "growth": values[-1] / values[len(values) // 2] - 1.0}
+            name: {
+                "middle": values[len(values) // 2],
+                "end": values[-1],
+                "growth": values[-1] / values[len(values) // 2] - 1.0,
+            }
             for name, values in memory.items()
         },
-        "report": {"size": (run / "report.html").stat().st_size, "written": written, "opened": opened(run / "report.html")},
+        "report": {
+            "size": (run / "report.html").stat().st_size,
+            "written": written,
+            "opened": opened(run / "report.html"),
+        },
     }
 
 
 def main() -> None:
     """Fly and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="of flight time")
-    parser.add_argument("--observer", action="store_true", help="the osprey with its observer, in place of the c172p")
+    parser.add_argument(
+        "--observer",
+        action="store_true",
+        help="the osprey with its observer, in place of the c172p",
+    )
     mode = parser.add_mutually_exclusive_group()
-    for name, words in (("--one-process", "in lockstep in one process"), ("--real-time", "in real time")):
-        mode.add_argument(name, dest="mode", action="store_const", const=words, default="in lockstep", help=words)
+    for name, words in (
+        ("--one-process", "in lockstep in one process"),
+        ("--real-time", "in real time"),
+    ):
+        mode.add_argument(
+            name, dest="mode", action="store_const", const=words, default="in lockstep", help=words
+        )
     parser.add_argument("--rate", type=float, help="of y and y_m, Hz; by default the scenario's")
     parser.add_argument("--json", type=Path, help="JSON file to write")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the flight ends too
     timed = options.mode == "in real time"
-    with tempfile.TemporaryDirectory() as folder, delay_monitors(timed and bool(real_time())) as delays:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        delay_monitors(timed and bool(real_time())) as delays,
+    ):
         runs = Path(folder)
         path = runs / "flown.yaml"
         path.write_text(
-            scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate)), encoding="utf-8"
+            scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate)),
+            encoding="utf-8",
         )
         begin = time.monotonic()
         memory, report_memory = fly(path, runs, options.mode)

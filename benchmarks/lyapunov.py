@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plots docs/images/lyapunov.png: V1, V2, e and r of the small example, for a beta that meets (29), (30) and one that does not.
+"""Plots docs/images/lyapunov.png: V1, V2, e and r of the small example, for a beta that meets (29),
+(30) and one that does not.
 
 python -m benchmarks.lyapunov
 """
@@ -22,7 +23,9 @@ DPI, PALETTE = 110, 16  # pixels per inch, and colours of the file
 
 
 def flights() -> dict[str, Evidence]:
-    """The same flight under beta and under 0.05 beta, both with the constant zeta_b of Lemma 2 for the first."""
+    """The same flight under beta and under 0.05 beta, both with the constant zeta_b of Lemma 2 for
+    the first.
+    """
     case = example(DT, DURATION)
     evidence_by_beta = {}
     zeta_b = 0.0
@@ -30,19 +33,30 @@ def flights() -> dict[str, Evidence]:
         params = case.params._replace(beta=factor * case.params.beta)
         flight = fly(case.plant, case.y_m, DT, params, case.x_0)
         zeta_b = zeta_b or lemma_2(case.plant, evidence(case.plant, flight, params), params)
-        evidence_by_beta[f"beta = ({', '.join(f'{b:g}' for b in params.beta)})"] = evidence(case.plant, flight, params, zeta_b)
+        evidence_by_beta[f"beta = ({', '.join(f'{b:g}' for b in params.beta)})"] = evidence(
+            case.plant, flight, params, zeta_b
+        )
     return evidence_by_beta
 
 
 def plot(evidence_by_beta: dict[str, Evidence]) -> Figure:
-    """Four panels over time, a line a gain set: V1 and the norms of e and r on log scales, V2 on a linear one."""
+    """Four panels over time, a line a gain set: V1 and the norms of e and r on log scales, V2 on a
+    linear one.
+    """
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
     for (name, signals), colour in zip(evidence_by_beta.items(), COLOURS, strict=True):
-        lines = (signals.V1, signals.V2, np.linalg.norm(signals.e, axis=1), np.linalg.norm(signals.r, axis=1))
+        lines = (
+            signals.V1,
+            signals.V2,
+            np.linalg.norm(signals.e, axis=1),
+            np.linalg.norm(signals.r, axis=1),
+        )
         for axis, line in zip(axes.flat, lines, strict=True):
             axis.plot(signals.t, line, color=colour, linewidth=1.2, label=name)
-    for axis, title in zip(axes.flat, ("V1 (31)", "V2 = V1 + P (48)", "|e| (3)", "|r| (4)"), strict=True):
+    for axis, title in zip(
+        axes.flat, ("V1 (31)", "V2 = V1 + P (48)", "|e| (3)", "|r| (4)"), strict=True
+    ):
         axis.set_title(title, fontsize=10, loc="left")
         axis.grid(color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
@@ -66,7 +80,10 @@ def main() -> None:
         late = signals.t > 20.0
         e, r = (np.max(np.linalg.norm(signal[late], axis=1)) for signal in (signals.e, signals.r))
         V2, P = signals.V2, signals.P
-        print(f"{name}: V2 {V2[0]:.2f} -> {V2[-1]:.2f}, P >= {P.min():.2f}, past 20 s |e| {e:.2g}, |r| {r:.2g}")
+        print(
+            f"{name}: V2 {V2[0]:.2f} -> {V2[-1]:.2f}, P >= {P.min():.2f}, past 20 s |e| "
+            f"{e:.2g}, |r| {r:.2g}"
+        )
 
 
 if __name__ == "__main__":

@@ -21,12 +21,16 @@ PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 
 
 class Child:
-    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process; a context manager."""
+    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process; a
+    context manager.
+    """
 
     def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
         module = (role,) if "." in role else ("benchmarks.speed_nodes", role)
         command = [*within, sys.executable, "-m", *module, *arguments]
-        self.popen = psutil.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self.popen = psutil.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
 
     def __enter__(self) -> "Child":
         return self
@@ -49,7 +53,10 @@ class Child:
         output, _ = self.popen.communicate(timeout=timeout)
         lines = [line for line in output.splitlines() if line.startswith("{")]
         if not lines:
-            raise RuntimeError(f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and without output")
+            raise RuntimeError(
+                f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and "
+                "without output"
+            )
         figures: dict[str, Any] = json.loads(lines[-1])
         return figures
 
@@ -60,7 +67,9 @@ class Child:
 
 
 def threads_ns(pid: int) -> int:
-    """Processor time of the threads of a process, ns, from the kernel's schedstat: psutil resolves 10 ms only."""
+    """Processor time of the threads of a process, ns, from the kernel's schedstat: psutil resolves
+    10 ms only.
+    """
     total = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(FileNotFoundError):
@@ -77,11 +86,15 @@ def real_time() -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
-    """Host delays, measured by a process of the highest priority on each core, monotonic ns; None if not allowed."""
+    """Host delays, measured by a process of the highest priority on each core, monotonic ns; None
+    if not allowed.
+    """
     if not allowed:
         yield None
         return
     with contextlib.ExitStack() as stack:
         cores = sorted(os.sched_getaffinity(0))
-        monitors = [stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores]
+        monitors = [
+            stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores
+        ]
         yield lambda: [tuple(delay) for child in monitors for delay in child.stop()["delays"]]

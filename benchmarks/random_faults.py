@@ -5,11 +5,12 @@
     .venv/bin/python -m benchmarks.random_faults --count 1000 --lockstep 100 --seed 1 [--json FILE]
     .venv/bin/python -m benchmarks.random_faults --count 1 --seed 417    # one of them again
 
-It injects the cases of tests/ros/flight_bringup/faults in real time, and those of failures of the past
-(tests/ros/flight_bringup/faults/draws.py). A fault passes where the node that should detects it, u responds as docs/faults.md
-states, no process ends or raises, the flight is steady again, and the log holds every message that was received. Two at a time:
-all but the response of u. In lockstep, where faults of messages do not exist, a killed node ends the flight with its name, and
-a stopped one changes no byte of the log.
+It injects the cases of tests/ros/flight_bringup/faults in real time, and those of failures of the
+past (tests/ros/flight_bringup/faults/draws.py). A fault passes where the node that should detects
+it, u responds as docs/faults.md states, no process ends or raises, the flight is steady again, and
+the log holds every message that was received. Two at a time: all but the response of u. In
+lockstep, where faults of messages do not exist, a killed node ends the flight with its name, and a
+stopped one changes no byte of the log.
 """
 
 import json
@@ -25,8 +26,12 @@ from tests.ros.flight_bringup.faults.draws import FOUND
 
 def main(
     count: Annotated[int, typer.Option(min=0, help="Number of draws in real time.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first draw; the others count up.")] = 1,
-    lockstep: Annotated[int, typer.Option(min=0, help="Number of draws in lockstep, beside the others.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the first draw; the others count up.")
+    ] = 1,
+    lockstep: Annotated[
+        int, typer.Option(min=0, help="Number of draws in lockstep, beside the others.")
+    ] = 0,
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
     """Inject random faults and print what failed; exit status 1 if any did."""

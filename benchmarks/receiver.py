@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a receiver for one message of y that has arrived: a right one taken by the controller, and refused ones.
+"""Time of a receiver for one message of y that has arrived: a right one taken by the controller,
+and refused ones.
 
 python -m benchmarks.speed --only receiver
 """
@@ -22,7 +23,8 @@ from rise_di_controller.controller import Controller
 RIGHT = "right message, taken"
 DECODED = "message under the name of the publisher, twice as long, decoded and refused"
 AT_MOST = {DECODED: 6.0}
-"""Times of a refused message over that of a right one; 2 of those that are not here, which are not decoded."""
+"""Times of a refused message over that of a right one; 2 of those that are not here, which are not
+decoded."""
 REPEATS, WARM_UP = 20_000, 200
 OWN, FOREIGN = "/aircraft#1", "/foreign#2"
 TAKEOVER_NS = 10**15  # no publisher times out
@@ -41,11 +43,17 @@ def measure() -> dict[str, FloatArray]:
     right = encoder.encode(0, np.zeros(4))
     refused = {
         DECODED: right + bytes(len(right)),
-        "message of a conflicting publisher, refused": Encoder(parameters.outputs, FOREIGN).encode(0, np.zeros(4)),
-        f"message of a conflicting publisher of {MAX_SIZE} bytes, refused": long_message(FOREIGN, MAX_SIZE),
+        "message of a conflicting publisher, refused": Encoder(parameters.outputs, FOREIGN).encode(
+            0, np.zeros(4)
+        ),
+        f"message of a conflicting publisher of {MAX_SIZE} bytes, refused": long_message(
+            FOREIGN, MAX_SIZE
+        ),
         "message of a conflicting publisher of 1.2 MB, refused": long_message(FOREIGN, 1_200_000),
         "message under the name of the publisher of 1.2 MB, refused": long_message(OWN, 1_200_000),
-        f"message under the name of the publisher of {MAX_SIZE} bytes, refused": long_message(OWN, MAX_SIZE),
+        f"message under the name of the publisher of {MAX_SIZE} bytes, refused": long_message(
+            OWN, MAX_SIZE
+        ),
     }
     took = {name: np.empty(REPEATS) for name in (RIGHT, *refused)}
 
@@ -56,10 +64,15 @@ def measure() -> dict[str, FloatArray]:
         subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
         lock = PublisherLock(lambda: (TAKEOVER_NS, TAKEOVER_NS))
         decode, max_age_ns = Decoder(parameters.outputs).decode, lambda: TAKEOVER_NS
-        receiver = Receiver(subscription, Refusals(node), decode, take, max_age_ns=max_age_ns, lock=lock)
+        receiver = Receiver(
+            subscription, Refusals(node), decode, take, max_age_ns=max_age_ns, lock=lock
+        )
 
         for k in range(REPEATS):  # in turn, since the speed of the host drifts
-            for name, message in {RIGHT: encoder.encode(k, np.full(4, 1e-6 * k)), **refused}.items():
+            for name, message in {
+                RIGHT: encoder.encode(k, np.full(4, 1e-6 * k)),
+                **refused,
+            }.items():
                 begin_ns = time.perf_counter_ns()
                 receiver.take_message(message, REPEATS)
                 took[name][k] = time.perf_counter_ns() - begin_ns

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and losses of the recorder at 1 kHz on six topics, and the size of its file compared with that of rosbags' Writer.
+"""CPU time and losses of the recorder at 1 kHz on six topics, and the size of its file compared
+with that of rosbags' Writer.
 
-Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the scenario osprey_servo. Then
-the same messages, in the order recorded, go through rosbags.rosbag2.Writer: plain, and with its chunks compressed.
+Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the
+scenario osprey_servo. Then the same messages, in the order recorded, go through
+rosbags.rosbag2.Writer: plain, and with its chunks compressed.
 
     .venv/bin/python -m benchmarks.speed --only recorder
 """
@@ -30,15 +32,21 @@ TOPICS = (Y, Y_M, U, U_M, INTERNALS, TRUTH)
 
 
 def publish(rate: float, duration: float) -> None:
-    """Publish on each topic for the duration or until SIGTERM. Print "matched" first and the number sent at the end."""
+    """Publish on each topic for the duration or until SIGTERM. Print "matched" first and the number
+    sent at the end.
+    """
     tape = simulate(find_scenario("osprey_servo").vary(flight={"duration": 5.0}))
     ended, sent, missed = termination(), 0, 0
     with open_node("publisher") as node:
         publishers = [node.create_publisher(topic.type, topic.name, PUBLISH) for topic in TOPICS]
         signals = [tape["y_m" if topic is U_M else topic.name] for topic in TOPICS]
         encoders = [Encoder(signal.names, "/publisher") for signal in signals]
-        sources = list(zip(publishers, encoders, (list(signal.values) for signal in signals), strict=True))
-        while not ended.is_set() and not all(publisher.get_subscription_count() for publisher in publishers):
+        sources = list(
+            zip(publishers, encoders, (list(signal.values) for signal in signals), strict=True)
+        )
+        while not ended.is_set() and not all(
+            publisher.get_subscription_count() for publisher in publishers
+        ):
             time.sleep(0.01)
         print("matched", flush=True)
         begin = time.monotonic()
@@ -52,11 +60,18 @@ def publish(rate: float, duration: float) -> None:
             missed += tick.missed
         for publisher in publishers:
             publisher.wait_for_all_acked(Duration(seconds=5.0))
-        print(json.dumps({"sent": sent * len(TOPICS), "missed": missed, "seconds": time.monotonic() - begin}), flush=True)
+        print(
+            json.dumps(
+                {"sent": sent * len(TOPICS), "missed": missed, "seconds": time.monotonic() - begin}
+            ),
+            flush=True,
+        )
 
 
 def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], float]:
-    """The publisher's counts, and the processor time of the recorder from the first message to the last, s."""
+    """The publisher's counts, and the processor time of the recorder from the first message to the
+    last, s.
+    """
     scenario = find_scenario("osprey_servo").path
     options = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
     with (
@@ -80,7 +95,9 @@ class Rewritten(NamedTuple):
 
 
 def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
-    """Write the messages of a run on TOPICS, read into memory before, to a bag of rosbags' Writer."""
+    """Write the messages of a run on TOPICS, read into memory before, to a bag of rosbags'
+    Writer.
+    """
     names = {f"/{topic.name}" for topic in TOPICS}
     with AnyReader([run]) as reader:
         connections = [connection for connection in reader.connections if connection.topic in names]
@@ -91,7 +108,9 @@ def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
             writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:
             made = {
-                connection.id: writer.add_connection(connection.topic, connection.msgtype, typestore=reader.typestore)
+                connection.id: writer.add_connection(
+                    connection.topic, connection.msgtype, typestore=reader.typestore
+                )
                 for connection in connections
             }
             for connection, stamp_ns, data in messages:

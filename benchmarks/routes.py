@@ -1,14 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves: flown, missed or refused.
+"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves: flown,
+missed or refused.
 
     .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix]
 
-The figures go to docs/evidence/guidance-routes-*.csv, where all cases are flown. A row a flight in one process: the result,
-the largest cross-track error on the legs in seconds of flight at V0 and its limit, the largest error of the altitude. A leg or
-a circle that the aircraft joins, and the leg of the start, count from one radius beyond on, within which the start counts as
-reached. A refusal is a result, with the sentence. The wind is known as `guidance.wind`. No number is tuned to an aircraft. Exit
-status 1: an error beyond its limit, a missed leg, or an aircraft lost.
+The figures go to docs/evidence/guidance-routes-*.csv, where all cases are flown. A row a flight in
+one process: the result, the largest cross-track error on the legs in seconds of flight at V0 and
+its limit, the largest error of the altitude. A leg or a circle that the aircraft joins, and the leg
+of the start, count from one radius beyond on, within which the start counts as reached. A refusal
+is a result, with the sentence. The wind is known as `guidance.wind`. No number is tuned to an
+aircraft. Exit status 1: an error beyond its limit, a missed leg, or an aircraft lost.
 """
 
 import argparse
@@ -43,7 +45,9 @@ SETTLE = 20.0
 
 
 class Case(NamedTuple):
-    """A route, by the least radius in m, and the air. The aircraft starts at the origin and heads north."""
+    """A route, by the least radius in m, and the air. The aircraft starts at the origin and heads
+    north.
+    """
 
     waypoints: Callable[[float], list[Waypoint]]
     wind: float = 0.0  # to the east, of V0
@@ -65,15 +69,24 @@ class Row(NamedTuple):
         """The row of evidence; words that are no refusal do not meet the limit."""
         goal = None if self.result.startswith("refused") else self.limit
         value = self.xtrack if self.result == "flown" else self.result
-        return evidence.row(f"{self.case}: cross-track", value, "s" * (self.result == "flown"), at_most=goal)
+        return evidence.row(
+            f"{self.case}: cross-track", value, "s" * (self.result == "flown"), at_most=goal
+        )
 
 
-def of_radii(*places: tuple[float, float], altitudes: tuple[float, ...] = ()) -> Callable[[float], list[Waypoint]]:
-    """A route of places in radii to the north and to the east, and altitudes over that of the start in m."""
+def of_radii(
+    *places: tuple[float, float], altitudes: tuple[float, ...] = ()
+) -> Callable[[float], list[Waypoint]]:
+    """A route of places in radii to the north and to the east, and altitudes over that of the start
+    in m.
+    """
 
     def waypoints(radius: float) -> list[Waypoint]:
         heights = altitudes or (0.0,) * len(places)
-        return [Waypoint(north * radius, east * radius, up) for (north, east), up in zip(places, heights, strict=True)]
+        return [
+            Waypoint(north * radius, east * radius, up)
+            for (north, east), up in zip(places, heights, strict=True)
+        ]
 
     return waypoints
 
@@ -89,7 +102,9 @@ def steep(_: float) -> list[Waypoint]:
 
 
 EIGHT = of_radii((0, 0), (3, 0), (6, 3), (9, 3), (9, 0), (6, 0), (3, 3), (0, 3))
-BOX = of_radii((0, 0), (3, 0), (3, 3), (0, 3))  # longer, and the f16 runs out of fuel against the wind
+BOX = of_radii(
+    (0, 0), (3, 0), (3, 3), (0, 3)
+)  # longer, and the f16 runs out of fuel against the wind
 CASES: Mapping[str, Case] = {
     "behind": Case(of_radii((-4, 0), (-9, 0), (-9, 5))),
     "across": Case(of_radii((3, 7), (3, 13))),
@@ -111,7 +126,10 @@ def duration(route: Route, section: GuidanceConfig) -> float:
     side = float(path.joining(start, course, route.radius, route.near(0), at, 0.0))
     length, time = 0.0, SETTLE
     if side:
-        length = float(path.joining_length(start, course, side * route.radius, at, 0.0)) + math.pi * route.radius
+        length = (
+            float(path.joining_length(start, course, side * route.radius, at, 0.0))
+            + math.pi * route.radius
+        )
     for k, leg in enumerate(route.legs):
         if isinstance(leg, Line):
             length += path.length(leg)
@@ -146,7 +164,9 @@ def fly(name: str, title: str, case: Case) -> Row:
     elif flown[-1].leg < len(route.legs) - 1:
         result = f"missed: on leg {flown[-1].leg} of {len(route.legs) - 1} at the end"
     xtrack, altitude = errors(tape, route)
-    return Row(name, title, result, round(xtrack / varied.guidance.speed, 3), limit, round(altitude, 2))
+    return Row(
+        name, title, result, round(xtrack / varied.guidance.speed, 3), limit, round(altitude, 2)
+    )
 
 
 def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
@@ -156,35 +176,52 @@ def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
     wind, ground = case.wind * scenario.guidance.speed, scenario.aircraft.altitude or 0.0
     section = scenario.guidance.model_copy(update={"wind": wind})
     waypoints = [
-        point._replace(altitude=point.altitude + ground) for point in case.waypoints(math.ceil(section.least_radius()))
+        point._replace(altitude=point.altitude + ground)
+        for point in case.waypoints(math.ceil(section.least_radius()))
     ]
     aircraft: dict[str, Any] = {"wind": [0.0, wind]}
     if case.turbulent:
         aircraft["turbulence"] = turbulence(scenario, 1)
     varied = with_route(scenario.vary(aircraft=aircraft, guidance={"wind": wind}), waypoints)
-    return varied.vary(flight={"duration": float(math.ceil(duration(section.plan(waypoints), section)))})
+    return varied.vary(
+        flight={"duration": float(math.ceil(duration(section.plan(waypoints), section)))}
+    )
 
 
 def errors(tape: Tape, route: Route) -> tuple[float, float]:
     """Largest cross-track error and error of the altitude on the legs before the last orbit, m."""
     log = tape["guidance"]
     circles = [k for k, leg in enumerate(route.legs) if isinstance(leg, Arc) and leg.loiter]
-    on_leg = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0) & (log["leg"] < len(route.legs) - 1)
+    on_leg = (
+        (log["mode.lateral"] == Lateral.ROUTE)
+        & (log["joining"] == 0.0)
+        & (log["leg"] < len(route.legs) - 1)
+    )
     on_circle = np.isin(log["leg"], circles)
     on_leg &= ~on_circle | (log["loitered"] > 0.0)
     begins = (log["joining"] != 0.0) | (on_circle & (log["loitered"] == 0.0))
     for k in [0, *(np.flatnonzero(begins[:-1] & ~begins[1:]) + 1)]:
-        from_start = np.hypot(log["pose.north"] - log["pose.north"][k], log["pose.east"] - log["pose.east"][k])
+        from_start = np.hypot(
+            log["pose.north"] - log["pose.north"][k], log["pose.east"] - log["pose.east"][k]
+        )
         on_leg[k:] &= (log["leg"][k:] != log["leg"][k]) | (from_start[k:] > route.radius)
     off = np.abs(log["pose.altitude"] - log["target.altitude"])
-    return float(np.abs(log["xtrack"][on_leg]).max(initial=0.0)), float(off[on_leg & ~on_circle].max(initial=0.0))
+    return float(np.abs(log["xtrack"][on_leg]).max(initial=0.0)), float(
+        off[on_leg & ~on_circle].max(initial=0.0)
+    )
 
 
 def main() -> int:
     """Fly, print the rows and store them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", choices=[*AIRCRAFT, *OTHERS], default=[*AIRCRAFT], help="aircraft")
-    parser.add_argument("--cases", nargs="*", choices=[*CASES], default=[*CASES], help="routes; not stored")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", nargs="*", choices=[*AIRCRAFT, *OTHERS], default=[*AIRCRAFT], help="aircraft"
+    )
+    parser.add_argument(
+        "--cases", nargs="*", choices=[*CASES], default=[*CASES], help="routes; not stored"
+    )
     chosen = parser.parse_args()
     writer, failed = csv.writer(sys.stdout), False
     writer.writerow(Row._fields)

@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the stack, each figure compared with a baseline: the least program that does the same on this host in one run.
+"""Speed of the stack, each figure compared with a baseline: the least program that does the same on
+this host in one run.
 
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
-Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with other work.
-The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an
-empty timer of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags, a right message.
+Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with
+other work. The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback
+publishes the message again (an echo), an empty timer of rclpy, a loop that only sleeps, a node of
+rclpy that only spins, the writer of rosbags, a right message.
 """
 
 import argparse
@@ -87,23 +89,35 @@ class Row:
 def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
     """Percentiles of times in ns as columns in us."""
     low, high = np.percentile(np.asarray(values) / 1e3, (50, 99))
-    return {"p50 (us)": float(low), "p99 (us)": float(high), "max (us)": float(np.max(values)) / 1e3}
+    return {
+        "p50 (us)": float(low),
+        "p99 (us)": float(high),
+        "max (us)": float(np.max(values)) / 1e3,
+    }
 
 
 class Peer:
-    """Publishes y and y_m at a rate as aircraft and reference model do, and receives u and internals."""
+    """Publishes y and y_m at a rate as aircraft and reference model do, and receives u and
+    internals.
+    """
 
     def __init__(self, node: Node) -> None:
         outputs = find_scenario(SCENARIO).controller.outputs
-        self._y, self._y_m = (node.create_publisher(topic.type, topic.name, PUBLISH) for topic in (Y, Y_M))
-        self._y_encoder, self._y_m_encoder = (Encoder(outputs, f"/peer/{name}") for name in ("y", "y_m"))
+        self._y, self._y_m = (
+            node.create_publisher(topic.type, topic.name, PUBLISH) for topic in (Y, Y_M)
+        )
+        self._y_encoder, self._y_m_encoder = (
+            Encoder(outputs, f"/peer/{name}") for name in ("y", "y_m")
+        )
         self._u = PolledSubscription(node, U, RECORD, raw=True)
         self._internals = PolledSubscription(node, INTERNALS, RECORD, raw=True)
         self._decoder = Decoder(("age", "late"))
         self._values = np.random.default_rng(1).normal(size=(1000, len(outputs))) * 1e-3
 
     def drive(self, hz: float, seconds: float, child: Child) -> "Driven":
-        """Publish to a process for `seconds` after its first answer and WARM_UP. Raises RuntimeError without an answer."""
+        """Publish to a process for `seconds` after its first answer and WARM_UP. Raises
+        RuntimeError without an answer.
+        """
         begin, first, since_ns = time.monotonic(), 0.0, time.time_ns()
         driven = Driven()
         zero = np.zeros(self._values.shape[1])
@@ -112,16 +126,22 @@ class Peer:
                 break
             now_ns = time.time_ns()
             self._y_m.publish(self._y_m_encoder.encode(now_ns, zero))
-            self._y.publish(self._y_encoder.encode(now_ns, self._values[tick.number % len(self._values)]))
+            self._y.publish(
+                self._y_encoder.encode(now_ns, self._values[tick.number % len(self._values)])
+            )
             driven.sent += 1
             for received in self._u.take():
-                if (stamp_ns := stamp_of(received.message)) >= since_ns:  # else of an earlier process, or warm-up
+                if (
+                    stamp_ns := stamp_of(received.message)
+                ) >= since_ns:  # else of an earlier process, or warm-up
                     driven.start = driven.start or received.received_ns / NANOSECONDS
                     driven.received[stamp_ns] = received.received_ns
             for received in self._internals.take():
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
-                    driven.age[sample.stamp_ns], driven.late[sample.stamp_ns] = sample.value.tolist()
+                    driven.age[sample.stamp_ns], driven.late[sample.stamp_ns] = (
+                        sample.value.tolist()
+                    )
             if not first and driven.received and time.time() > driven.start + WARM_UP:
                 first = time.monotonic() - WARM_UP
                 driven, cpu_ns, since_ns = Driven(driven.start), child.cpu_ns(), time.time_ns()
@@ -161,7 +181,11 @@ class Driven:
     @property
     def answers(self) -> list[float]:
         """From the beginning of the tick to u received, ns."""
-        return [at - stamp - 1e9 * self.age[stamp] for stamp, at in self.received.items() if stamp in self.age]
+        return [
+            at - stamp - 1e9 * self.age[stamp]
+            for stamp, at in self.received.items()
+            if stamp in self.age
+        ]
 
     @property
     def cpu_each(self) -> float:
@@ -170,11 +194,21 @@ class Driven:
 
 
 @contextlib.contextmanager
-def controller_at(hz: float, folder: Path, role: str = "controller", scenario_name: str = SCENARIO) -> Iterator[Child]:
+def controller_at(
+    hz: float, folder: Path, role: str = "controller", scenario_name: str = SCENARIO
+) -> Iterator[Child]:
     """The process of the controller of a scenario at a rate."""
-    others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not run here
-    rates = {"aircraft": others | {"step": 0.001}, "reference_model": others, "controller": {"rate": hz}}
-    scenario = written(find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml")
+    others = {
+        "rate": max(hz, 500.0)
+    }  # at least as fast as the controller, as a scenario demands; they do not run here
+    rates = {
+        "aircraft": others | {"step": 0.001},
+        "reference_model": others,
+        "controller": {"rate": hz},
+    }
+    scenario = written(
+        find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml"
+    )
     with Child(role, "--ros-args", "--params-file", str(scenario.path)) as child:
         yield child
 
@@ -195,7 +229,9 @@ def receiver_rows() -> Iterator[Row]:
 
 
 def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """The controller's tick and an echo's callback, from a y that has arrived to the message published."""
+    """The controller's tick and an echo's callback, from a y that has arrived to the message
+    published.
+    """
     length = min(seconds, 4.0)
     took: dict[str, list[dict[str, float]]] = {}
     with open_node("peer") as node:
@@ -216,10 +252,18 @@ def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
                     took.setdefault(name, []).append(_whole(child.stop()))
     without, observed = OBSERVED.values()
     for name, runs in took.items():
-        figures = {f"{column} (us)": float(np.median([run[column] for run in runs])) for column in ("p50", "p99")}
+        figures = {
+            f"{column} (us)": float(np.median([run[column] for run in runs]))
+            for column in ("p50", "p99")
+        }
         goals = () if name.startswith("bare") else (Goal("p50 (us)", 2.0, of_floor=True),)
         if name in {without, observed}:
-            yield Row(name, figures, without, (Goal("p50 (us)", 1.5, of_floor=True),) if name == observed else ())
+            yield Row(
+                name,
+                figures,
+                without,
+                (Goal("p50 (us)", 1.5, of_floor=True),) if name == observed else (),
+            )
         else:
             yield Row(name, figures, "bare echo, single", goals)
 
@@ -244,15 +288,24 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
             for executor, of in echoed.items():
                 yield Row(f"bare echo, {executor}, {hz} Hz", _latency(of, of.round_trips), floor)
             goals = (Goal("CPU (us each)", 2.0, of_floor=True),)
-            yield Row(f"controller, tick to u, {hz} Hz", _latency(driven, driven.answers), floor, goals)
-            yield Row(f"controller, y to u with the wait for the tick, {hz} Hz", us(driven.round_trips), floor)
+            yield Row(
+                f"controller, tick to u, {hz} Hz", _latency(driven, driven.answers), floor, goals
+            )
+            yield Row(
+                f"controller, y to u with the wait for the tick, {hz} Hz",
+                us(driven.round_trips),
+                floor,
+            )
             late = [1e9 * seconds_late for seconds_late in driven.late.values()]
             yield Row(f"controller, lateness of the tick, {hz} Hz", us(late))
 
 
 def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
     times = us(values) if values else {}  # none was answered
-    return times | {"CPU (us each)": driven.cpu_each, "answered (%)": 100.0 * len(driven.received) / driven.sent}
+    return times | {
+        "CPU (us each)": driven.cpu_each,
+        "answered (%)": 100.0 * len(driven.received) / driven.sent,
+    }
 
 
 def tick_rows(seconds: float) -> Iterator[Row]:
@@ -267,8 +320,14 @@ def tick_rows(seconds: float) -> Iterator[Row]:
                 yield Row(f"empty timer, {executor}, {hz} Hz", _ticks(child, short), floor)
         with Child("bare_loop", *options, str(short)) as child:
             yield Row(f"loop that only sleeps, {hz} Hz", _ticks(child, short), floor)
-        goals = {500: [Goal(OWN_MISSES if within else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
-        with delay_monitors(bool(within)) as delays, Child("ticker", *options, str(seconds)) as child:
+        goals = {
+            500: [Goal(OWN_MISSES if within else "missed", 0)],
+            1000: [Goal("p99 (us)", 100.0)],
+        }.get(hz, [])
+        with (
+            delay_monitors(bool(within)) as delays,
+            Child("ticker", *options, str(seconds)) as child,
+        ):
             figures = _ticks(child, seconds, delays)
         yield Row(f"the stack's loop, {hz} Hz", figures, floor, goals)
     if not within:
@@ -278,11 +337,16 @@ def tick_rows(seconds: float) -> Iterator[Row]:
             length = short if role == "timer" else seconds
             with Child(role, "--hz", "100", "--seconds", str(length), within=within) as child:
                 goals = [Goal("p99 (us)", 50.0)] if role == "ticker" else []
-                what, floor = (f"{label}, 100 Hz, FIFO {PRIORITY}, full load" for label in (name, "empty timer, single"))
+                what, floor = (
+                    f"{label}, 100 Hz, FIFO {PRIORITY}, full load"
+                    for label in (name, "empty timer, single")
+                )
                 yield Row(what, _ticks(child, length), floor, goals)
 
 
-def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None = None) -> dict[str, float]:
+def _ticks(
+    child: Child, seconds: float, delays: Callable[[], Intervals] | None = None
+) -> dict[str, float]:
     time.sleep(seconds / 2.0)
     cpu_ns, at = child.cpu_ns(), time.monotonic()
     time.sleep(seconds / 2.0)  # it started later, so it still runs
@@ -291,7 +355,9 @@ def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None 
     figures = {f"{name} (us)": output[name] for name in ("p50", "p99", "max")}
     figures["missed"] = output["missed"]
     if delays is not None:
-        figures[OWN_MISSES] = missed_excluding_delays(output["skipped"], delays(), output["period_ns"])
+        figures[OWN_MISSES] = missed_excluding_delays(
+            output["skipped"], delays(), output["period_ns"]
+        )
     return figures | {"ticks": output["ticks"], "CPU (%)": 100.0 * share}
 
 
@@ -299,7 +365,9 @@ def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None 
 def full_load() -> Iterator[None]:
     """Every core busy with other work at ordinary priority."""
     # Also where this program runs at real-time priority: else they would block the host.
-    spin = "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
+    spin = (
+        "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
+    )
     busy = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(os.cpu_count() or 1)]  # noqa: S603
     try:
         yield
@@ -319,14 +387,18 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
         yield Row("node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
     scenario = written(scenario, folder / "scenario.yaml")
     with (
-        FlightMonitor(scenario.controller.outputs, lockstep=True) as monitor,  # without a subscription to internals
+        FlightMonitor(
+            scenario.controller.outputs, lockstep=True
+        ) as monitor,  # without a subscription to internals
         FlightProcesses(scenario, run, monitor, lockstep=False, one_process=False) as flight,
     ):
         if reason := flight.begin():
             raise RuntimeError(reason)
         time.sleep(max(flight.start_time - time.time(), 0.0) + WARM_UP)
         processes = flight.processes
-        for process, figures in zip(processes, _use([process.popen.pid for process in processes], seconds), strict=True):
+        for process, figures in zip(
+            processes, _use([process.popen.pid for process in processes], seconds), strict=True
+        ):
             yield Row(process.node.executable, figures, "node that only spins")
 
 
@@ -334,7 +406,9 @@ def _use(pids: Sequence[int], seconds: float) -> list[dict[str, float]]:
     before, begin = [threads_ns(pid) for pid in pids], time.monotonic()
     time.sleep(seconds)
     elapsed = time.monotonic() - begin
-    shares = [(threads_ns(pid) - was) / 1e9 / elapsed for pid, was in zip(pids, before, strict=True)]
+    shares = [
+        (threads_ns(pid) - was) / 1e9 / elapsed for pid, was in zip(pids, before, strict=True)
+    ]
     memory = [psutil.Process(pid).memory_full_info() for pid in pids]
     return [
         {"CPU (%)": 100.0 * share, "resident (MB)": of.rss / 1e6, "unique (MB)": of.uss / 1e6}
@@ -347,7 +421,9 @@ def start_rows(folder: Path) -> Iterator[Row]:
     floor = "python, import rclpy, rclpy.init"
     begin = time.perf_counter()
     for _ in range(5):
-        subprocess.run([sys.executable, "-c", "import rclpy; rclpy.init(); rclpy.shutdown()"], check=True)
+        subprocess.run(
+            [sys.executable, "-c", "import rclpy; rclpy.init(); rclpy.shutdown()"], check=True
+        )
     yield Row(floor, {"seconds": (time.perf_counter() - begin) / 5}, floor)
     with open_node("peer") as node:
         peer = Peer(node)
@@ -357,7 +433,11 @@ def start_rows(folder: Path) -> Iterator[Row]:
             with controller_at(100.0, folder, CONTROLLER.module) as child:
                 waits.append(peer.drive(100.0, 0.1, child).start - begin)
         yield Row("controller, to its first u", {"seconds": float(np.median(waits))}, floor)
-    yield Row("rise-di fly, to its first u", {"seconds": float(np.median([seconds_to_first_u() for _ in range(5)]))}, floor)
+    yield Row(
+        "rise-di fly, to its first u",
+        {"seconds": float(np.median([seconds_to_first_u() for _ in range(5)]))},
+        floor,
+    )
 
 
 def seconds_to_first_u() -> float:
@@ -366,7 +446,9 @@ def seconds_to_first_u() -> float:
         subscription = PolledSubscription(node, U, RECORD, raw=True)
         begin = time.time()
         command = [RISE_DI, "fly", SCENARIO, "--duration", "30", "--set", f"runs={runs}"]
-        flight = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # noqa: S603 - this stack
+        flight = subprocess.Popen(  # noqa: S603 - this stack
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
         try:
             while not (received := subscription.take()) and flight.poll() is None:
                 time.sleep(0.005)
@@ -374,15 +456,24 @@ def seconds_to_first_u() -> float:
             flight.send_signal(signal.SIGINT)
             _, output = flight.communicate()
     if not received:
-        raise RuntimeError(f"rise-di fly ended before its first u: {output.strip().splitlines()[-1:]}")
+        raise RuntimeError(
+            f"rise-di fly ended before its first u: {output.strip().splitlines()[-1:]}"
+        )
     return received[0].received_ns / NANOSECONDS - begin
 
 
 def import_rows() -> Iterator[Row]:
-    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`; medians."""
+    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`;
+    medians.
+    """
     floor, ours, usage = "python, import numpy", "python, import rise_di", "rise-di --help"
-    alone = "import time; begin = time.process_time(); import {}; print(1e3 * (time.process_time() - begin))"
-    commands = {name: [sys.executable, "-c", alone.format(name.split()[-1])] for name in (floor, ours)}
+    alone = (
+        "import time; begin = time.process_time(); import {}; print(1e3 * "
+        "(time.process_time() - begin))"
+    )
+    commands = {
+        name: [sys.executable, "-c", alone.format(name.split()[-1])] for name in (floor, ours)
+    }
     commands[usage] = [RISE_DI, "--help"]
     whole, imported = defaultdict(list), defaultdict(list)
     for _ in range(IMPORTS):  # in turns, since the speed of the host drifts
@@ -390,11 +481,15 @@ def import_rows() -> Iterator[Row]:
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             output = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603 - this stack
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            whole[name].append(1e3 * (after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime))
+            whole[name].append(
+                1e3 * (after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+            )
             if name != usage:
                 imported[name].append(float(output))
     figures = {name: {PROCESS: float(np.median(times))} for name, times in whole.items()}
-    figures |= {name: figures[name] | {IMPORT: float(np.median(times))} for name, times in imported.items()}
+    figures |= {
+        name: figures[name] | {IMPORT: float(np.median(times))} for name, times in imported.items()
+    }
     yield Row(floor, figures[floor], floor)
     yield Row(ours, figures[ours], floor, (Goal(IMPORT, 50.0), Goal(PROCESS, 0.6, of_floor=True)))
     yield Row(usage, figures[usage], goals=(Goal(PROCESS, 300.0),))
@@ -408,26 +503,45 @@ def lockstep_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """CPU time, losses and size of the recorder at 1 kHz on six topics, compared with rosbags' writer fed from memory."""
+    """CPU time, losses and size of the recorder at 1 kHz on six topics, compared with rosbags'
+    writer fed from memory.
+    """
     run, floor = folder / "recorded", "rosbags' Writer, MCAP"
     sent, processor = recorder.record(run, 1000.0, seconds)
     rewritten = recorder.rewrite(run, folder / "rosbags", CompressionMode.NONE)
     count = rewritten.counts.total()
     yield Row(floor, {"CPU (us each)": rewritten.cpu, "bytes each": rewritten.size}, floor)
-    figures = {"CPU (us each)": 1e6 * processor / count, "bytes each": recorder.mcap_size(run) / count}
-    yield Row("recorder, from topics to disk", figures | {"lost": sent["sent"] - count}, floor, (Goal("lost", 0),))
+    figures = {
+        "CPU (us each)": 1e6 * processor / count,
+        "bytes each": recorder.mcap_size(run) / count,
+    }
+    yield Row(
+        "recorder, from topics to disk",
+        figures | {"lost": sent["sent"] - count},
+        floor,
+        (Goal("lost", 0),),
+    )
 
 
 def evidence_rows(rows: Sequence[Row]) -> Iterator[evidence.Row]:
     """The rows of evidence; counts, single outliers and shares have no baseline."""
     by_name = {row.what: row.figures for row in rows}
     for row in rows:
-        goals = {goal.column: f"<= {goal.at_most:g}" + evidence.BASELINE * goal.of_floor for goal in row.goals}
+        goals = {
+            goal.column: f"<= {goal.at_most:g}" + evidence.BASELINE * goal.of_floor
+            for goal in row.goals
+        }
         for column, value in row.figures.items():
             name, unit = evidence.split(column)
-            compared = row.floor != row.what and column in by_name.get(row.floor, {}) and column not in WITHOUT_BASELINE
+            compared = (
+                row.floor != row.what
+                and column in by_name.get(row.floor, {})
+                and column not in WITHOUT_BASELINE
+            )
             baseline = f"{row.floor}: {name}" if compared else ""
-            yield evidence.Row(f"{row.what}: {name}", f"{value:.6g}", unit, baseline, goals.get(column, ""))
+            yield evidence.Row(
+                f"{row.what}: {name}", f"{value:.6g}", unit, baseline, goals.get(column, "")
+            )
 
 
 Group = Callable[[float, Path], Iterator[Row]]
@@ -452,7 +566,9 @@ def show(console: Console, name: str, rows: Sequence[Row]) -> None:
     by_name = {row.what: row.figures for row in rows}
     for row in rows:
         floor = by_name.get(row.floor, {})
-        table.add_row(row.what, *(_cell(row.figures.get(column), floor.get(column)) for column in columns))
+        table.add_row(
+            row.what, *(_cell(row.figures.get(column), floor.get(column)) for column in columns)
+        )
     console.print(table)
 
 
@@ -464,9 +580,16 @@ def _cell(value: float | None, floor: float | None) -> str:
 
 def main() -> None:
     """Measure, print, and write the figures to a file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", choices=GROUPS, help="measure only this group")
-    parser.add_argument("--seconds", type=float, default=10.0, help="how long each figure of a running process is measured")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=10.0,
+        help="how long each figure of a running process is measured",
+    )
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()
     # its own domain, among those whose ports are outside Linux's ephemeral range
@@ -480,7 +603,9 @@ def main() -> None:
         show(console, name, rows)
         measured += evidence_rows(rows)
     if options.json is not None:
-        options.json.write_text(json.dumps({"evidence": measured}, indent=1) + "\n", encoding="utf-8")
+        options.json.write_text(
+            json.dumps({"evidence": measured}, indent=1) + "\n", encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -45,14 +45,24 @@ MONITOR_PERIOD = 0.0005  # s
 def times(took_ns: list[int]) -> dict[str, float]:
     """Median and 99th percentile of durations, us, without the warm-up."""
     took = np.array(took_ns[len(took_ns) // 20 :]) / 1e3
-    return {"p50": float(np.percentile(took, 50)), "p99": float(np.percentile(took, 99)), "calls": len(took_ns)}
+    return {
+        "p50": float(np.percentile(took, 50)),
+        "p99": float(np.percentile(took, 99)),
+        "calls": len(took_ns),
+    }
 
 
 def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
     """Percentiles of the lateness of ticks, us, without the warm-up."""
     late = times(late_ns)
     most = max(late_ns[len(late_ns) // 20 :]) / 1e3
-    return {"p50": late["p50"], "p99": late["p99"], "max": most, "missed": missed, "ticks": late["calls"]}
+    return {
+        "p50": late["p50"],
+        "p99": late["p99"],
+        "max": most,
+        "missed": missed,
+        "ticks": late["calls"],
+    }
 
 
 def executor_of(node: Node, kind: str) -> Any:
@@ -65,8 +75,8 @@ def executor_of(node: Node, kind: str) -> Any:
 def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
     """A subscription to y whose callback publishes each message on u.
 
-    Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the end of the callback is
-    measured. Otherwise the executor spins as usual.
+    Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the
+    end of the callback is measured. Otherwise the executor spins as usual.
     """
     ended = termination()
     took: list[int] = []
@@ -87,7 +97,9 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
         for _ in ticks(hz):
             if ended.is_set():
                 break
-            if sent_ns > begin_ns:  # a message had arrived; checked late, since an executor may have threads
+            if (
+                sent_ns > begin_ns
+            ):  # a message had arrived; checked late, since an executor may have threads
                 took.append(sent_ns - begin_ns)
             begin_ns = time.perf_counter_ns()
             executor.spin_once(timeout_sec=0.0)
@@ -154,7 +166,9 @@ def bare_loop(hz: float, seconds: float) -> dict[str, float]:
 def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     """An empty node of the stack, with the services, diagnostics and graph checks of its loop."""
     late: list[int] = []
-    skipped: list[tuple[int, int]] = []  # from the first missed deadline to the next tick, monotonic ns
+    skipped: list[
+        tuple[int, int]
+    ] = []  # from the first missed deadline to the next tick, monotonic ns
     period = round(NANOSECONDS / hz)
 
     class Empty(FlightNode[NodeConfig]):
@@ -178,25 +192,34 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
 
 
 def delay_monitor(core: int) -> dict[str, Any]:
-    """Host delays of one core: intervals in which a process of the highest priority did not run, monotonic ns.
+    """Host delays of one core: intervals in which a process of the highest priority did not run,
+    monotonic ns.
 
     The kernel delays it or, in a virtual machine, its host (steal time).
     """
     os.sched_setaffinity(0, {core})
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))
+    os.sched_setscheduler(
+        0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO))
+    )
     ended, delays = termination(), []
     last_ns = time.monotonic_ns()
     while not ended.is_set():
         time.sleep(MONITOR_PERIOD)
         now_ns = time.monotonic_ns()
-        if now_ns - last_ns > 1.5e9 * MONITOR_PERIOD:  # a wake-up takes a twentieth to a fifth of a period
-            delays.append((last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns))  # it was to sleep until then
+        if (
+            now_ns - last_ns > 1.5e9 * MONITOR_PERIOD
+        ):  # a wake-up takes a twentieth to a fifth of a period
+            delays.append(
+                (last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns)
+            )  # it was to sleep until then
         last_ns = now_ns
     return {"delays": delays}
 
 
 def controller() -> dict[str, float]:
-    """The controller's node: time from the beginning of a tick until u is published, and until its end."""
+    """The controller's node: time from the beginning of a tick until u is published, and until its
+    end.
+    """
     until_u: list[int] = []
     whole: list[int] = []
 
@@ -239,7 +262,9 @@ ROLES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
 
 def main() -> None:
     """Run one role."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("role", choices=ROLES)
     parser.add_argument("--executor", choices=EXECUTORS, default="single")
     parser.add_argument("--hz", type=float, default=500.0)

@@ -1,12 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of watching a flight: opening a long log, the server beside a flight, delays to the screen, missed ticks.
+"""The cost of watching a flight: opening a long log, the server beside a flight, delays to the
+screen, missed ticks.
 
 .venv/bin/python -m benchmarks.view                      # all
 .venv/bin/python -m benchmarks.view open --hours 1       # `rise-di watch` of a log of that length
-.venv/bin/python -m benchmarks.view live --seconds 30    # a flight in real time, a client, and a browser where there is one
-.venv/bin/python -m benchmarks.view frozen               # a page whose process stops for 10 s, and how it comes back
-.venv/bin/python -m benchmarks.view flights --count 10   # that many flights, with a client for half of the time
+.venv/bin/python -m benchmarks.view live --seconds 30
+    # a flight in real time, a client, and a browser where there is one
+.venv/bin/python -m benchmarks.view frozen
+    # a page whose process stops for 10 s, and how it comes back
+.venv/bin/python -m benchmarks.view flights --count 10
+    # that many flights, with a client for half of the time
 """
 
 import argparse
@@ -51,7 +55,10 @@ PIECE = 60.0  # s of flight that are repeated to a long log
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
 START_S = 1_795_000_000  # s, stamps of today
 POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
-FREEZE, RECOVERED = 10.0, 0.3  # s: a page stops for so long, and is back when it is less behind than that
+FREEZE, RECOVERED = (
+    10.0,
+    0.3,
+)  # s: a page stops for so long, and is back when it is less behind than that
 BEGUN = 3.0  # s, until a flight has begun
 FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
 TURN = 2.5  # s, with a client and without one in turns
@@ -62,15 +69,22 @@ STARTED = 7.0  # s, for the start of the server, until its client has the flight
 
 
 def write_long_log(run: Path, hours: float) -> None:
-    """Repeat a flight of PIECE s with moved stamps, with a chunk each 0.1 s as the recorder writes them."""
+    """Repeat a flight of PIECE s with moved stamps, with a chunk each 0.1 s as the recorder writes
+    them.
+    """
     scenario = find_scenario(SCENARIO).vary(flight={"duration": PIECE})
     with tempfile.TemporaryDirectory() as folder:
         write_run(simulate(scenario), Path(folder), attachments_for(scenario, Path(folder)))
-        messages = [message for message in stored_messages(Path(folder)) if message.received_ns < nanoseconds(PIECE)]
+        messages = [
+            message
+            for message in stored_messages(Path(folder))
+            if message.received_ns < nanoseconds(PIECE)
+        ]
     with BagWriter(run) as bag:
         bag.add_attachments(attachments_for(scenario, run), 0)
         channels = {
-            topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(message.topic for message in messages)
+            topic: bag.add_topic(topic, JOINT_STATE, "")
+            for topic in dict.fromkeys(message.topic for message in messages)
         }
         flushed_ns = 0
         for k in range(round(hours * 3600.0 / PIECE)):
@@ -83,15 +97,24 @@ def write_long_log(run: Path, hours: float) -> None:
 
 
 def moved(one: StoredMessage, now_ns: int) -> bytes:
-    """The message with another stamp. Its t, where it has one, stays, as in one flight the first alone counts."""
+    """The message with another stamp. Its t, where it has one, stays, as in one flight the first
+    alone counts.
+    """
     seconds, rest = divmod(now_ns, NANOSECONDS)
-    return one.data[: STAMP.start] + seconds.to_bytes(4, "little") + rest.to_bytes(4, "little") + one.data[STAMP.stop :]
+    return (
+        one.data[: STAMP.start]
+        + seconds.to_bytes(4, "little")
+        + rest.to_bytes(4, "little")
+        + one.data[STAMP.stop :]
+    )
 
 
 def open_log(hours: float) -> dict[str, Any]:
-    """Times in s from the start of `rise-di watch` to answers about a long log, and the memory of the server in MB.
+    """Times in s from the start of `rise-di watch` to answers about a long log, and the memory of
+    the server in MB.
 
-    "first samples" is the first answer that has some, "whole log" the first one with the state "ended".
+    "first samples" is the first answer that has some, "whole log" the first one with the state
+    "ended".
     """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
@@ -107,7 +130,12 @@ def open_log(hours: float) -> dict[str, Any]:
             times["whole log"] = time.monotonic() - begin
             processor, memory = server.cpu_times(), server.memory_info().rss / 1e6
         size = sum(path.stat().st_size for path in run.glob("*.mcap")) / 1e6
-    return times | {"processor": processor.user + processor.system, "memory": memory, "flight": 3600.0 * hours, "log": size}
+    return times | {
+        "processor": processor.user + processor.system,
+        "memory": memory,
+        "flight": 3600.0 * hours,
+        "log": size,
+    }
 
 
 # Beside a flight
@@ -120,7 +148,9 @@ class Client(threading.Thread):
         super().__init__(daemon=True)
         parts = urllib.parse.urlsplit(address)
         self._loop = asyncio.Runner()
-        self._socket = self._loop.run(self._connect(parts.netloc, parts.fragment.removeprefix("token=")))
+        self._socket = self._loop.run(
+            self._connect(parts.netloc, parts.fragment.removeprefix("token="))
+        )
         self._ended = threading.Event()
         self.asks = True
         self._head: dict[str, Any] = {}
@@ -135,7 +165,9 @@ class Client(threading.Thread):
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends; not while `asks` is off."""
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # of this thread: in use the browser is on another host
+        os.sched_setscheduler(
+            0, os.SCHED_IDLE, os.sched_param(0)
+        )  # of this thread: in use the browser is on another host
         while not self._ended.wait(1.0 / POLLS):
             try:
                 if self.asks:
@@ -144,8 +176,12 @@ class Client(threading.Thread):
                 break
 
     def news(self) -> dict[str, Any]:
-        """The head of an answer with what the client lacks, which it knows then. Raises EOFError where the server has ended."""
-        known = {name: self._head.get(name, "") for name in ("epoch", "state", "described")} | self._rows
+        """The head of an answer with what the client lacks, which it knows then. Raises EOFError
+        where the server has ended.
+        """
+        known = {
+            name: self._head.get(name, "") for name in ("epoch", "state", "described")
+        } | self._rows
         content = self.ask(urllib.parse.urlencode(known))
         self.bytes += len(content)
         size = int.from_bytes(content[:4], "little")
@@ -180,9 +216,20 @@ class Client(threading.Thread):
 @contextmanager
 def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
     """A flight in real time, and the folder of its run."""
-    command = [RISE_DI, "fly", SCENARIO, "--duration", f"{seconds:g}", "--set", f"runs={runs}", "--json"]
+    command = [
+        RISE_DI,
+        "fly",
+        SCENARIO,
+        "--duration",
+        f"{seconds:g}",
+        "--set",
+        f"runs={runs}",
+        "--json",
+    ]
     known = set(runs.iterdir())
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as flight:  # noqa: S603
+    with subprocess.Popen(  # noqa: S603
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as flight:
         while not (new := set(runs.iterdir()) - known):
             time.sleep(0.02)
         yield flight, new.pop()
@@ -215,7 +262,9 @@ MEASURE = """(start => {
 
 
 def live(seconds: float, *, browser: bool) -> dict[str, Any]:
-    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the screen."""
+    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the
+    screen.
+    """
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), seconds) as (flight, run),
@@ -239,12 +288,23 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         flight.communicate()
         client.stop()
         traffic = client.bytes / seconds
-    shown: dict[str, Any] = {"flight": seconds, "processor": share, "memory": memory, "traffic": traffic}
-    return shown | ({"to the screen": {f"p{k}": float(np.percentile(drawn, k)) for k in (50, 99)}} if browser else {})
+    shown: dict[str, Any] = {
+        "flight": seconds,
+        "processor": share,
+        "memory": memory,
+        "traffic": traffic,
+    }
+    return shown | (
+        {"to the screen": {f"p{k}": float(np.percentile(drawn, k)) for k in (50, 99)}}
+        if browser
+        else {}
+    )
 
 
 def frozen(seconds: float = FREEZE) -> dict[str, Any]:
-    """A page whose process stops for so long: the time from its going on until its delay is below RECOVERED again, s."""
+    """A page whose process stops for so long: the time from its going on until its delay is below
+    RECOVERED again, s.
+    """
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), seconds + 60.0) as (flight, run),
@@ -256,7 +316,9 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
         page.run(f"{MEASURE}({start_of(address)})")
         time.sleep(3.0)
         renderers = [
-            process for process in psutil.Process(page.pid).children(recursive=True) if "--type=renderer" in process.cmdline()
+            process
+            for process in psutil.Process(page.pid).children(recursive=True)
+            if "--type=renderer" in process.cmdline()
         ]
         for renderer in renderers:
             renderer.suspend()
@@ -264,11 +326,18 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
         resumed = time.time()
         for renderer in renderers:
             renderer.resume()
-        page.wait_for(f"window.delays.length > 0 && delays.at(-1) < {RECOVERED} && instants.at(-1) > {resumed}")
+        page.wait_for(
+            f"window.delays.length > 0 && delays.at(-1) < {RECOVERED} && instants.at(-1) > "
+            f"{resumed}"
+        )
         instants, delays = page.run("[instants, delays]")
         flight.terminate()
         flight.communicate()
-    back = (at - resumed for at, delay in zip(instants, delays, strict=True) if at > resumed and delay < RECOVERED)
+    back = (
+        at - resumed
+        for at, delay in zip(instants, delays, strict=True)
+        if at > resumed and delay < RECOVERED
+    )
     return {"frozen": seconds, "recovered after": next(back)}
 
 
@@ -280,17 +349,22 @@ def start_of(address: str) -> float:
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
-    """Ticks of flights, for half of the time without and with a watching client: missed, and late p99 in s.
+    """Ticks of flights, for half of the time without and with a watching client: missed, and late
+    p99 in s.
 
-    Client and server stop and go on in turns of TURN. So the phases of the nodes' timers, which differ from flight to flight,
-    are the same for both, and a drift of the host cancels. "start included" counts also the start of the server, whose
-    processor time is that of any program that starts.
+    Client and server stop and go on in turns of TURN. So the phases of the nodes' timers, which
+    differ from flight to flight, are the same for both, and a drift of the host cancels. "start
+    included" counts also the start of the server, whose processor time is that of any program that
+    starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
     found: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
     starting: list[float] = []  # s
     for number in range(count):
-        turns: dict[bool, list[tuple[int, int]]] = {False: [], True: []}  # system time, ns; without and with a client
+        turns: dict[bool, list[tuple[int, int]]] = {
+            False: [],
+            True: [],
+        }  # system time, ns; without and with a client
         with (
             tempfile.TemporaryDirectory() as folder,
             delay_monitors(bool(real_time())) as delays,
@@ -316,7 +390,9 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
                 client.stop()
             flight.communicate()
             clock = time.time_ns() - time.monotonic_ns()
-            host_delays = [(since + clock, until + clock) for since, until in delays()] if delays else None
+            host_delays = (
+                [(since + clock, until + clock) for since, until in delays()] if delays else None
+            )
             internals = read_run(run).tape["internals"]
         for kind, windows in {
             "without": turns[False],
@@ -327,7 +403,8 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
         starting.append((joins - starts) / NANOSECONDS)
     names = found["with"][0]
     shown: dict[str, Any] = {
-        kind: {name: [figure[name] for figure in figures] for name in names} for kind, figures in found.items()
+        kind: {name: [figure[name] for figure in figures] for name in names}
+        for kind, figures in found.items()
     }
     for kind in ("with", "start included"):
         more = {name: np.subtract(shown[kind][name], shown["without"][name]) for name in names}
@@ -338,14 +415,21 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
 
 
 def figures_of_ticks(
-    internals: Signal, delays: Intervals | None, period_ns: int, windows: Intervals = ((0, 2**63 - 1),)
+    internals: Signal,
+    delays: Intervals | None,
+    period_ns: int,
+    windows: Intervals = ((0, 2**63 - 1),),
 ) -> dict[str, float]:
-    """Missed ticks and late p99 of the deadlines inside windows, also excluding host delays where they are known."""
+    """Missed ticks and late p99 of the deadlines inside windows, also excluding host delays where
+    they are known.
+    """
     at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
 
     def inside(instants: NDArray[np.int64]) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = np.any([(instants >= first) & (instants <= last) for first, last in windows], axis=0)
+        found: NDArray[np.bool_] = np.any(
+            [(instants >= first) & (instants <= last) for first, last in windows], axis=0
+        )
         return found
 
     missed = due[:-1] + period_ns  # unless the next tick has this deadline
@@ -361,13 +445,16 @@ def figures_of_ticks(
 
 
 def interval(differences: FloatArray) -> list[float]:
-    """The 95 % confidence interval of the median, by order statistics: of ten values from the second to the ninth."""
+    """The 95 % confidence interval of the median, by order statistics: of ten values from the
+    second to the ninth.
+    """
     ends: list[float] = np.array(quantile_test(differences).confidence_interval(0.95)).tolist()
     return ends
 
 
 def probability(differences: FloatArray) -> float:
-    """Of a mean difference this large or larger by chance, where watching has no effect: all signs of the pairs are alike.
+    """Of a mean difference this large or larger by chance, where watching has no effect: all signs
+    of the pairs are alike.
 
     Exact permutation test of paired samples; Edgington, Randomization Tests, 4th edition, 5.
     """
@@ -377,18 +464,26 @@ def probability(differences: FloatArray) -> float:
 
 def main() -> None:
     """Measure, and print the figures as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=["open", "live", "frozen", "flights", []], help="all by default")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "parts", nargs="*", choices=["open", "live", "frozen", "flights", []], help="all by default"
+    )
     parser.add_argument("--hours", type=float, default=1.0, help="length of the log")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the live flight")
     parser.add_argument("--count", type=int, default=10, help="flights whose ticks are compared")
-    parser.add_argument("--no-browser", action="store_true", help="measure without a browser on this machine")
+    parser.add_argument(
+        "--no-browser", action="store_true", help="measure without a browser on this machine"
+    )
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     parts = arguments.parts or ["open", "live", "frozen", "flights"]
     browser = CHROMIUM is not None and not arguments.no_browser
-    found: dict[str, Any] = {} if browser else {"to the screen": {"p50": None, "p99": None}, "recovered after": None}
+    found: dict[str, Any] = (
+        {} if browser else {"to the screen": {"p50": None, "p99": None}, "recovered after": None}
+    )
     if "open" in parts:
         found["opened"] = open_log(arguments.hours)
     if "live" in parts:

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of the live page in the documentation: a flight in the air, a replay with a ghost, a guided flight.
+"""The pictures of the live page in the documentation: a flight in the air, a replay with a ghost, a
+guided flight.
 
 .venv/bin/python -m benchmarks.view_pictures
 """
@@ -27,7 +28,11 @@ DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
 STATE = "document.getElementById('state')?.textContent"
 ENDED = f"{STATE} === 'ENDED'"
 TIME = "parseFloat(document.getElementById('time').textContent.slice(4))"
-LIVE_AT, GHOST_AT, GUIDED_AT = 12.0, 40.6, 60.0  # s: a roll, the vertical gust, the second leg of the route
+LIVE_AT, GHOST_AT, GUIDED_AT = (
+    12.0,
+    40.6,
+    60.0,
+)  # s: a roll, the vertical gust, the second leg of the route
 
 
 def flown(scenario: Scenario, folder: Path, name: str) -> Path:
@@ -38,8 +43,18 @@ def flown(scenario: Scenario, folder: Path, name: str) -> Path:
     return run
 
 
-def save(browser: Browser, runs: Sequence[Path], until: str, picture: str, *, at: str = "", clicks: Sequence[str] = ()) -> None:
-    """Open the page of runs, at an instant, click on elements, and save its picture once a condition holds."""
+def save(
+    browser: Browser,
+    runs: Sequence[Path],
+    until: str,
+    picture: str,
+    *,
+    at: str = "",
+    clicks: Sequence[str] = (),
+) -> None:
+    """Open the page of runs, at an instant, click on elements, and save its picture once a
+    condition holds.
+    """
     with watching(*runs) as (_, address):
         browser.open(f"{address}{at}")
         browser.wait_for(f"{DRAWN} > 2 && {until}", limit=60.0)
@@ -48,20 +63,32 @@ def save(browser: Browser, runs: Sequence[Path], until: str, picture: str, *, at
             browser.run(f"void document.querySelector('{selector}').click()")
             browser.wait_for(f"{DRAWN} > {before}")
         shot = Image.open(BytesIO(base64.b64decode(browser.call("Page.captureScreenshot")["data"])))
-        shot.convert("RGB").quantize(COLOURS).save(IMAGES / picture, optimize=True)  # a third of the size
+        shot.convert("RGB").quantize(COLOURS).save(
+            IMAGES / picture, optimize=True
+        )  # a third of the size
         browser.open("about:blank")
 
 
 def main() -> None:
     """Write the pictures to docs/images."""
-    with tempfile.TemporaryDirectory() as temporary, Browser(Path(temporary) / "profile", WIDTH, HEIGHT) as browser:
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        Browser(Path(temporary) / "profile", WIDTH, HEIGHT) as browser,
+    ):
         folder = Path(temporary)
         servo = find_scenario("osprey_servo")
         run = flown(servo, folder, "osprey_servo")
         weak = flown(servo.vary(controller={"k_g": 0.5}), folder, "half_the_gain")
         guided = flown(find_scenario("osprey_route"), folder, "osprey_route")
         save(browser, (run, weak), ENDED, "view_ghost.png", at=f"&t={GHOST_AT}", clicks=["#window"])
-        save(browser, (guided,), ENDED, "view_guided.png", at=f"&t={GUIDED_AT}", clicks=["[data-camera=map]"])
+        save(
+            browser,
+            (guided,),
+            ENDED,
+            "view_guided.png",
+            at=f"&t={GUIDED_AT}",
+            clicks=["[data-camera=map]"],
+        )
         (folder / "runs").mkdir()
         with flying(folder / "runs", LIVE_AT + 8.0) as (flight, live):
             save(browser, (live,), f"{STATE} === 'LIVE' && {TIME} > {LIVE_AT}", "view_live.png")

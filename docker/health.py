@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Health check of a container (a watchdog): whether the loops of its nodes still publish to /diagnostics, at 1 Hz.
+"""Health check of a container (a watchdog): whether the loops of its nodes still publish to
+/diagnostics, at 1 Hz.
 
-health.py [NODE ...] waits for one report of each given node, or of any node without arguments. Exit status 0 when all reports
-arrived, 1 otherwise. A report of level WARN or ERROR is printed and counts as healthy: the node runs.
+health.py [NODE ...] waits for one report of each given node, or of any node without arguments. Exit
+status 0 when all reports arrived, 1 otherwise. A report of level WARN or ERROR is printed and
+counts as healthy: the node runs.
 """
 
 import sys
@@ -26,7 +28,9 @@ def main(names: list[str]) -> int:
     reports: dict[str, str] = {}
 
     def receive(message: DiagnosticArray) -> None:
-        reports.update({status.name.rpartition("/")[2]: status.message for status in message.status})
+        reports.update(
+            {status.name.rpartition("/")[2]: status.message for status in message.status}
+        )
 
     node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, receive, NEWEST_SAMPLES)
     deadline = time.monotonic() + TIMEOUT
@@ -34,7 +38,13 @@ def main(names: list[str]) -> int:
         rclpy.spin_once(node, timeout_sec=0.1)
     node.destroy_node()
     rclpy.try_shutdown()
-    missing = [name for name in names if name not in reports] if names else [] if reports else ["any node"]
+    missing = (
+        [name for name in names if name not in reports]
+        if names
+        else []
+        if reports
+        else ["any node"]
+    )
     for name in missing:
         print(f"no report of {name} within {TIMEOUT:g} s")
     for name, sentence in reports.items():

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of one flight, as the recorders of ROS 2 and other programs leave them, and files that are no logs.
+"""Bags of one flight, as the recorders of ROS 2 and other programs leave them, and files that are
+no logs.
 
 The writers are the libraries mcap and rosbags, not the stack.
 """
@@ -41,7 +42,7 @@ module sensor_msgs { module msg {
 ================================================================================
 IDL: std_msgs/msg/Header
 module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
-"""
+"""  # noqa: E501 - a text as it is written
 CLOCK = struct.Struct("<iI")
 
 
@@ -60,18 +61,27 @@ def restamped(data: bytes, stamp_ns: int) -> bytes:
 
 
 def flight_messages(file: Path) -> list[Recorded]:
-    """The messages of a log in the order of recording, with stamps of today, received 1 ms and sent 0.5 ms later."""
+    """The messages of a log in the order of recording, with stamps of today, received 1 ms and sent
+    0.5 ms later.
+    """
     with file.open("rb") as stream:
-        stored = [(channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()]
+        stored = [
+            (channel.topic, message.data)
+            for _, channel, message in make_reader(stream).iter_messages()
+        ]
     messages = []
     for topic, data in stored:
         seconds, nanoseconds = CLOCK.unpack_from(data, 4)
         stamp_ns = EPOCH + seconds * NANOSECONDS + nanoseconds
-        messages.append(Recorded(topic, stamp_ns + 1_000_000, stamp_ns + 500_000, restamped(data, stamp_ns)))
+        messages.append(
+            Recorded(topic, stamp_ns + 1_000_000, stamp_ns + 500_000, restamped(data, stamp_ns))
+        )
     return sorted(messages, key=lambda message: message.log_ns)
 
 
-def write_metadata(folder: Path, names: Sequence[str], messages: Sequence[Recorded], **information: object) -> None:
+def write_metadata(
+    folder: Path, names: Sequence[str], messages: Sequence[Recorded], **information: object
+) -> None:
     """Write metadata.yaml of rosbag2 that names these files."""
     first, last = (choose((m.log_ns for m in messages), default=0) for choose in (min, max))
     topics = dict.fromkeys(message.topic for message in messages)
@@ -127,19 +137,25 @@ def write_mcap(
         if beside is not None:
             beside(writer)
         for number, message in enumerate(messages):
-            writer.add_message(channels[message.topic], message.log_ns, message.data, message.publish_ns, number)
+            writer.add_message(
+                channels[message.topic], message.log_ns, message.data, message.publish_ns, number
+            )
         writer.finish()  # type: ignore[no-untyped-call]
     return folder / name
 
 
-def write_rosbags(folder: Path, messages: Sequence[Recorded], storage: StoragePlugin, mode: CompressionMode | None) -> None:
+def write_rosbags(
+    folder: Path, messages: Sequence[Recorded], storage: StoragePlugin, mode: CompressionMode | None
+) -> None:
     """Write the messages by the library rosbags."""
     writer = RosbagWriter(folder, version=9, storage_plugin=storage)
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         topics = dict.fromkeys(message.topic for message in messages)
-        connections = {topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics}
+        connections = {
+            topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics
+        }
         for message in messages:
             writer.write(connections[message.topic], message.log_ns, message.data)
 
@@ -157,7 +173,9 @@ def in_namespace(namespace: str, messages: Sequence[Recorded]) -> list[Recorded]
 
 def foreign_topics(writer: Any) -> None:
     """Add a type that is not installed, a channel with JSON, and a channel without a schema."""
-    unknown = writer.register_schema("my_msgs/msg/Secret", "ros2msg", b"float64 a\nmy_msgs/Part b\n")
+    unknown = writer.register_schema(
+        "my_msgs/msg/Secret", "ros2msg", b"float64 a\nmy_msgs/Part b\n"
+    )
     log = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
     channels = [
         (writer.register_channel("/secret", "cdr", unknown), bytes(28)),
@@ -169,7 +187,13 @@ def foreign_topics(writer: Any) -> None:
             writer.add_message(channel, EPOCH + k * 10_000_000, data, EPOCH + k * 10_000_000, k)
 
 
-def packed(folder: Path, messages: Sequence[Recorded], suffix: str, pack: Callable[[bytes], bytes], part: float = 1.0) -> None:
+def packed(
+    folder: Path,
+    messages: Sequence[Recorded],
+    suffix: str,
+    pack: Callable[[bytes], bytes],
+    part: float = 1.0,
+) -> None:
     """Write an MCAP file and pack it; `part` is the part of the packed file that is left."""
     plain = write_mcap(folder, messages, chunk_size=1 << 14)
     content = pack(plain.read_bytes())
@@ -177,8 +201,12 @@ def packed(folder: Path, messages: Sequence[Recorded], suffix: str, pack: Callab
     plain.unlink()
 
 
-def split(folder: Path, messages: Sequence[Recorded], names: Sequence[str], *, metadata: bool = True) -> None:
-    """Write the messages in three files; a name "" leaves a file out. metadata.yaml names bag_0 to bag_2."""
+def split(
+    folder: Path, messages: Sequence[Recorded], names: Sequence[str], *, metadata: bool = True
+) -> None:
+    """Write the messages in three files; a name "" leaves a file out. metadata.yaml names bag_0 to
+    bag_2.
+    """
     for k, (name, part) in enumerate(zip(names, parts(messages), strict=True)):
         file = write_mcap(folder, part, name or f"bag_{k}.mcap")
         if not name:
@@ -190,7 +218,11 @@ def split(folder: Path, messages: Sequence[Recorded], names: Sequence[str], *, m
 def whole_bags() -> dict[str, Callable[[Path, list[Recorded]], object]]:
     """Writers of bags that hold the whole flight, by name."""
     text = STORE.generate_msgdef(JOINT_STATE, ros_version=2)[0].encode()
-    nothing: dict[str, Any] = {"use_chunking": False, "index_types": IndexType.NONE, "use_statistics": False}
+    nothing: dict[str, Any] = {
+        "use_chunking": False,
+        "index_types": IndexType.NONE,
+        "use_statistics": False,
+    }
     nothing |= {"repeat_channels": False, "repeat_schemas": False, "use_summary_offsets": False}
     rosbags = {
         f"rosbags_{storage.name}_{'plain' if mode is None else mode.name}".lower(): partial(
@@ -200,7 +232,9 @@ def whole_bags() -> dict[str, Callable[[Path, list[Recorded]], object]]:
         for mode in (None, CompressionMode.FILE, CompressionMode.MESSAGE)
     }
     return rosbags | {
-        "rosbags_mcap_storage": lambda f, m: write_rosbags(f, m, StoragePlugin.MCAP, CompressionMode.STORAGE),
+        "rosbags_mcap_storage": lambda f, m: write_rosbags(
+            f, m, StoragePlugin.MCAP, CompressionMode.STORAGE
+        ),
         "chunks_zstd": lambda f, m: write_mcap(f, m, compression=CompressionType.ZSTD),
         "chunks_lz4": lambda f, m: write_mcap(f, m, compression=CompressionType.LZ4),
         "chunks_plain": lambda f, m: write_mcap(f, m, compression=CompressionType.NONE),
@@ -210,15 +244,23 @@ def whole_bags() -> dict[str, Callable[[Path, list[Recorded]], object]]:
         "zst_file": lambda f, m: packed(f, m, ".zst", zstandard.compress),
         "lz4_file": lambda f, m: packed(f, m, ".lz4", lz4.frame.compress),
         "split": lambda f, m: split(f, m, ["bag_0.mcap", "bag_1.mcap", "bag_2.mcap"]),
-        "split_renamed": lambda f, m: split(f, m, ["flight_0.mcap", "flight_1.mcap", "flight_2.mcap"]),
-        "split_without_metadata": lambda f, m: split(f, m, [f"bag_{k}.mcap" for k in range(3)], metadata=False),
+        "split_renamed": lambda f, m: split(
+            f, m, ["flight_0.mcap", "flight_1.mcap", "flight_2.mcap"]
+        ),
+        "split_without_metadata": lambda f, m: split(
+            f, m, [f"bag_{k}.mcap" for k in range(3)], metadata=False
+        ),
         "foreign_topics": lambda f, m: write_mcap(f, m, beside=foreign_topics),
         "namespace": lambda f, m: write_mcap(f, in_namespace("/uav1", m)),
         "deep_namespace": lambda f, m: write_mcap(f, in_namespace("/fleet/a/uav1", m)),
-        "publish_time_0": lambda f, m: write_mcap(f, [message._replace(publish_ns=0) for message in m]),
+        "publish_time_0": lambda f, m: write_mcap(
+            f, [message._replace(publish_ns=0) for message in m]
+        ),
         "idl": lambda f, m: write_mcap(f, m, schema=(JOINT_STATE, "ros2idl", IDL.encode())),
         "blank_schema": lambda f, m: write_mcap(f, m, schema=(JOINT_STATE, "ros2msg", b" ")),
-        "short_type": lambda f, m: write_mcap(f, m, schema=("sensor_msgs/JointState", "ros2msg", text)),
+        "short_type": lambda f, m: write_mcap(
+            f, m, schema=("sensor_msgs/JointState", "ros2msg", text)
+        ),
         "no_profile": lambda f, m: write_mcap(f, m, profile=""),
         "other_suffix": lambda f, m: write_mcap(f, m, name="bag_0.mcap").rename(f / "flight.log"),
     }
@@ -234,7 +276,10 @@ def _zip() -> bytes:
 FOREIGN_FILES = {
     "ULog": (b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1) + bytes(200), "a ULog of PX4"),
     "DataFlash": (bytes([0xA3, 0x95, 0x80, 0x80, 89]) + bytes(84), "a DataFlash log of ArduPilot"),
-    "tlog": (struct.pack(">Q", EPOCH // 1000) + b"\xfd\x09\x00\x00" + bytes(30), "a tlog of MAVLink"),
+    "tlog": (
+        struct.pack(">Q", EPOCH // 1000) + b"\xfd\x09\x00\x00" + bytes(30),
+        "a tlog of MAVLink",
+    ),
     "CSV": (b"time,q,p,r,V\n0,0,0,0,25\n0.1,0,0,0,25\n", "a CSV file"),
     "text": (b"hello\n", "a text file"),
     "empty": (b"", "an empty file"),

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium, controlled over its DevTools pipe: JSON that ends with a zero byte, on descriptors 3 and 4."""
+"""A headless Chromium, controlled over its DevTools pipe: JSON that ends with a zero byte, on
+descriptors 3 and 4.
+"""
 
 import json
 import os
@@ -14,21 +16,37 @@ from typing import Any, Self
 
 NAMES = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--hide-scrollbars",
+    "--remote-debugging-pipe",
+)
 LOOK = 0.1  # s, on an idle machine one look of `wait_for` takes a fifth of it
 CONSOLE_EVENTS = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"}
 
 
 class Browser:
-    """One browser with one page. `console` holds the exceptions and console messages of the last page that was opened."""
+    """One browser with one page. `console` holds the exceptions and console messages of the last
+    page that was opened.
+    """
 
-    def __init__(self, profile: Path, width: int = 1280, height: int = 900, flags: Sequence[str] = ()) -> None:
+    def __init__(
+        self, profile: Path, width: int = 1280, height: int = 900, flags: Sequence[str] = ()
+    ) -> None:
         if CHROMIUM is None:
             raise FileNotFoundError("no Chromium on the path")
         commands, self._commands = os.pipe()
         self._responses, responses = os.pipe()
         ends, null = (commands, responses), subprocess.DEVNULL
-        flags = [*FLAGS, *flags, f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"]
+        flags = [
+            *FLAGS,
+            *flags,
+            f"--window-size={width},{height}",
+            f"--user-data-dir={profile}",
+            "about:blank",
+        ]
         # The shell moves the ends of the pipes to the descriptors that Chromium uses.
         redirect = f'exec "$0" "$@" 3<&{commands} 4>&{responses}'
         command = ["/bin/bash", "-c", redirect, CHROMIUM, *flags]
@@ -40,21 +58,32 @@ class Browser:
         self._events: list[dict[str, Any]] = []
         self._session: dict[str, str] = {}
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = {"sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
+        self._session = {
+            "sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)[
+                "sessionId"
+            ]
+        }
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._process.terminate()
         self._process.wait()
         for end in (self._commands, self._responses):
             os.close(end)
 
     def call(self, method: str, **params: Any) -> Any:
-        """The result of a command of the DevTools protocol. Raises RuntimeError with the error of the browser."""
+        """The result of a command of the DevTools protocol. Raises RuntimeError with the error of
+        the browser.
+        """
         self._number += 1
         message = {"id": self._number, "method": method, "params": params} | self._session
         os.write(self._commands, json.dumps(message).encode() + b"\0")
@@ -79,7 +108,9 @@ class Browser:
 
     def run(self, expression: str) -> Any:
         """The value of a JavaScript expression, awaited. Raises RuntimeError with its exception."""
-        result = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        result = self.call(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
         if "exceptionDetails" in result:
             raise RuntimeError(json.dumps(result["exceptionDetails"]))
         return result["result"].get("value")
@@ -87,7 +118,8 @@ class Browser:
     def wait_for(self, expression: str, limit: float = 120.0) -> None:
         """Wait until an expression is true. Raises TimeoutError after `limit` seconds.
 
-        Time counts while the browser answers: of each look at most LOOK, since other work may keep the processor from both.
+        Time counts while the browser answers: of each look at most LOOK, since other work may keep
+        the processor from both.
         """
         waited, before = 0.0, time.monotonic()
         while not self._holds(expression):

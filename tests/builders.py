@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that several tests share: parameters and truth of the simulated aircraft, errors of a flight."""
+"""Builders that several tests share: parameters and truth of the simulated aircraft, errors of a
+flight.
+"""
 
 from typing import Any
 
@@ -18,7 +20,9 @@ MS = 1_000_000  # ns
 
 def aircraft_parameters(**values: Any) -> AircraftConfig:
     """The osprey at 100 Hz with steps of 2 ms, with these values instead or in addition."""
-    return AircraftConfig.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
+    return AircraftConfig.validate_mapping(
+        {"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft"
+    )
 
 
 def truth_of(simulator: Simulator) -> dict[str, float]:
@@ -28,4 +32,9 @@ def truth_of(simulator: Simulator) -> dict[str, float]:
 def rms(tape: Tape) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     e = error(tape)
-    return np.array([error_metrics(e[name]).rms * (1.0 if name == "V" else 1e3) for name in ("q", "V", "p", "r")])
+    return np.array(
+        [
+            error_metrics(e[name]).rms * (1.0 if name == "V" else 1e3)
+            for name in ("q", "V", "p", "r")
+        ]
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that the tests of the closed loop share: parameters of the law, reference outputs, flights without a scenario."""
+"""Builders that the tests of the closed loop share: parameters of the law, reference outputs,
+flights without a scenario.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -22,29 +24,47 @@ from reference_model.command import Profile, command
 from rise_di_controller import law as rise
 from rise_di_controller.law import LawParams, Sign
 
-PROTOTYPE_GAINS = {"k_g": 1.0, "k_d": [16.0, 16.0, 7.0], "Lambda": [5.0, 5.0, 3.0, 0.5], "softening": 2.75}
-"""Gains of the prototype of the law, 32 deg of phase margin in r, 26 in V. Tests and pages quote its figures."""
+PROTOTYPE_GAINS = {
+    "k_g": 1.0,
+    "k_d": [16.0, 16.0, 7.0],
+    "Lambda": [5.0, 5.0, 3.0, 0.5],
+    "softening": 2.75,
+}
+"""Gains of the prototype of the law, 32 deg of phase margin in r, 26 in V. Tests and pages quote
+its figures."""
 
 PROTOTYPE_SERVO = find_scenario("osprey_servo").vary(controller=PROTOTYPE_GAINS)
 
 CALM_SERVO = PROTOTYPE_SERVO.vary(
-    aircraft={"sensors": {}, "gusts": {}, "rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    aircraft={"sensors": {}, "gusts": {}, "rate": 100.0, "step": 0.005},
+    reference_model={"rate": 100.0},
 )
-"""Scenario osprey_servo with these gains in calm air, without noise, at 100 Hz and in steps of 5 ms."""
+"""Scenario osprey_servo with these gains in calm air, without noise, at 100 Hz and in steps of 5
+ms."""
 
 
-def law_params(K: Any, Lambda: Any, beta: Any, D: Any = 1.0, sign: Sign = Sign.IMPLICIT, **others: Any) -> LawParams:
-    """Parameters of the law. A number holds for each channel; input_scale, omega and eps are 1 unless given."""
+def law_params(
+    K: Any, Lambda: Any, beta: Any, D: Any = 1.0, sign: Sign = Sign.IMPLICIT, **others: Any
+) -> LawParams:
+    """Parameters of the law. A number holds for each channel; input_scale, omega and eps are 1
+    unless given.
+    """
     values = {"K": np.atleast_1d(K), "Lambda": Lambda, "beta": beta, "D": D}
     values |= {"input_scale": 1.0, "omega": 1.0, "eps": 1.0} | others
-    arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values.values()))
-    return LawParams(**dict(zip(values, (array.copy() for array in arrays), strict=True)), sign=sign)
+    arrays = np.broadcast_arrays(
+        *(np.asarray(value, dtype=np.float64) for value in values.values())
+    )
+    return LawParams(
+        **dict(zip(values, (array.copy() for array in arrays), strict=True)), sign=sign
+    )
 
 
 def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) -> Aircraft:
     """An aircraft without gusts."""
     empty = np.zeros(0)
-    return Aircraft(A, B, C, gravity, np.zeros((len(A), 0)), Gusts(empty, empty, empty), speed=np.array(1.0))
+    return Aircraft(
+        A, B, C, gravity, np.zeros((len(A), 0)), Gusts(empty, empty, empty), speed=np.array(1.0)
+    )
 
 
 def reference_outputs(params: model.Model, profile: Profile, dt: float, steps: int) -> FloatArray:
@@ -52,15 +72,23 @@ def reference_outputs(params: model.Model, profile: Profile, dt: float, steps: i
     x_m, matrices = np.zeros(len(params.A_m)), model.stepper(dt, params)
     y_m = [model.output(x_m, params)]
     for k in range(steps):
-        x_m = model.step(x_m, command((k + np.array([0.0, 0.5, 1.0])) * dt, profile).ravel(), matrices)
+        x_m = model.step(
+            x_m, command((k + np.array([0.0, 0.5, 1.0])) * dt, profile).ravel(), matrices
+        )
         y_m.append(model.output(x_m, params))
     return np.array(y_m)
 
 
 def fly(
-    aircraft: Aircraft, law: LawParams, y_m: Iterable[FloatArray], dt: float, bound: float, x_0: FloatArray | None = None
+    aircraft: Aircraft,
+    law: LawParams,
+    y_m: Iterable[FloatArray],
+    dt: float,
+    bound: float,
+    x_0: FloatArray | None = None,
 ) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends the flight.
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends
+    the flight.
 
     The law acts on the aircraft through ideal actuators. The flight starts from x_0, or from trim.
     """

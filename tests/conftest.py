@@ -23,7 +23,11 @@ settings.register_profile("flight", deadline=None)
 settings.load_profile("flight")
 
 few = settings(
-    max_examples=30, derandomize=True, database=None, phases=(Phase.generate,), suppress_health_check=list(HealthCheck)
+    max_examples=30,
+    derandomize=True,
+    database=None,
+    phases=(Phase.generate,),
+    suppress_health_check=list(HealthCheck),
 )
 """Deterministic examples of fuzzing. benchmarks/fuzz.py does long searches."""
 
@@ -31,7 +35,9 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let all processes of a session share the programs that JAX has compiled; workers inherit the environment."""
+    """Let all processes of a session share the programs that JAX has compiled; workers inherit the
+    environment.
+    """
     if not hasattr(config, "workerinput"):
         folder = tempfile.TemporaryDirectory(prefix="jax", ignore_cleanup_errors=True)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
@@ -41,7 +47,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort the quick tests to the end: no worker computes long after the others have ended."""
-    items.sort(key=lambda item: "pure" in item.path.parts and item.get_closest_marker("slow") is None)
+    items.sort(
+        key=lambda item: "pure" in item.path.parts and item.get_closest_marker("slow") is None
+    )
 
 
 @pytest.fixture(scope="session")
@@ -72,8 +80,13 @@ def run(recorded: Path, tmp_path: Path) -> Path:
 
 
 def with_policy(*policy: str) -> list[str]:
-    """What runs a command with a scheduling policy, as options of chrt; skips the test where that is not permitted."""
+    """What runs a command with a scheduling policy, as options of chrt; skips the test where that
+    is not permitted.
+    """
     command = [shutil.which("chrt") or "", *policy]
-    if not command[0] or subprocess.run([*command, "true"], check=False, capture_output=True).returncode:
+    if (
+        not command[0]
+        or subprocess.run([*command, "true"], check=False, capture_output=True).returncode
+    ):
         pytest.skip("needs chrt, and the right to a real-time priority")
     return command

@@ -31,25 +31,41 @@ DAMAGES: Mapping[str, Damage] = {
     "without its begin": lambda k, n, data: data if k >= n // 3 else None,
     "every second sample": lambda k, n, data: data if k % 2 == 0 else None,
     "stamps are zero": lambda k, n, data: restamped(data, 0),
-    "stamps are zero from the middle": lambda k, n, data: restamped(data, 0) if k >= n // 2 else data,
+    "stamps are zero from the middle": lambda k, n, data: (
+        restamped(data, 0) if k >= n // 2 else data
+    ),
     "stamps are zero to the middle": lambda k, n, data: restamped(data, 0) if k < n // 2 else data,
-    "clock back": lambda k, n, data: restamped(data, stamp_of(data) - STEP_NS) if k >= n // 2 else data,
-    "clock forth": lambda k, n, data: restamped(data, stamp_of(data) + STEP_NS) if k >= n // 2 else data,
-    "clock back and forth": lambda k, n, data: restamped(data, stamp_of(data) - STEP_NS) if n // 3 <= k < 2 * n // 3 else data,
-    "clock forth and back": lambda k, n, data: restamped(data, stamp_of(data) + STEP_NS) if n // 3 <= k < 2 * n // 3 else data,
+    "clock back": lambda k, n, data: (
+        restamped(data, stamp_of(data) - STEP_NS) if k >= n // 2 else data
+    ),
+    "clock forth": lambda k, n, data: (
+        restamped(data, stamp_of(data) + STEP_NS) if k >= n // 2 else data
+    ),
+    "clock back and forth": lambda k, n, data: (
+        restamped(data, stamp_of(data) - STEP_NS) if n // 3 <= k < 2 * n // 3 else data
+    ),
+    "clock forth and back": lambda k, n, data: (
+        restamped(data, stamp_of(data) + STEP_NS) if n // 3 <= k < 2 * n // 3 else data
+    ),
 }
 """Damages by their names."""
 
 
 def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 0) -> Path:
-    """Write the copy of a log with a damaged topic; an empty `topic` damages each. The stamps count from `from_ns`."""
+    """Write the copy of a log with a damaged topic; an empty `topic` damages each. The stamps count
+    from `from_ns`.
+    """
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:
         reader, writer = make_reader(source), Writer(target)
         writer.start(profile="ros2", library="damaged")
         for attachment in reader.iter_attachments():
             writer.add_attachment(
-                attachment.log_time, attachment.create_time, attachment.name, attachment.media_type, attachment.data
+                attachment.log_time,
+                attachment.create_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
             )
         for record in reader.iter_metadata():
             if record.name != "rosbag2":
@@ -65,13 +81,19 @@ def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 
             if schema is None:
                 continue
             if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                schemas[schema.id] = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
             if channel.id not in channels:
                 channels[channel.id] = writer.register_channel(
                     channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
                 )
             k = places[channel.topic] = places.get(channel.topic, -1) + 1
-            data: bytes | None = restamped(message.data, stamp_of(message.data) + from_ns) if from_ns else message.data
+            data: bytes | None = (
+                restamped(message.data, stamp_of(message.data) + from_ns)
+                if from_ns
+                else message.data
+            )
             if data is not None and topic in {"", channel.topic}:
                 data = change(k, counts[channel.topic], data)
             if data is not None:

@@ -3,8 +3,8 @@
 # ruff: noqa: D101, D102 - launch documents its classes and methods
 """Stand-in for the parts of `launch` and `launch_ros` that the launch files use. It runs nothing.
 
-Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other argument is a TypeError.
-.ci/ros launches a flight with the official packages.
+Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other
+argument is a TypeError. .ci/ros launches a flight with the official packages.
 """
 
 import os
@@ -20,7 +20,9 @@ class Event: ...
 
 
 class LaunchContext:
-    """The values of the arguments, the events, and the ROS node of the launch. It is its own asyncio loop."""
+    """The values of the arguments, the events, and the ROS node of the launch. It is its own
+    asyncio loop.
+    """
 
     def __init__(self, **arguments: str) -> None:
         self.launch_configurations = dict(arguments)
@@ -38,7 +40,9 @@ class LaunchContext:
         self.events.append(event)
 
     def handle(self, actions: Sequence[Any]) -> list[Any]:
-        """The actions that follow from the kept events, given all actions so far. Unregisters handlers that handle once."""
+        """The actions that follow from the kept events, given all actions so far. Unregisters
+        handlers that handle once.
+        """
         follow: list[Any] = []
         events, self.events = self.events, []
         for event in events:
@@ -58,7 +62,9 @@ class RosNode:
         self.subscriptions: dict[str, Callable[[Any], None]] = {}
         self.published: list[tuple[str, bytes]] = []
 
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
+    def create_subscription(
+        self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any
+    ) -> None:
         """Keep the callback by the topic."""
         self.subscriptions[topic] = callback
 

@@ -9,7 +9,9 @@ from tests.conftest import REPOSITORY
 from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
 
 EXAMPLE_MAPS = REPOSITORY / "examples" / "maps"
-MAP_FILES: dict[str, Path] = {path.stem: path for folder in (LIBRARY, EXAMPLE_MAPS) for path in sorted(folder.glob("*.yaml"))}
+MAP_FILES: dict[str, Path] = {
+    path.stem: path for folder in (LIBRARY, EXAMPLE_MAPS) for path in sorted(folder.glob("*.yaml"))
+}
 
 
 def named_map(name: str) -> ChannelMap:

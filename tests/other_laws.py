@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections `controller` of osprey_servo under other laws: those of docs/laws.md, and that of the example package."""
+"""Sections `controller` of osprey_servo under other laws: those of docs/laws.md, and that of the
+example package.
+"""
 
 import re
 from collections.abc import Iterator
@@ -30,7 +32,9 @@ _RISE_DI = _section(find_scenario("osprey_servo").path.read_text(encoding="utf-8
 COMMON = {key: value for key, value in _RISE_DI.items() if key in ControllerConfig.model_fields}
 """The parameters that every law has."""
 
-_BLOCKS = re.findall(r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8"), re.DOTALL)
+_BLOCKS = re.findall(
+    r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8"), re.DOTALL
+)
 
 SECTIONS = {law["law"]: COMMON | law for law in map(yaml.safe_load, _BLOCKS)}
 SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text(encoding="utf-8"))
@@ -38,11 +42,17 @@ SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text(encoding="utf
 
 @contextmanager
 def example_installed(folder: Path) -> Iterator[None]:
-    """The example as an installed package: its modules, and the metadata with its entry point in a folder."""
+    """The example as an installed package: its modules, and the metadata with its entry point in a
+    folder.
+    """
     metadata = folder / "pid_law-0.1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8")
-    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8")
+    (metadata / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8"
+    )
+    (metadata / "entry_points.txt").write_text(
+        f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLE))
         patch.syspath_prepend(str(folder))

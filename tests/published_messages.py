@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of the message types that the channel maps use and that common_interfaces lacks, as their packages publish them.
+"""Fields of the message types that the channel maps use and that common_interfaces lacks, as their
+packages publish them.
 
 Only the fields that a map uses, from the definitions of the releases below.
 tests/nodes/autopilot_bridge/test_published_messages.py compares them with the installed packages.
@@ -18,7 +19,15 @@ PACKAGES = {
 }
 
 HEADER = "std_msgs/Header"
-MODES = ("position", "velocity", "acceleration", "attitude", "body_rate", "thrust_and_torque", "direct_actuator")
+MODES = (
+    "position",
+    "velocity",
+    "acceleration",
+    "attitude",
+    "body_rate",
+    "thrust_and_torque",
+    "direct_actuator",
+)
 
 PUBLISHED: dict[str, dict[str, str]] = {
     "ardupilot_msgs/msg/Airspeed": {"true_airspeed": "geometry_msgs/Vector3"},
@@ -67,7 +76,9 @@ def kind(field: str) -> Kind:
 
 
 def blank(type_name: str) -> SimpleNamespace:
-    """An object with the published fields at zero, as rclpy creates them: arrays of NumPy with the type of the field."""
+    """An object with the published fields at zero, as rclpy creates them: arrays of NumPy with the
+    type of the field.
+    """
     message = SimpleNamespace()
     for name, field in PUBLISHED[type_name].items():
         element, length, is_array, _ = kind(field)

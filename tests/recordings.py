@@ -17,13 +17,17 @@ from rosbags.highlevel import AnyReader
 from flight_core.tape import Signal
 
 MS = 1_000_000  # ns
-EPOCH = 1_795_000_000_000_000_000  # ns, a stamp of today, which float64 cannot hold to the ns; in seconds it resolves 0.2 us
+# ns, a stamp of today, which float64 cannot hold to the ns; in seconds it resolves 0.2 us
+EPOCH = 1_795_000_000_000_000_000
 
 
 def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
     """Channels by stamps in ms after EPOCH. A number holds at all stamps."""
     stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
-    values = [np.broadcast_to(np.asarray(channel, dtype=float), stamps.shape) for channel in channels.values()]
+    values = [
+        np.broadcast_to(np.asarray(channel, dtype=float), stamps.shape)
+        for channel in channels.values()
+    ]
     return Signal(stamps, tuple(channels), np.column_stack(values))
 
 
@@ -37,7 +41,9 @@ def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path
 
 
 def truncate(run: Path, fraction: float) -> bytes:
-    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no metadata.yaml."""
+    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no
+    metadata.yaml.
+    """
     file = run / "run_0.mcap"
     content = file.read_bytes()
     beginning = content[: int(len(content) * fraction)]
@@ -55,10 +61,14 @@ def summary_of(file: Path) -> Summary:
 
 
 def messages(run: Path) -> list[tuple[str, int, bytes]]:
-    """Topic, log time and bytes of all messages, as rosbags reads them. Each can be deserialised."""
+    """Topic, log time and bytes of all messages, as rosbags reads them. Each can be
+    deserialised.
+    """
     with AnyReader([run]) as reader:
         assert sum(connection.msgcount for connection in reader.connections) == reader.message_count
-        read = [(connection.topic, stamp_ns, data) for connection, stamp_ns, data in reader.messages()]
+        read = [
+            (connection.topic, stamp_ns, data) for connection, stamp_ns, data in reader.messages()
+        ]
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
     return read

@@ -21,7 +21,10 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
     mount, unmount = (shutil.which(command) for command in ("mount", "umount"))
     folder.mkdir()
     command = [str(mount), "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
-    if not (mount and unmount) or subprocess.run(command, check=False, capture_output=True).returncode != 0:
+    if (
+        not (mount and unmount)
+        or subprocess.run(command, check=False, capture_output=True).returncode != 0
+    ):
         pytest.skip("no permission to mount a small file system")
     try:
         yield folder

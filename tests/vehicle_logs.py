@@ -24,22 +24,50 @@ def write_dataflash(
     firmware: str,
     changes: Changes = (),
 ) -> None:
-    """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and parameters before them."""
+    """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and
+    parameters before them.
+    """
     packets: list[tuple[int, bytes]] = [
-        (-1, FMT.pack(HEAD + b"\x80", 0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"))
+        (
+            -1,
+            FMT.pack(
+                HEAD + b"\x80", 0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
+            ),
+        )
     ]
     text = struct.Struct("<3sQ64s")
-    packets.append((-1, FMT.pack(HEAD + b"\x80", 0x7F, text.size, b"MSG", b"QZ", b"TimeUS,Message")))
+    packets.append(
+        (-1, FMT.pack(HEAD + b"\x80", 0x7F, text.size, b"MSG", b"QZ", b"TimeUS,Message"))
+    )
     packets.append((0, text.pack(HEAD + b"\x7f", 0, firmware.encode())))
     row = struct.Struct("<3sQ16sf")
-    packets.append((-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value")))
+    packets.append(
+        (-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value"))
+    )
     records = [*((0, name, value) for name, value in parameters.items()), *changes]
-    packets += [(stamp, row.pack(HEAD + b"\x81", stamp, name.encode(), value)) for stamp, name, value in records]
+    packets += [
+        (stamp, row.pack(HEAD + b"\x81", stamp, name.encode(), value))
+        for stamp, name, value in records
+    ]
     for identity, (name, (fields, rows)) in enumerate(messages.items(), start=0x82):
         packet = struct.Struct(f"<3sQ{len(fields)}f")
         labels = ",".join(("TimeUS", *fields)).encode()
-        packets.append((-1, FMT.pack(HEAD + b"\x80", identity, packet.size, name.encode(), b"Q" + b"f" * len(fields), labels)))
-        packets += [(stamp, packet.pack(HEAD + bytes([identity]), stamp, *values)) for stamp, values in rows]
+        packets.append(
+            (
+                -1,
+                FMT.pack(
+                    HEAD + b"\x80",
+                    identity,
+                    packet.size,
+                    name.encode(),
+                    b"Q" + b"f" * len(fields),
+                    labels,
+                ),
+            )
+        )
+        packets += [
+            (stamp, packet.pack(HEAD + bytes([identity]), stamp, *values)) for stamp, values in rows
+        ]
     path.write_bytes(b"".join(packet for _, packet in sorted(packets, key=lambda pair: pair[0])))
 
 
@@ -50,7 +78,8 @@ def write_ulog(
     changes: Changes = (),
     second: Mapping[str, Rows] = MappingProxyType({}),
 ) -> None:
-    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file format).
+    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file
+    format).
 
     `second` has the samples of the instance 1 by topic.
     """
@@ -62,25 +91,44 @@ def write_ulog(
         return bytes([len(key)]) + key.encode() + value
 
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message(b"B", bytes(40))]
-    parts += [message(b"F", f"{name}:uint64_t timestamp;{fields}".encode()) for name, (fields, _) in topics.items()]
+    parts += [
+        message(b"F", f"{name}:uint64_t timestamp;{fields}".encode())
+        for name, (fields, _) in topics.items()
+    ]
 
     def parameter(name: str, value: float) -> bytes:
         return message(b"P", key_value(f"float {name}", struct.pack("<f", value)))
 
     parts += [parameter(name, value) for name, value in parameters.items()]
-    series = [*((0, name, rows) for name, (_, rows) in topics.items()), *((1, name, rows) for name, rows in second.items())]
-    parts += [message(b"A", bytes([i]) + struct.pack("<H", k) + name.encode()) for k, (i, name, _) in enumerate(series)]
+    series = [
+        *((0, name, rows) for name, (_, rows) in topics.items()),
+        *((1, name, rows) for name, rows in second.items()),
+    ]
+    parts += [
+        message(b"A", bytes([i]) + struct.pack("<H", k) + name.encode())
+        for k, (i, name, _) in enumerate(series)
+    ]
     samples = [
         (stamp, k, message(b"D", struct.pack(f"<HQ{len(values)}f", k, stamp, *values)))
         for k, (_, _, rows) in enumerate(series)
         for stamp, values in rows
     ]
-    samples += [(stamp, len(series), parameter(name, value)) for stamp, name, value in changes]  # after samples of its stamp
-    path.write_bytes(b"".join([*parts, *(packet for _, _, packet in sorted(samples, key=lambda sample: sample[:2]))]))
+    samples += [
+        (stamp, len(series), parameter(name, value)) for stamp, name, value in changes
+    ]  # after samples of its stamp
+    path.write_bytes(
+        b"".join(
+            [*parts, *(packet for _, _, packet in sorted(samples, key=lambda sample: sample[:2]))]
+        )
+    )
 
 
 def write_tlog(path: Path, messages: Sequence[tuple[int, Any]], system: int = 1) -> None:
-    """A tlog: before each packet its time, us since 1970 (MAVLink guide). The messages are those of pymavlink."""
+    """A tlog: before each packet its time, us since 1970 (MAVLink guide). The messages are those of
+    pymavlink.
+    """
     sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     ordered = sorted(messages, key=lambda pair: pair[0])
-    path.write_bytes(b"".join(struct.pack(">Q", stamp) + message.pack(sender) for stamp, message in ordered))
+    path.write_bytes(
+        b"".join(struct.pack(">Q", stamp) + message.pack(sender) for stamp, message in ordered)
+    )

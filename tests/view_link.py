@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the air for the page's control: a log whose recording seems to go on, and nodes in memory behind the `Link`."""
+"""A flight in the air for the page's control: a log whose recording seems to go on, and nodes in
+memory behind the `Link`.
+"""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -31,7 +33,10 @@ class NodesInMemory:
 
     def __init__(self, scenario: Scenario, *names: str, dry_run: bool = True) -> None:
         self.names = list(names)
-        self.schemas = {"controller": type(scenario.controller), "aircraft": type(scenario.aircraft)}
+        self.schemas = {
+            "controller": type(scenario.controller),
+            "aircraft": type(scenario.aircraft),
+        }
         self.values: dict[str, dict[str, Any]] = {
             "controller": dict(flatten(scenario.controller.model_dump(exclude_none=True))),
             "aircraft": dict(flatten(scenario.aircraft.model_dump(exclude_none=True))),

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: the formulas of a page become MathML, which browsers draw without a script and without another host."""
+"""A hook of MkDocs: the formulas of a page become MathML, which browsers draw without a script and
+without another host.
+"""
 
 import html
 import re
@@ -9,25 +11,33 @@ from typing import Any
 from math_core import LatexError, LatexToMathML
 from mkdocs.exceptions import PluginError
 
-FORMULA = re.compile(r'(?P<opening><(?P<tag>span|div) class="arithmatex">)\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL)
-"""A formula as pymdownx.arithmatex leaves it: in the line as a span, on a line of its own as a div."""
+FORMULA = re.compile(
+    r'(?P<opening><(?P<tag>span|div) class="arithmatex">)\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>',
+    re.DOTALL,
+)
+"""A formula as pymdownx.arithmatex leaves it: in the line as a span, on a line of its own as a
+div."""
 
 CONVERTER = LatexToMathML(fancy_error=False)
 
 
 def mathml(tex: str, displayed: bool) -> str:
-    r"""The MathML of a formula; a \tag becomes its number at the right margin. Raises LatexError."""
+    r"""The MathML of a formula; a \tag becomes its number at the right. Raises LatexError."""
     numbered = rf"\begin{{equation}}{tex}\end{{equation}}" if r"\tag" in tex else tex
     return CONVERTER.convert_with_local_state(numbered, displaystyle=displayed)
 
 
 def on_page_content(content: str, page: Any, **_: object) -> str:
-    """The HTML of a page with its formulas as MathML. Raises PluginError: the page and the formula that is no LaTeX."""
+    """The HTML of a page with its formulas as MathML. Raises PluginError: the page and the formula
+    that is no LaTeX.
+    """
 
     def converted(match: re.Match[str]) -> str:
         tex = html.unescape(match["tex"]).strip()
         try:
-            return f"{match['opening']}{mathml(tex, displayed=match['tag'] == 'div')}</{match['tag']}>"
+            return (
+                f"{match['opening']}{mathml(tex, displayed=match['tag'] == 'div')}</{match['tag']}>"
+            )
         except LatexError as error:
             raise PluginError(f"{page.file.src_uri}: {tex}: {error}") from None
 

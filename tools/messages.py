@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builds ROS 2 message packages for this interpreter from their sources; ROS 2 itself comes from PyPI.
+"""Builds ROS 2 message packages for this interpreter from their sources; ROS 2 itself comes from
+PyPI.
 
     make messages PACKAGE=px4_msgs SOURCE=../px4_msgs
-    make messages PACKAGE=mavros_msgs SOURCE="../mavros ../geographic_info"          # the package, and what it depends on
+    make messages PACKAGE=mavros_msgs SOURCE="../mavros ../geographic_info"
+        # the package, and what it depends on
     make messages PACKAGE=px4_msgs SOURCE=../px4_msgs MESSAGES="VehicleOdometry AirspeedValidated"
 
-It installs into the virtual environment, so that every process of the stack finds the package. Needs a C and a C++ compiler
-and the headers of Python. Where ROS 2 is installed in full, `colcon build` does the same.
+It installs into the virtual environment, so that every process of the stack finds the package.
+Needs a C and a C++ compiler and the headers of Python. Where ROS 2 is installed in full, `colcon
+build` does the same.
 """
 
 import argparse
@@ -25,11 +28,18 @@ from typing import NamedTuple
 
 import numpy as np
 from catkin_pkg.packages import find_packages
-from rosidl_adapter.parser import MessageSpecification, parse_action_file, parse_message_file, parse_service_file
+from rosidl_adapter.parser import (
+    MessageSpecification,
+    parse_action_file,
+    parse_message_file,
+    parse_service_file,
+)
 
 BUILD = Path(__file__).resolve().parents[1] / "build" / "messages"
 KINDS = ("msg", "srv", "action")
-MISSING = re.compile(r'package configuration\s+file\s+provided\s+by\s+"(\w+)"')  # of CMake's find_package
+MISSING = re.compile(
+    r'package configuration\s+file\s+provided\s+by\s+"(\w+)"'
+)  # of CMake's find_package
 LAST_LINES = 15  # of a failed step
 
 
@@ -49,18 +59,25 @@ def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
     sources = {}
     for folder in folders:
         if not folder.is_dir():
-            raise MessagesError(f"SOURCE: found {folder}, expected a folder with the sources of message packages")
+            raise MessagesError(
+                f"SOURCE: found {folder}, expected a folder with the sources of message packages"
+            )
         for path, package in find_packages(str(folder)).items():
             dependencies = (*package.build_depends, *package.build_export_depends)
-            sources[package.name] = Source(folder / path, frozenset(dependency.name for dependency in dependencies))
+            sources[package.name] = Source(
+                folder / path, frozenset(dependency.name for dependency in dependencies)
+            )
     return sources
 
 
 def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
-    """The package and those of its dependencies that are among the sources, each after its dependencies."""
+    """The package and those of its dependencies that are among the sources, each after its
+    dependencies.
+    """
     if package not in sources:
         raise MessagesError(
-            f"PACKAGE: found {package or 'none'}, expected one of SOURCE: {', '.join(sorted(sources)) or 'none'}"
+            f"PACKAGE: found {package or 'none'}, expected one of SOURCE: "
+            f"{', '.join(sorted(sources)) or 'none'}"
         )
     graph, waiting = dict[str, frozenset[str]](), [package]
     while waiting:
@@ -68,7 +85,10 @@ def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
         if name not in graph:
             folder = sources[name].folder
             if not (folder / "CMakeLists.txt").is_file():
-                raise MessagesError(f"SOURCE: found no CMakeLists.txt in {folder}, expected sources, not an installed package")
+                raise MessagesError(
+                    f"SOURCE: found no CMakeLists.txt in {folder}, expected sources, not an "
+                    "installed package"
+                )
             graph[name] = sources[name].dependencies & sources.keys()
             waiting += graph[name]
     return list(TopologicalSorter(graph).static_order())
@@ -91,13 +111,18 @@ def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
     files = {path.stem: path for kind in KINDS for path in (source / kind).glob(f"*.{kind}")}
     unknown = [name for name in names if name not in files]
     if unknown:
-        raise MessagesError(f"MESSAGES: found {', '.join(unknown)}, expected interfaces of {package}, as in {source}")
+        raise MessagesError(
+            f"MESSAGES: found {', '.join(unknown)}, expected interfaces of {package}, as in "
+            f"{source}"
+        )
     waiting, chosen = list(names), set[str]()
     while waiting:
         name = waiting.pop()
         if name not in chosen:
             chosen.add(name)
-            fields = [field.type for spec in specifications(package, files[name]) for field in spec.fields]
+            fields = [
+                field.type for spec in specifications(package, files[name]) for field in spec.fields
+            ]
             waiting += [kind.type for kind in fields if kind.pkg_name == package]
     return chosen
 
@@ -109,7 +134,12 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
     shutil.copytree(source, target, ignore=shutil.ignore_patterns(".*"))
     lists = target / "CMakeLists.txt"
     text = lists.read_text(encoding="utf-8")
-    for path in [path for kind in KINDS for path in (target / kind).glob(f"*.{kind}") if path.stem not in chosen]:
+    for path in [
+        path
+        for kind in KINDS
+        for path in (target / kind).glob(f"*.{kind}")
+        if path.stem not in chosen
+    ]:
         path.unlink()
         text = re.sub(rf'"?\b{path.parent.name}/{re.escape(path.name)}"?', "", text)
     lists.write_text(text, encoding="utf-8")
@@ -117,10 +147,15 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
 
 
 def point_at_this_python(prefix: Path) -> None:
-    """Replace, in the CMake files of the wheels, the headers of the Python that built them by those of this one."""
+    """Replace, in the CMake files of the wheels, the headers of the Python that built them by those
+    of this one.
+    """
     include = sysconfig.get_path("include")
     if not Path(include, "Python.h").is_file():
-        raise MessagesError(f"no {include}/Python.h: install the headers of Python, with apt-get install python3-dev on Debian")
+        raise MessagesError(
+            f"no {include}/Python.h: install the headers of Python, with apt-get install "
+            "python3-dev on Debian"
+        )
     for path in prefix.glob("share/*/cmake/export_*__rosidl_generator_pyExport.cmake"):
         text = path.read_text(encoding="utf-8")
         fixed = re.sub(r'[^;"]*/numpy/(_core|core)/include', np.get_include(), text)
@@ -130,17 +165,28 @@ def point_at_this_python(prefix: Path) -> None:
 
 
 def run(log: Path, prefix: Path, *command: str) -> None:
-    """Run a step of a build with the packages of this environment alone; its output goes to a log."""
+    """Run a step of a build with the packages of this environment alone; its output goes to a
+    log.
+    """
     # A ROS 2 that is sourced too would mix two.
-    environment = {name: value for name, value in os.environ.items() if name not in {"CMAKE_PREFIX_PATH", "PYTHONPATH"}}
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in {"CMAKE_PREFIX_PATH", "PYTHONPATH"}
+    }
     environment["AMENT_PREFIX_PATH"] = f"{prefix}{os.pathsep}{sys.prefix}"
     with log.open("a", encoding="utf-8") as file:
-        done = subprocess.run(command, env=environment, stdout=file, stderr=subprocess.STDOUT, check=False)
+        done = subprocess.run(
+            command, env=environment, stdout=file, stderr=subprocess.STDOUT, check=False
+        )
     if done.returncode == 0:
         return
     text = log.read_text(encoding="utf-8")
     if missing := MISSING.search(text):
-        sentence = f"{log.stem} needs {missing[1]}, which is neither installed nor below SOURCE: add the folder that holds it"
+        sentence = (
+            f"{log.stem} needs {missing[1]}, which is neither installed nor below "
+            "SOURCE: add the folder that holds it"
+        )
         raise MessagesError(sentence)
     end = "\n".join(text.splitlines()[-LAST_LINES:])
     raise MessagesError(f"{log.stem} does not build; the whole output is in {log}\n{end}")
@@ -153,7 +199,8 @@ def build(package: str, source: Path, prefix: Path, jobs: int) -> None:
     log.write_text("", encoding="utf-8")
     cmake, ninja = (str(Path(sys.executable).parent / name) for name in ("cmake", "ninja"))
     run(
-        log, prefix, cmake, "--fresh", "-G", "Ninja", "-S", str(source), "-B", str(folder), f"-DCMAKE_MAKE_PROGRAM={ninja}",
+        log, prefix, cmake, "--fresh", "-G", "Ninja", "-S", str(source), "-B", str(folder),
+        f"-DCMAKE_MAKE_PROGRAM={ninja}",
         f"-DCMAKE_PREFIX_PATH={prefix};{sys.prefix}", f"-DCMAKE_INSTALL_PREFIX={prefix}",
         f"-DPython3_EXECUTABLE={sys.executable}", "-DBUILD_TESTING=OFF",
     )  # fmt: skip
@@ -162,27 +209,50 @@ def build(package: str, source: Path, prefix: Path, jobs: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Build a package and those that it needs; 2 and a sentence where it cannot be built."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("package")
-    parser.add_argument("sources", nargs="+", type=Path, help="folders below which the packages are")
-    parser.add_argument("--messages", nargs="+", default=[], help="interfaces of the package to build; without it, all")
+    parser.add_argument(
+        "sources", nargs="+", type=Path, help="folders below which the packages are"
+    )
+    parser.add_argument(
+        "--messages",
+        nargs="+",
+        default=[],
+        help="interfaces of the package to build; without it, all",
+    )
     parser.add_argument("--jobs", type=int, default=2, help="steps at a time, each of some 0.3 GB")
-    parser.add_argument("--prefix", type=Path, default=Path(sys.prefix), help="where to install; by default this environment")
+    parser.add_argument(
+        "--prefix",
+        type=Path,
+        default=Path(sys.prefix),
+        help="where to install; by default this environment",
+    )
     options = parser.parse_args(arguments)
     try:
         sources = find_sources([folder.resolve() for folder in options.sources])
         order = in_order(options.package, sources)
         for compiler in ("cc", "c++"):
             if shutil.which(compiler) is None:
-                raise MessagesError(f"no {compiler} here: install a C and a C++ compiler, with apt-get install g++ on Debian")
+                raise MessagesError(
+                    f"no {compiler} here: install a C and a C++ compiler, with apt-get install "
+                    "g++ on Debian"
+                )
         point_at_this_python(Path(sys.prefix))
         for name in order:
             source, start = sources[name].folder, time.monotonic()
             if name == options.package and options.messages:
                 source = copy_of_part(name, source, options.messages, BUILD / f"{name}.source")
-            print(f"{name}: builds from {sources[name].folder}; the output is in {BUILD / name}.log", flush=True)
+            print(
+                f"{name}: builds from {sources[name].folder}; the output is in {BUILD / name}.log",
+                flush=True,
+            )
             build(name, source, options.prefix.resolve(), options.jobs)
-            print(f"{name}: installed in {options.prefix} after {time.monotonic() - start:.0f} s", flush=True)
+            print(
+                f"{name}: installed in {options.prefix} after {time.monotonic() - start:.0f} s",
+                flush=True,
+            )
     except MessagesError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

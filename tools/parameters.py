@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/reference/parameters.md: every parameter of every node, from the classes that validate them."""
+"""Writes docs/reference/parameters.md: every parameter of every node, from the classes that
+validate them.
+"""
 
 from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
@@ -32,7 +34,7 @@ SI and radians, if nothing else is said. Without a type a value is a number. `= 
 without *optional* is required. A list has an entry a channel. No number is above 1e9 in size, no time limit above 1e6 s. The
 instant `.inf` is never. The node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this
 page: `python -m tools.parameters`.
-"""
+"""  # noqa: E501 - a text as it is written
 MET = (
     "flight.duration",
     "aircraft.airframe",
@@ -50,7 +52,8 @@ MET = (
     "controller.Lambda",
     "controller.beta",
 )
-"""The keys that a first scenario of a user changes; `rise-di gains` writes those of the controller."""
+"""The keys that a first scenario of a user changes; `rise-di gains` writes those of the
+controller."""
 SHARED = {
     "lockstep": "run in lockstep with the other nodes",
     "start_time": "system time of t = 0, s; 0: at once; -1: by the topic `start`",
@@ -67,18 +70,29 @@ SECTIONS: Mapping[str, type[Config]] = {
     "bridge": BridgeConfig,
     "recorder": RecorderConfig,
 }
-TYPES = {float: "number", int: "integer", str: "string", bool: "boolean", dict: "numbers by channel", object: "any"}
+TYPES = {
+    float: "number",
+    int: "integer",
+    str: "string",
+    bool: "boolean",
+    dict: "numbers by channel",
+    object: "any",
+}
 HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 
 def page() -> str:
     """The text of the page."""
     parts = [LEAD, "## The keys that you meet first", "", *HEAD]
-    known = {f"{section}.{row[0]}": row for section, schema in SECTIONS.items() for row in _rows(schema)}
+    known = {
+        f"{section}.{row[0]}": row for section, schema in SECTIONS.items() for row in _rows(schema)
+    }
     known |= {f"controller.{row[0]}": row for row in _rows(laws.schema("rise_di"))}
     parts += [f"| `{key}` | {known[key][1]} | {known[key][2]} |" for key in MET]
     parts += ["", "## Keys of several sections", "", *HEAD]
-    parts += [f"| `{key}` | {known[f'aircraft.{key}'][1]} | {text} |" for key, text in SHARED.items()]
+    parts += [
+        f"| `{key}` | {known[f'aircraft.{key}'][1]} | {text} |" for key, text in SHARED.items()
+    ]
     parts += [""]
     parts += [_section(f"`{name}`", schema) for name, schema in SECTIONS.items()]
     for name in laws.names():
@@ -86,19 +100,25 @@ def page() -> str:
             schema = laws.schema(name)
         except ParameterError:  # a law that needs the full state cannot be flown over topics
             continue
-        parts.append(_section(f"`controller` with `law: {name}`", schema, set(ControllerConfig.model_fields)))
+        parts.append(
+            _section(f"`controller` with `law: {name}`", schema, set(ControllerConfig.model_fields))
+        )
     return "\n".join(parts)
 
 
 def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) -> str:
     rows = [
-        f"| `{key}` | {value} | {text} |" for key, value, text in _rows(schema) if key.split(".")[0] not in {*known, *SHARED}
+        f"| `{key}` | {value} | {text} |"
+        for key, value, text in _rows(schema)
+        if key.split(".")[0] not in {*known, *SHARED}
     ]
     return "\n".join([f"## {title}", "", *((*HEAD, *rows) if rows else ("No further keys.",)), ""])
 
 
 def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Key, permitted value and meaning of each parameter of a set; those of a group under a dotted key, once for each class."""
+    """Key, permitted value and meaning of each parameter of a set; those of a group under a dotted
+    key, once for each class.
+    """
     shown: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
         annotation, rules = _resolved(field.annotation, field.rules)
@@ -108,22 +128,46 @@ def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, st
         if isinstance(group, type) and issubclass(group, Config):
             meaning = _text(field.description or ("" if named else group.__doc__ or ""))
             like = shown.setdefault(group, key)
-            yield key, "groups by name" if named else "group", meaning if like == key else f"{meaning}; keys as in `{like}`"
+            yield (
+                key,
+                "groups by name" if named else "group",
+                meaning if like == key else f"{meaning}; keys as in `{like}`",
+            )
             if like == key:
                 yield from _rows(group, f"{key}.NAME." if named else f"{key}.")
         else:
-            item_rules = _resolved(get_args(annotation)[0])[1] if get_origin(annotation) is tuple else rules
-            parts = [part for part in (_type(annotation), _bounds(item_rules), _value(field.default)) if part]
-            yield key, " ".join(parts[1:] if parts[0] == TYPES[float] and parts[1:] else parts), _text(field.description)
+            item_rules = (
+                _resolved(get_args(annotation)[0])[1] if get_origin(annotation) is tuple else rules
+            )
+            parts = [
+                part
+                for part in (_type(annotation), _bounds(item_rules), _value(field.default))
+                if part
+            ]
+            yield (
+                key,
+                " ".join(parts[1:] if parts[0] == TYPES[float] and parts[1:] else parts),
+                _text(field.description),
+            )
 
 
-def _resolved(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> tuple[Any, Mapping[str, Any]]:
+def _resolved(
+    annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})
+) -> tuple[Any, Mapping[str, Any]]:
     """A type without its rules and without the alternative None, and the rules."""
     if get_origin(annotation) is Annotated:
         inner, *outer = get_args(annotation)
-        return _resolved(inner, {rule: limit for field in outer for rule, limit in field.rules.items()} | dict(rules))
+        return _resolved(
+            inner,
+            {rule: limit for field in outer for rule, limit in field.rules.items()} | dict(rules),
+        )
     if get_origin(annotation) in (Union, UnionType):
-        return _resolved(next(alternative for alternative in get_args(annotation) if alternative is not NoneType), rules)
+        return _resolved(
+            next(
+                alternative for alternative in get_args(annotation) if alternative is not NoneType
+            ),
+            rules,
+        )
     return annotation, rules
 
 
@@ -137,7 +181,9 @@ def _type(annotation: Any) -> str:
 
 
 def _bounds(rules: Mapping[str, Any]) -> str:
-    """The bounds of a number, without those of every number; a smallest size says that the number is positive."""
+    """The bounds of a number, without those of every number; a smallest size says that the number
+    is positive.
+    """
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     limits = {rule: rules[rule] for rule in signs if rule in rules and abs(rules[rule]) < UNBOUNDED}
     if 0.0 < limits.get("ge", 0.0) <= SMALLEST:

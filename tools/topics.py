@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the table of topics in docs/interfaces.md, and the access control policy of DDS Security, from flight_core.topics."""
+"""Writes the table of topics in docs/interfaces.md, and the access control policy of DDS Security,
+from flight_core.topics.
+"""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,11 +12,25 @@ from flight_core.topics import FLIGHT, NODES, TOPICS, VECTOR, Topic, published_b
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGE = REPOSITORY / "docs" / "interfaces.md"
-POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "flight_bringup" / "security" / "flight.policy.xml"
+POLICY = (
+    REPOSITORY
+    / "ros_ws"
+    / "src"
+    / "flight_bringup"
+    / "flight_bringup"
+    / "security"
+    / "flight.policy.xml"
+)
 HEAD = ("| topic | from -> to | keeps | channels, or message and content |", "|---|---|---|---|")
 FURTHER_ROWS = (
-    "| `commands` | `rise-di import` -> log | | trim + u by input, SI, of a flight of another program |",
-    "| `alive/<role>` | all nodes, in lockstep | | `std_msgs/msg/String`; carries the liveliness of the middleware |",
+    (
+        "| `commands` | `rise-di import` -> log | | trim + u by input, SI, of a flight of another "
+        "program |"
+    ),
+    (
+        "| `alive/<role>` | all nodes, in lockstep | | `std_msgs/msg/String`; carries the "
+        "liveliness of the middleware |"
+    ),
 )
 POLICY_COMMENT = """ SPDX-FileCopyrightText: RISE-DI contributors
      SPDX-License-Identifier: Apache-2.0
@@ -25,18 +41,30 @@ POLICY_COMMENT = """ SPDX-FileCopyrightText: RISE-DI contributors
      parameters, changes the controller's state or engages the bridge. Lockstep needs `alive/*`, `clock` and
      `recorded`. The bridge has the topics of all maps of the library: delete those of other autopilots. Add
      the topics of `recorder.topics` to the recorder. Guidance publishes `/tf` where tf2_msgs is installed.
-     `python -m tools.topics` writes this file, tests/ros/flight_bringup/test_policy.py compares it with the nodes. """
+     `python -m tools.topics` writes this file, tests/ros/flight_bringup/test_policy.py compares it with the nodes. """  # noqa: E501 - a text as it is written
 
 IN_LOCKSTEP = NODES[:-1]  # all but the bridge
 MONITOR = "monitor"
 TYPES = "~get_type_description"
 PARAMETER_SERVICES = (
-    *("describe_parameters", "get_parameter_types", "get_parameters", "get_type_description", "list_parameters"),
+    *(
+        "describe_parameters",
+        "get_parameter_types",
+        "get_parameters",
+        "get_type_description",
+        "list_parameters",
+    ),
     *("set_parameters", "set_parameters_atomically"),
 )
 SERVICES = {
     "guidance": ("engage", "hold", "skip", "resume", "home"),
-    "controller": ("change_state", "get_available_states", "get_available_transitions", "get_state", "get_transition_graph"),
+    "controller": (
+        "change_state",
+        "get_available_states",
+        "get_available_transitions",
+        "get_state",
+        "get_transition_graph",
+    ),
     "bridge": ("engage", "engage_blind"),
 }
 FURTHER = {"guidance": ["/tf"], "controller": ["~transition_event"]}  # topics of ROS 2
@@ -66,14 +94,30 @@ def policy() -> str:
     enclaves = ElementTree.SubElement(root, "enclaves")
     for node in (*NODES, MONITOR):
         enclave = ElementTree.SubElement(enclaves, "enclave", path=f"/flight/{node}")
-        profile = ElementTree.SubElement(ElementTree.SubElement(enclave, "profiles"), "profile", ns="/", node=node)
+        profile = ElementTree.SubElement(
+            ElementTree.SubElement(enclave, "profiles"), "profile", ns="/", node=node
+        )
         sent, received, requested = _of_maps() if node == "bridge" else ([], [], [])
         alive = [f"alive/{role}" for role in IN_LOCKSTEP if node in IN_LOCKSTEP]
         own = f"alive/{node}"
-        publishes = [*published_by(node), *FURTHER.get(node, []), *(name for name in alive if name == own), *sent]
-        subscribes = [topic.name for topic in TOPICS if node in topic.subscribers or (node == "recorder" and topic in FLIGHT)]
+        publishes = [
+            *published_by(node),
+            *FURTHER.get(node, []),
+            *(name for name in alive if name == own),
+            *sent,
+        ]
+        subscribes = [
+            topic.name
+            for topic in TOPICS
+            if node in topic.subscribers or (node == "recorder" and topic in FLIGHT)
+        ]
         _list(profile, "topics", "publish", publishes)
-        _list(profile, "topics", "subscribe", [*subscribes, *(name for name in alive if name != own), *received])
+        _list(
+            profile,
+            "topics",
+            "subscribe",
+            [*subscribes, *(name for name in alive if name != own), *received],
+        )
         _list(profile, "services", "request", requested)
         replies = [f"~{name}" for name in (*SERVICES.get(node, ()), *PARAMETER_SERVICES)]
         _list(profile, "services", "reply", [TYPES] if node == MONITOR else replies)
@@ -90,8 +134,14 @@ def _list(profile: ElementTree.Element, kind: str, verb: str, names: list[str]) 
 
 
 def _of_maps() -> tuple[list[str], list[str], list[str]]:
-    """Topics that the bridge sends and receives with each map of the library and of the examples, and services."""
-    files = (path for folder in (LIBRARY, REPOSITORY / "examples" / "maps") for path in sorted(folder.glob("*.yaml")))
+    """Topics that the bridge sends and receives with each map of the library and of the examples,
+    and services.
+    """
+    files = (
+        path
+        for folder in (LIBRARY, REPOSITORY / "examples" / "maps")
+        for path in sorted(folder.glob("*.yaml"))
+    )
     used = {row for path in files for row in load_map(str(path)).used_topics()}
     sent: set[str] = set()
     received: set[str] = set()

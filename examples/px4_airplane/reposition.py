@@ -1,10 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Send PX4 to a place, as "Go to location" of a ground station does, over the loopback profile of the stack.
+"""Send PX4 to a place, as "Go to location" of a ground station does, over the loopback profile of
+the stack.
 
-    .venv/bin/python examples/px4_airplane/reposition.py LATITUDE LONGITUDE ALTITUDE    # degrees, degrees, m above sea level
+    .venv/bin/python examples/px4_airplane/reposition.py LATITUDE LONGITUDE ALTITUDE
+        # degrees, degrees, m above sea level
 
-It sends DO_REPOSITION (MAVLink command 192) for 3 s, for the first message of a new publisher can be lost.
+It sends DO_REPOSITION (MAVLink command 192) for 3 s, for the first message of a new publisher can
+be lost.
 """
 
 import argparse
@@ -17,8 +20,14 @@ WAIT = 10.0  # s, for PX4's agent
 
 def main() -> None:
     """Send the command; exit status 1 without PX4."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, unit in (("latitude", "degrees"), ("longitude", "degrees"), ("altitude", "m above sea level")):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, unit in (
+        ("latitude", "degrees"),
+        ("longitude", "degrees"),
+        ("altitude", "m above sea level"),
+    ):
         parser.add_argument(name, type=float, help=unit)
     place = parser.parse_args()
     try:
@@ -28,11 +37,16 @@ def main() -> None:
 
         from flight_ros import transport  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        sys.exit(f"error: {error}; `make messages PACKAGE=px4_msgs SOURCE=FOLDER` builds px4_msgs (docs/autopilots.md)")
+        sys.exit(
+            f"error: {error}; `make messages PACKAGE=px4_msgs SOURCE=FOLDER` builds px4_msgs "
+            "(docs/autopilots.md)"
+        )
     transport.prepare()
     rclpy.init()
     node = rclpy.create_node("reposition")
-    publisher = node.create_publisher(VehicleCommand, "/fmu/in/vehicle_command", qos_profile_sensor_data)
+    publisher = node.create_publisher(
+        VehicleCommand, "/fmu/in/vehicle_command", qos_profile_sensor_data
+    )
     command = VehicleCommand(
         command=192,
         param1=-1.0,  # the speed stays
@@ -49,7 +63,10 @@ def main() -> None:
     begin = time.monotonic()
     while not publisher.get_subscription_count():
         if time.monotonic() - begin > WAIT:
-            sys.exit(f"error: found no subscriber of {publisher.topic_name}: start PX4 and its agent, with the stack's profile")
+            sys.exit(
+                f"error: found no subscriber of {publisher.topic_name}: start PX4 and its "
+                "agent, with the stack's profile"
+            )
         time.sleep(0.1)
     for _ in range(round(RATE * DURATION)):
         publisher.publish(command)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulator with its own clock: `python simulator.py 3` flies at 3 times real time, `python simulator.py 0` in lockstep."""
+"""A simulator with its own clock: `python simulator.py 3` flies at 3 times real time, `python
+simulator.py 0` in lockstep.
+"""
 
 import sys
 import time
@@ -15,9 +17,16 @@ from sensor_msgs.msg import JointState
 SECOND = 1_000_000_000  # ns
 STEP = SECOND // 200  # of the simulation and of /clock
 SAMPLE = 2 * STEP  # of y and of the servos
-EFFECTS = {"q": ("elevator", 56.15), "p": ("aileron", 85.94), "r": ("rudder", 9.74), "V": ("thrust", 6.0)}
+EFFECTS = {
+    "q": ("elevator", 56.15),
+    "p": ("aileron", 85.94),
+    "r": ("rudder", 9.74),
+    "V": ("thrust", 6.0),
+}
 DAMPING = 0.5  # 1/s
-KEPT = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # in lockstep no sample may be lost
+KEPT = QoSProfile(
+    depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)  # in lockstep no sample may be lost
 
 speed = float(sys.argv[1])
 y, u = dict.fromkeys(EFFECTS, 0.0), {}
@@ -41,14 +50,20 @@ with suppress(KeyboardInterrupt):
         clock = Clock()
         clock.clock.sec, clock.clock.nanosec = divmod(t, SECOND)
         if t % SAMPLE == 0:
-            u = dict(zip(received["u"].name, received["u"].position, strict=True))  # the servos take the u of the last sample
+            u = dict(
+                zip(received["u"].name, received["u"].position, strict=True)
+            )  # the servos take the u of the last sample
             sample = JointState(name=list(y), position=list(y.values()))
             sample.header.stamp = clock.clock
             y_publisher.publish(sample)  # before the clock: a node then finds y at its tick
         clock_publisher.publish(clock)
-        due = max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0  # a pause is not caught up with
+        due = (
+            max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0
+        )  # a pause is not caught up with
         rclpy.spin_once(node, timeout_sec=0.0)
-        while time.monotonic() < due or (not speed and t % SAMPLE == 0 and answered() < t):  # lockstep: u answers this y
+        while time.monotonic() < due or (
+            not speed and t % SAMPLE == 0 and answered() < t
+        ):  # lockstep: u answers this y
             rclpy.spin_once(node, timeout_sec=0.0005)
         for output, (name, effect) in EFFECTS.items():
             y[output] += STEP / SECOND * (effect * u.get(name, 0.0) - DAMPING * y[output])

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lets pytest in the folder of a package, as `colcon test` starts it, run the tests of the package in tests/."""
+"""Lets pytest in the folder of a package, as `colcon test` starts it, run the tests of the package
+in tests/.
+"""
 
 from pathlib import Path
 

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module.
+"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the
+executable, Python the module.
 
 The quick ones run as they stand. tests/docs/test_pages.py runs all of the tutorials.
 """
@@ -24,7 +25,12 @@ from typer.testing import CliRunner
 from flight_cli.cli import COMMANDS, application
 
 FOLDERS = ("docs", "docker", "examples", "ros_ws/src")
-PAGES = sorted([*REPOSITORY.glob("*.md"), *(page for folder in FOLDERS for page in (REPOSITORY / folder).rglob("*.md"))])
+PAGES = sorted(
+    [
+        *REPOSITORY.glob("*.md"),
+        *(page for folder in FOLDERS for page in (REPOSITORY / folder).rglob("*.md")),
+    ]
+)
 SHELL = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^    (?:\$ )?(\S.*)$", re.MULTILINE)
 SPAN = re.compile(r"(?<!`)`rise-di (\w[\w-]*)([^`]*)`(?!`)")
@@ -35,8 +41,13 @@ RISE_DI = typer.main.get_command(application([*COMMANDS]))
 
 def rise_di(words: list[str]) -> None:
     """The command and its options exist, and their values have the right types."""
-    with suppress(typer.Exit), RISE_DI.make_context("rise-di", [*words]) as context:  # --help and --version exit
-        name, command, rest = RISE_DI.resolve_command(context, [*context._protected_args, *context.args])  # type: ignore[attr-defined]
+    with (
+        suppress(typer.Exit),
+        RISE_DI.make_context("rise-di", [*words]) as context,
+    ):  # --help and --version exit
+        name, command, rest = RISE_DI.resolve_command(  # type: ignore[attr-defined]
+            context, [*context._protected_args, *context.args]
+        )
         command.make_context(name, rest, parent=context)
 
 
@@ -45,7 +56,9 @@ def make(words: list[str]) -> None:
     folder = REPOSITORY
     if words[:1] == ["-C"]:
         folder, words = folder / words[1], words[2:]
-    rules = re.findall(r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    rules = re.findall(
+        r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
     targets = " ".join(rules).split()
     asked = [word for word in words if "=" not in word]
     assert asked == [] or asked[0] in targets
@@ -57,8 +70,14 @@ def ros2(words: list[str]) -> None:
         assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text(encoding="utf-8")
     elif words[0] == "launch":
         with patch.dict(sys.modules, launch_stand_in.modules()):
-            launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))["generate_launch_description"]()
-        known = {argument.name for argument in launch.entities if isinstance(argument, launch_stand_in.DeclareLaunchArgument)}
+            launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))[
+                "generate_launch_description"
+            ]()
+        known = {
+            argument.name
+            for argument in launch.entities
+            if isinstance(argument, launch_stand_in.DeclareLaunchArgument)
+        }
         assert {word.partition(":=")[0] for word in words[3:] if not word.startswith("--")} <= known
     else:
         assert words[0] in {"bag", "pkg", "security", "service", "topic"}
@@ -71,14 +90,22 @@ def python(words: list[str]) -> None:
         assert all(Path(word).exists() for word in words[2:] if word.startswith("tests/"))
 
 
-QUICK = {"airframes", "layouts", "replay", "report"}  # a second or two each on a short run, and without ROS
+QUICK = {
+    "airframes",
+    "layouts",
+    "replay",
+    "report",
+}  # a second or two each on a short run, and without ROS
 CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "python3": python}
 
 
 def lines(page: Path) -> list[str]:
     """The lines of the blocks of a page; one that ends with a backslash goes on with the next."""
     text = re.sub(r"\\\n *", "", page.read_text(encoding="utf-8"))
-    return [*(line for block in SHELL.findall(text) for line in block.splitlines()), *INDENTED.findall(text)]
+    return [
+        *(line for block in SHELL.findall(text) for line in block.splitlines()),
+        *INDENTED.findall(text),
+    ]
 
 
 def commands(line: str) -> list[list[str]]:
@@ -99,14 +126,18 @@ def commands(line: str) -> list[list[str]]:
 
 
 def test_commands_of_pages_exist() -> None:
-    mistakes = [mistake for page in PAGES for line in lines(page) if (mistake := mistake_in(line, page))]
+    mistakes = [
+        mistake for page in PAGES for line in lines(page) if (mistake := mistake_in(line, page))
+    ]
     assert not mistakes, "\n".join(mistakes)
 
 
 def mistake_in(line: str, page: Path) -> str:
     """Page, line and error of a command that does not exist; empty if all do."""
     try:
-        for name, *words in commands(line) if any(f"{name} " in f"{line} " for name in CHECKS) else ():
+        for name, *words in (
+            commands(line) if any(f"{name} " in f"{line} " for name in CHECKS) else ()
+        ):
             CHECKS[name](words)
     except Exception as error:
         return f"{page.relative_to(REPOSITORY)}: {line}: {error!r}"
@@ -124,12 +155,22 @@ def test_options_in_the_text_of_pages_exist() -> None:
     assert not unknown, "\n".join(unknown)
 
 
-def test_quick_commands_of_pages_run_as_they_stand(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_commands_of_pages_run_as_they_stand(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for run in ("latest", "A", "B"):
         shutil.copytree(recorded, tmp_path / "runs" / run)
     monkeypatch.chdir(tmp_path)
-    indented = [line for page in PAGES for line in INDENTED.findall(page.read_text(encoding="utf-8"))]
-    found = {tuple(words[1:]) for line in indented if "rise-di " in line for words in commands(line) if words[1:]}
+    indented = [
+        line for page in PAGES for line in INDENTED.findall(page.read_text(encoding="utf-8"))
+    ]
+    found = {
+        tuple(words[1:])
+        for line in indented
+        if "rise-di " in line
+        for words in commands(line)
+        if words[1:]
+    }
     quick = sorted(words for words in found if words[0] in QUICK)
     assert {words[0] for words in quick} == QUICK
     for words in quick:

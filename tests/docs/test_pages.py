@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands and the Python of the tutorials run page by page, each in an empty folder.
 
-They run as they stand but for their length: campaigns of four aircraft, four samples of margins, flights of five seconds.
+They run as they stand but for their length: campaigns of four aircraft, four samples of margins,
+flights of five seconds.
 """
 
 import json
@@ -23,7 +24,9 @@ PAGES = [
 ]
 NOTEBOOKS = sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))
 BLOCK = re.compile(
-    r"(?:<!-- (?P<reason>not run by the tests of the pages: [^\n]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)```", re.DOTALL
+    r"(?:<!-- (?P<reason>not run by the tests of the pages: [^\n]+) "
+    r"-->\n)?```(?P<kind>\w*)\n(?P<text>.*?)```",
+    re.DOTALL,
 )
 EXECUTED = {"sh", "python"}
 TIMEOUT = 600.0  # s, of a block: the longest takes about 30 s on an idle host
@@ -32,12 +35,26 @@ pytestmark = pytest.mark.timeout(2.0 * TIMEOUT)
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
     """Kind, text and the reason for not running it, of each block of a page."""
-    return [(block["kind"], block["text"], block["reason"] or "") for block in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+    return [
+        (block["kind"], block["text"], block["reason"] or "")
+        for block in BLOCK.finditer(page.read_text(encoding="utf-8"))
+    ]
 
 
 def run(command: list[str], folder: Path) -> None:
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "MPLBACKEND": "agg"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "MPLBACKEND": "agg",
+    }
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+        check=False,
+    )
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
 
 
@@ -92,13 +109,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_site_has_every_page(site: Path) -> None:
-    pages = {path.relative_to(REPOSITORY / "docs").with_suffix(".html") for path in (REPOSITORY / "docs").rglob("*.md")}
+    pages = {
+        path.relative_to(REPOSITORY / "docs").with_suffix(".html")
+        for path in (REPOSITORY / "docs").rglob("*.md")
+    }
     assert all((site / page).is_file() for page in pages)
 
 
 def test_a_formula_is_mathml_on_the_site(site: Path) -> None:
     code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)
-    pages = {path.name: code.sub("", path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    pages = {
+        path.name: code.sub("", path.read_text(encoding="utf-8")) for path in site.rglob("*.html")
+    }
     theory = (REPOSITORY / "docs" / "theory.md").read_text(encoding="utf-8")
     assert pages["theory.html"].count("<math") == theory.replace("$$", "$").count("$") / 2
     assert [name for name, page in pages.items() if re.search(r"\\[(\[]|\$", page)] == []
@@ -108,9 +130,16 @@ def test_the_site_loads_nothing_from_another_host(site: Path) -> None:
     pages = {path.name: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
     loads = re.compile(r"""<link [^>]*\bhref="?(?:https?:)?//|\bsrc(?:set)?="?(?:https?:)?//""")
     assert [name for name, page in pages.items() if loads.search(page)] == []
-    # The theme would load the library of such a diagram from a host; without the library the diagram is code.
-    assert [page.name for page in (REPOSITORY / "docs").rglob("*.md") if "```mermaid" in page.read_text(encoding="utf-8")] == []
+    # The theme would load the library of such a diagram from a host; without the library the
+    # diagram is code.
+    assert [
+        page.name
+        for page in (REPOSITORY / "docs").rglob("*.md")
+        if "```mermaid" in page.read_text(encoding="utf-8")
+    ] == []
 
 
 def test_reference_of_parameters_is_that_of_classes() -> None:
-    assert parameters.PAGE.read_text(encoding="utf-8") == parameters.page(), "python -m tools.parameters writes it again"
+    assert parameters.PAGE.read_text(encoding="utf-8") == parameters.page(), (
+        "python -m tools.parameters writes it again"
+    )

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuzz targets: every reader of external input, as a function of bytes.
 
-A target returns for input that is read or rejected with one sentence. It raises any other exception. `SEEDS` holds the initial
-inputs of each target, made by the writers of the stack; tests/corpus/<target>/ holds the findings.
+A target returns for input that is read or rejected with one sentence. It raises any other
+exception. `SEEDS` holds the initial inputs of each target, made by the writers of the stack;
+tests/corpus/<target>/ holds the findings.
 """
 
 import asyncio
@@ -56,7 +57,12 @@ from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback
 from flight_log.repair import repair
-from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
+from flight_log.rosbag2_metadata import (
+    FileContents,
+    TopicCount,
+    bag_metadata_yaml,
+    read_bag_metadata,
+)
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
@@ -79,21 +85,31 @@ def rejected(call: Callable[[], object]) -> bool:
         call()
     except ParameterError as error:
         message = str(error)
-        if not message.strip() or len(message.splitlines()) != 1 or len(message) > MAX_SENTENCE_LENGTH:
-            raise AssertionError(f"no sentence: {message[:MAX_SENTENCE_LENGTH]!r} of {len(message)} characters") from error
+        if (
+            not message.strip()
+            or len(message.splitlines()) != 1
+            or len(message) > MAX_SENTENCE_LENGTH
+        ):
+            raise AssertionError(
+                f"no sentence: {message[:MAX_SENTENCE_LENGTH]!r} of {len(message)} characters"
+            ) from error
         return True
     return False
 
 
 def mcap(data: bytes, folder: Path) -> None:
-    """A log: read as a flight, as messages and as a replay; then repaired. The repaired log is not damaged."""
+    """A log: read as a flight, as messages and as a replay; then repaired. The repaired log is not
+    damaged.
+    """
     run = write_run(folder, data)
     file = run / "run_0.mcap"
     rejected(lambda: read_run(file))
     rejected(lambda: read_playback(file))
     rejected(lambda: _watch(file))
     rejected(lambda: _replay(file))
-    if not rejected(lambda: repair(run)) and any(repaired.damaged for repaired in repair(run).files):
+    if not rejected(lambda: repair(run)) and any(
+        repaired.damaged for repaired in repair(run).files
+    ):
         raise AssertionError("the repaired log is damaged")
 
 
@@ -136,22 +152,30 @@ NUMBER = re.compile(r"-?\b(0x)?[0-9a-f]+(\.[0-9a-f]*)?(p[+-]?\d+)?F?\b")
 
 
 def export(data: bytes, folder: Path) -> None:
-    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario, up to the C code and its FMU.
+    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario, up to
+    the C code and its FMU.
 
-    Outside of strings and comments the code has the tokens that it has with NAMED. The names reach the code from the files,
-    and past the check of the files.
+    Outside of strings and comments the code has the tokens that it has with NAMED. The names reach
+    the code from the files, and past the check of the files.
     """
     given = data.decode("utf-8", "replace").split("\n")
     names = dict(zip(NAMED, given, strict=False))
     flown = find_scenario("osprey_gust")
     frame = folder / "frame.yaml"
-    frame.write_text(dump_yaml(_renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")), names)))
+    frame.write_text(
+        dump_yaml(
+            _renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")), names)
+        )
+    )
     sections = _renamed(yaml.safe_load(flown.path.read_text(encoding="utf-8")), names)
     sections["/**/aircraft"]["ros__parameters"]["airframe"] = str(frame)
     path = folder / "scenario.yaml"
     path.write_text(dump_yaml(sections))
     rejected(lambda: _check_code(exportable(load_scenario(path).controller)))
-    changed = {key: tuple(names.get(name, name) for name in getattr(flown.controller, key)) for key in ("outputs", "inputs")}
+    changed = {
+        key: tuple(names.get(name, name) for name in getattr(flown.controller, key))
+        for key in ("outputs", "inputs")
+    }
     _check_code(exportable(flown.controller.model_copy(update=changed)))
 
 
@@ -159,15 +183,23 @@ def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
     """A tree of YAML with other names, as keys and as values."""
     if isinstance(tree, dict):
         return {names.get(key, key): _renamed(value, names) for key, value in tree.items()}
-    return [_renamed(value, names) for value in tree] if isinstance(tree, list) else names.get(tree, tree)
+    return (
+        [_renamed(value, names) for value in tree]
+        if isinstance(tree, list)
+        else names.get(tree, tree)
+    )
 
 
 def _check_code(controller: RiseDiConfig) -> None:
-    """The code has the tokens of the shipped scenario's, but for the numbers, and the FMU the variables of the channels."""
+    """The code has the tokens of the shipped scenario's, but for the numbers, and the FMU the
+    variables of the channels.
+    """
     text = header(controller, "fuzz", float32=False)
     assert "??" not in text  # a trigraph of C
     assert text.isascii()
-    assert _tokens(text) == _tokens(header(exportable(find_scenario("osprey_gust").controller), "fuzz", float32=False))
+    assert _tokens(text) == _tokens(
+        header(exportable(find_scenario("osprey_gust").controller), "fuzz", float32=False)
+    )
     variables = ElementTree.fromstring(model_description(controller, "fuzz")).iter("ScalarVariable")
     assert len([*variables]) == 2 * len(controller.outputs) + len(controller.effectors) + 4
 
@@ -209,7 +241,9 @@ def message(data: bytes, folder: Path) -> None:
         assert decode is not None
         for table in tables(messages):
             decode(table)
-    run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
+    run = write_run(
+        folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)])
+    )
     rejected(lambda: read_run(run))
     rejected(lambda: read_playback(run))
     rejected(lambda: parameter_changes(run, "/controller", RiseDiConfig.model_fields))
@@ -225,20 +259,35 @@ def route(data: bytes, folder: Path) -> None:
 
 
 def vehicle_log(data: bytes, folder: Path) -> None:
-    """The log of an autopilot. It is decoded here: `rise-di import` does it in an isolated process."""
+    """The log of an autopilot. It is decoded here: `rise-di import` does it in an isolated
+    process.
+    """
     path = folder / "vehicle.log"
     path.write_bytes(data)
     rejected(lambda: read_vehicle_log(path))
-    gc.collect()  # pymavlink leaves a damaged file open: Python warns here, and not in the middle of another test
+    # pymavlink leaves a damaged file open: Python warns here, and not in the middle of another test
+    gc.collect()
 
 
 def targets(data: bytes, folder: Path) -> None:
-    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and inside its slew limits.
+    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and
+    inside its slew limits.
 
-    After a time without steps beyond the age limit of u_m, guidance starts again at what is measured: no limit holds across it.
+    After a time without steps beyond the age limit of u_m, guidance starts again at what is
+    measured: no limit holds across it.
     """
-    guidance, params, now_ns, before, before_ns = Guidance(_guided()), _guided().params(), 0, None, 0
-    values = [value for (value,) in struct.iter_unpack("<d", data[: len(data) // 8 * 8]) if math.isfinite(value)]
+    guidance, params, now_ns, before, before_ns = (
+        Guidance(_guided()),
+        _guided().params(),
+        0,
+        None,
+        0,
+    )
+    values = [
+        value
+        for (value,) in struct.iter_unpack("<d", data[: len(data) // 8 * 8])
+        if math.isfinite(value)
+    ]
     while len(values) > GUIDED_NUMBERS:
         part, values = values[:GUIDED_NUMBERS], values[GUIDED_NUMBERS:]
         now_ns += params.period_ns
@@ -253,7 +302,10 @@ def targets(data: bytes, folder: Path) -> None:
         if before is not None and now_ns - before_ns <= params.max_age_ns:
             V = params.outputs.index("V")
             moved = np.delete(np.abs(output.u_m - before)[:4], V)
-            assert (moved <= np.delete(params.slew, V) * (now_ns - before_ns) / 1e9 * (1.0 + 1e-9) + 1e-12).all(), moved
+            assert (
+                moved
+                <= np.delete(params.slew, V) * (now_ns - before_ns) / 1e9 * (1.0 + 1e-9) + 1e-12
+            ).all(), moved
         before, before_ns = output.u_m, now_ns
 
 
@@ -284,7 +336,9 @@ async def _exchange(server: Server, data: bytes) -> None:
     reader, writer = await asyncio.open_connection(ADDRESS, server.port)
     writer.write(data)
     with suppress(TimeoutError, ConnectionError):
-        await asyncio.wait_for(reader.read(1 << 16), 0.02)  # the answer to a whole request takes 2 ms
+        await asyncio.wait_for(
+            reader.read(1 << 16), 0.02
+        )  # the answer to a whole request takes 2 ms
     writer.close()
     with suppress(ConnectionError):
         await writer.wait_closed()
@@ -292,7 +346,9 @@ async def _exchange(server: Server, data: bytes) -> None:
 
 KEY, TOKEN = "ABCD-EFGH", "a-token"
 GUIDED_NUMBERS = len(POSE) + 6
-MODES = [name for name in MODE_TARGETS if name not in {"north", "east", "radius"}]  # an orbit takes three together
+MODES = [
+    name for name in MODE_TARGETS if name not in {"north", "east", "radius"}
+]  # an orbit takes three together
 
 
 @lru_cache(maxsize=1)
@@ -304,7 +360,9 @@ def _guided() -> GuidanceConfig:
 
 @lru_cache(maxsize=1)
 def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
-    """A server with control of nodes in memory, its event loop, and the exceptions that it has logged."""
+    """A server with control of nodes in memory, its event loop, and the exceptions that it has
+    logged.
+    """
     folder = Path(tempfile.mkdtemp(prefix="fuzz"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     run = write_run(folder, log(_flight()))
@@ -312,7 +370,9 @@ def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
     flight = Flight(run)
     flight.update()
     nodes = NodesInMemory(scenario, "aircraft", "controller", "guidance", dry_run=True)
-    desk = Control(flight, nodes, KEY, now=lambda: 10.0 * next(times))  # each request has its allowance, and a new lease
+    desk = Control(
+        flight, nodes, KEY, now=lambda: 10.0 * next(times)
+    )  # each request has its allowance, and a new lease
     failed: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: failed.append(record.getMessage())  # type: ignore[method-assign]
@@ -368,10 +428,20 @@ def log(
     chunked: bool = True,
     indexed: bool = True,
 ) -> bytes:
-    """An MCAP file of (topic, type, payload), 1 ms apart. By default it has no checksums, which would reveal a changed byte."""
+    """An MCAP file of (topic, type, payload), 1 ms apart. By default it has no checksums, which
+    would reveal a changed byte.
+    """
     stream = BytesIO()
     index = IndexType.ALL if indexed else IndexType.NONE
-    writer = Writer(stream, 1024, packed, index, use_chunking=chunked, enable_crcs=checked, enable_data_crcs=checked)
+    writer = Writer(
+        stream,
+        1024,
+        packed,
+        index,
+        use_chunking=chunked,
+        enable_crcs=checked,
+        enable_data_crcs=checked,
+    )
     writer.start(profile="ros2", library="fuzz")
     channels: dict[str, int] = {}
     for name, content in attached.items():
@@ -379,7 +449,9 @@ def log(
     for k, (topic, kind, data) in enumerate(messages):
         if topic not in channels:
             schema = writer.register_schema(kind, "ros2msg", b"std_msgs/Header header\n")
-            channels[topic] = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": "- depth: 1\n"})
+            channels[topic] = writer.register_channel(
+                topic, "cdr", schema, {"offered_qos_profiles": "- depth: 1\n"}
+            )
         writer.add_message(channels[topic], 1_000_000 * k, data, 1_000_000 * k, k)
     writer.add_metadata("rise_di_lost", {"/y": "1"})
     writer.finish()  # type: ignore[no-untyped-call]
@@ -388,8 +460,15 @@ def log(
 
 _EVENT = parameter_event("/controller", {"k_g": 2.5}, stamp_ns=5)
 _SAMPLE = vector(1_000_000, ("q", "V"), (0.5, -1.0), "/aircraft#1")
-_PLAIN = log([("/y", JOINT_STATE, vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k), "a")) for k in range(8)])
-FLIGHT = {"/y": ("q", "V"), "/y_m": ("q", "V"), "/u": ("elevator", "thrust"), "/truth": ("t", "x.q")}
+_PLAIN = log(
+    [("/y", JOINT_STATE, vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k), "a")) for k in range(8)]
+)
+FLIGHT = {
+    "/y": ("q", "V"),
+    "/y_m": ("q", "V"),
+    "/u": ("elevator", "thrust"),
+    "/truth": ("t", "x.q"),
+}
 
 
 def _flight() -> list[tuple[str, str, bytes]]:
@@ -428,14 +507,26 @@ def _files(folder: Path) -> list[bytes]:
 
 
 _ROUTES = [
-    b"route: [[0, 0, 120], [500.5, -2, 130, 25.0], {latitude: 47.4, longitude: 8.5, altitude: 500, V: 25}]\n",
+    (
+        b"route: [[0, 0, 120], [500.5, -2, 130, 25.0], {latitude: 47.4, longitude: 8.5, altitude: "
+        b"500, V: 25}]\n"
+    ),
     b'{"type": "LineString", "coordinates": [[8.5, 47.4, 500], [8.51, 47.4, 510.5]]}',
-    b'{"features": [{"properties": {"V": 25}, "geometry": {"type": "Point", "coordinates": [8.5, 47.4, 500]}}]}',
+    (
+        b'{"features": [{"properties": {"V": 25}, "geometry": {"type": "Point", "coordinates": '
+        b"[8.5, 47.4, 500]}}]}"
+    ),
     b"<kml><Point><altitudeMode>absolute</altitudeMode><coordinates>8.5,47.4,500</coordinates></Point></kml>",
-    b'{"fileType": "Plan", "geoFence": {"polygons": [{"polygon": [[47.4, 8.5], [47.41, 8.5], [47.4, 8.51]]}]}}',
+    (
+        b'{"fileType": "Plan", "geoFence": {"polygons": [{"polygon": [[47.4, 8.5], [47.41, 8.5], '
+        b"[47.4, 8.51]]}]}}"
+    ),
 ]
 
-HOSTILE_NAME = 'q*/ __attribute__((constructor)) static void f(void) {} /*\nV", "\np\\\nr??/\n<e>&"\'\nx y\n\u00e9\n*/'
+HOSTILE_NAME = (
+    'q*/ __attribute__((constructor)) static void f(void) {} /*\nV", '
+    '"\np\\\nr??/\n<e>&"\'\nx y\n\u00e9\n*/'
+)
 
 _HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Page-Token: a-token\r\n\r\n"
 _REQUESTS = [
@@ -443,7 +534,8 @@ _REQUESTS = [
     _HEAD.replace(b"/ ", b"/data/0?epoch=0.0&y=3&state=ended ", 1),
     _HEAD.replace(b"GET / ", b"POST /control ").replace(
         b"\r\n\r\n",
-        b"\r\nOrigin: http://127.0.0.1:PORT\r\nContent-Type: application/json\r\nX-Control-Key: ABCD-EFGH\r\n"
+        b"\r\nOrigin: http://127.0.0.1:PORT\r\nContent-Type: application/json\r\nX-Control-Key: "
+        b"ABCD-EFGH\r\n"
         b'Content-Length: 14\r\n\r\n{"do":"state"}',
     ),
 ]
@@ -451,7 +543,10 @@ _BODIES = [
     {"do": "state"},
     {"do": "gains", "values": {"k_g": 2.0}, "digest": "0"},
     {"do": "check", "values": {"k_g": 2.0, "beta": [1.0, 2.0, 3.0, 4.0]}},
-    {"do": "fault", "values": {"actuators.stuck_at": [None, 2.0, None, None], "sensors.dropout": 0.1}},
+    {
+        "do": "fault",
+        "values": {"actuators.stuck_at": [None, 2.0, None, None], "sensors.dropout": 0.1},
+    },
     {"do": "gust", "axis": "vertical", "speed": 10.0, "length": 15.0},
     {"do": "target", "values": {"heading": 1.0, "altitude": 100.0}},
     {"do": "route", "points": [[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]]},
@@ -461,20 +556,32 @@ _BODIES = [
 
 def _numbers() -> list[bytes]:
     level = [0.1, 0.0, 1.0, 0.0, 0.0, 100.0, 25.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0]
-    return [struct.pack(f"<{4 * GUIDED_NUMBERS}d", *[*level, float(k), 1.0] * 4) for k in range(len(MODES))]
+    return [
+        struct.pack(f"<{4 * GUIDED_NUMBERS}d", *[*level, float(k), 1.0] * 4)
+        for k in range(len(MODES))
+    ]
 
 
 def _vehicle_logs() -> list[bytes]:
     """A log of each kind, with a rate gyro alone."""
     stamps = range(0, 400_000, 20_000)
     rates = [(stamp, (0.1, -0.2, 0.3)) for stamp in stamps]
-    packets = [(stamp, mavlink.MAVLink_attitude_message(stamp // 1000, *[0.1] * 6)) for stamp in stamps]
+    packets = [
+        (stamp, mavlink.MAVLink_attitude_message(stamp // 1000, *[0.1] * 6)) for stamp in stamps
+    ]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / name for name in ("a.bin", "a.ulg", "a.tlog")]
         write_dataflash(
-            paths[0], {"IMU": (("GyrX", "GyrY", "GyrZ"), rates)}, {"RC1_MIN": 1100.0}, "ArduPlane V4.6.0 (1f2e3d4c)"
+            paths[0],
+            {"IMU": (("GyrX", "GyrY", "GyrZ"), rates)},
+            {"RC1_MIN": 1100.0},
+            "ArduPlane V4.6.0 (1f2e3d4c)",
         )
-        write_ulog(paths[1], {"vehicle_angular_velocity": ("float[3] xyz", rates)}, {"FW_AIRSPD_TRIM": 15.0})
+        write_ulog(
+            paths[1],
+            {"vehicle_angular_velocity": ("float[3] xyz", rates)},
+            {"FW_AIRSPD_TRIM": 15.0},
+        )
         write_tlog(paths[2], packets)
         return [path.read_bytes() for path in paths]
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the command line: invalid input gives an exit status and one sentence, no traceback, no hang."""
+"""Fuzzing of the command line: invalid input gives an exit status and one sentence, no traceback,
+no hang.
+"""
 
 import io
 import signal
@@ -30,7 +32,11 @@ def rise_di(*arguments: str) -> CommandResult:
     """Run the command in this process. An exception other than SystemExit would be a traceback."""
     output, errors = io.StringIO(), io.StringIO()
     status, handler = 0, signal.getsignal(signal.SIGINT)
-    with patch("sys.argv", ["rise-di", *arguments]), redirect_stdout(output), redirect_stderr(errors):
+    with (
+        patch("sys.argv", ["rise-di", *arguments]),
+        redirect_stdout(output),
+        redirect_stderr(errors),
+    ):
         try:
             cli.main()
         except SystemExit as end:
@@ -64,7 +70,9 @@ def garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"{name}.yaml").write_bytes(content)
     for folder in ("folder.yaml", "nothing", "other"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "other" / "metadata.yaml").write_text("rosbag2_bagfile_information: 5\n", encoding="utf-8")
+    (tmp_path / "other" / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information: 5\n", encoding="utf-8"
+    )
     (tmp_path / "other" / "other.db3").write_bytes(b"SQLite format 3\x00" + bytes(200))
     return tmp_path
 
@@ -76,7 +84,9 @@ RUNS = [*ODD, *FOLDERS, "other/other.db3", "text/text_0.mcap", "/dev/null", "a\x
 
 @pytest.mark.parametrize("run", RUNS, ids=range(len(RUNS)))
 @pytest.mark.parametrize(
-    "command", [["report"], ["replay"], ["report", "--repair"], ["play"], ["check", "px4", "--run"]], ids=str
+    "command",
+    [["report"], ["replay"], ["report", "--repair"], ["play"], ["check", "px4", "--run"]],
+    ids=str,
 )
 def test_an_invalid_run_is_rejected(command: list[str], run: str, garbage: Path) -> None:
     require_rejection(rise_di(*command, run))
@@ -88,7 +98,9 @@ FILES = [*ODD, *FILE_NAMES, "../../x", "x" * 5000 + ".yaml", "\x1b[2J"]
 
 @pytest.mark.parametrize("name", FILES, ids=range(len(FILES)))
 @pytest.mark.parametrize(
-    "command", [["fly", "--in-process"], ["fly"], ["gains"], ["check"], ["gains", "osprey", "--scenario"]], ids=str
+    "command",
+    [["fly", "--in-process"], ["fly"], ["gains"], ["check"], ["gains", "osprey", "--scenario"]],
+    ids=str,
 )
 def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Path) -> None:
     require_rejection(rise_di(*command, name))
@@ -122,13 +134,29 @@ OPTIONS = {
 def test_an_invalid_value_is_rejected(command: str, garbage: Path) -> None:
     for value in OPTIONS[command]:
         *words, last = command.split()
-        require_rejection(rise_di(*words, *([last + value] if last.endswith("=") else [last, value])))
+        require_rejection(
+            rise_di(*words, *([last + value] if last.endswith("=") else [last, value]))
+        )
 
 
 COMMANDS = ["fly", "report", "replay", "play", "gains", "check", "airframes", "layouts", "identify"]
-OTHERS = ["--json", "--set", "--in-process", "--duration", "--run", "--", "-", "--help", "--topics", "--rate", "--check"]
+OTHERS = [
+    "--json",
+    "--set",
+    "--in-process",
+    "--duration",
+    "--run",
+    "--",
+    "-",
+    "--help",
+    "--topics",
+    "--rate",
+    "--check",
+]
 VALUES = ["osprey", "px4", "cut", "text", "absent", "nan", "0", "y"]
-WORDS = st.sampled_from(COMMANDS + OTHERS + VALUES) | st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=5)
+WORDS = st.sampled_from(COMMANDS + OTHERS + VALUES) | st.text(
+    st.characters(codec="utf-8", exclude_characters="\0"), max_size=5
+)
 
 
 @few

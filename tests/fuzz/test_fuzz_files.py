@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of file readers: any content is read or rejected with one sentence, in bounded time and memory."""
+"""Fuzzing of file readers: any content is read or rejected with one sentence, in bounded time and
+memory.
+"""
 
 import json
 import os
@@ -33,7 +35,9 @@ def test_corpus_read_or_rejected_in_bounded_time_and_memory(target: str) -> None
     files = sorted(str(path) for path in (CORPUS / target).iterdir())
     assert files
     command = [sys.executable, "-m", "benchmarks.fuzz", target, "--replay", *files]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert f"{len(files)} inputs read or refused" in done.stdout
 
@@ -44,7 +48,9 @@ def test_the_corpus_is_small() -> None:
 
 # Bytes: truncated, changed, moved
 
-BINARY = {name: SEEDS[name]() for name in ("mcap", "message", "route", "vehicle_log", "targets", "page")}
+BINARY = {
+    name: SEEDS[name]() for name in ("mcap", "message", "route", "vehicle_log", "targets", "page")
+}
 
 
 @st.composite
@@ -76,12 +82,42 @@ SCALARS = (
     st.none()
     | st.booleans()
     | st.integers()
-    | st.sampled_from([2**63, -(2**80), 10**4000, 1e308, -1e-320, float("nan"), float("inf"), -0.0, 1e-9, 3.0, 1000.0])
+    | st.sampled_from(
+        [
+            2**63,
+            -(2**80),
+            10**4000,
+            1e308,
+            -1e-320,
+            float("nan"),
+            float("inf"),
+            -0.0,
+            1e-9,
+            3.0,
+            1000.0,
+        ]
+    )
     | st.text(max_size=8)
-    | st.sampled_from(["osprey", "jsbsim:c172p", "/dev/zero", "../x.yaml", "a\x1b[2Jb", "\x85", "x" * 5000, "2001-01-01", "q"])
+    | st.sampled_from(
+        [
+            "osprey",
+            "jsbsim:c172p",
+            "/dev/zero",
+            "../x.yaml",
+            "a\x1b[2Jb",
+            "\x85",
+            "x" * 5000,
+            "2001-01-01",
+            "q",
+        ]
+    )
 )
 VALUES = st.recursive(
-    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3), max_leaves=6
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
+    max_leaves=6,
 )
 
 
@@ -98,7 +134,11 @@ def edited(draw: st.DrawFn, seeds: list[Any], write: Callable[[Any], str] = to_y
         for _ in range(draw(st.integers(0, 6))):
             if not isinstance(node, dict | list) or not node:
                 break
-            key = draw(st.sampled_from(sorted(node, key=str) if isinstance(node, dict) else range(len(node))))
+            key = draw(
+                st.sampled_from(
+                    sorted(node, key=str) if isinstance(node, dict) else range(len(node))
+                )
+            )
             deeper = node[key]
             if not isinstance(deeper, dict | list) or not deeper or draw(st.integers(0, 3)) == 0:
                 match draw(st.sampled_from(("value", "key", "none"))):
@@ -118,23 +158,30 @@ INPUTS = {
     "message": damaged("message") | st.binary(max_size=200),
     "route": damaged("route") | edited(SEEDS["route"]()[:3]),
     **{name: edited(SEEDS[name]()) for name in ("scenario", "airframe", "map")},
-    "export": st.lists(st.text(max_size=20) | st.sampled_from(["*/", "/*", '"', "\\", "??/", "q", "a.b"]), max_size=8).map(
-        lambda names: "\n".join(names).encode("utf-8", "surrogatepass")
-    ),
+    "export": st.lists(
+        st.text(max_size=20) | st.sampled_from(["*/", "/*", '"', "\\", "??/", "q", "a.b"]),
+        max_size=8,
+    ).map(lambda names: "\n".join(names).encode("utf-8", "surrogatepass")),
     "metadata": edited(SEEDS["metadata"]()) | st.binary(max_size=100),
     "vehicle_log": damaged("vehicle_log"),
     "targets": damaged("targets")
-    | st.lists(st.floats(), max_size=200).map(lambda values: struct.pack(f"<{len(values)}d", *values)),
+    | st.lists(st.floats(), max_size=200).map(
+        lambda values: struct.pack(f"<{len(values)}d", *values)
+    ),
     "control": edited(SEEDS["control"](), write=json.dumps),
     "page": damaged("page") | st.binary(max_size=200),
 }
 
 
 @pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a damaged file open
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # pymavlink leaves a damaged file open
 @few
 @given(st.data())
-def test_damaged_log_or_file_of_other_values_read_or_rejected(target: str, tmp_path: Path, data: st.DataObject) -> None:
+def test_damaged_log_or_file_of_other_values_read_or_rejected(
+    target: str, tmp_path: Path, data: st.DataObject
+) -> None:
     TARGETS[target](data.draw(INPUTS[target]), tmp_path)
 
 
@@ -144,7 +191,10 @@ def test_damaged_log_or_file_of_other_values_read_or_rejected(target: str, tmp_p
     [
         "&a [*a]",
         "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
-        + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
+        + "".join(
+            f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
+            for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+        ),
         "x: " + "[" * 1000,
         "x: " + "9" * 6000,
         "x: 0x" + "f" * 6000,
@@ -176,10 +226,28 @@ def test_file_that_is_too_large_and_pipe_rejected(tmp_path: Path) -> None:
 # Flights of any content: a readable log has a report
 
 Report = Callable[[Callable[[Path], object], list[tuple[str, str, bytes]]], None]
-TOPICS = st.sampled_from(["/y", "/y_m", "/u", "/u_m", "/internals", "/truth", "/two/y", "y", "/", ""])
+TOPICS = st.sampled_from(
+    ["/y", "/y_m", "/u", "/u_m", "/internals", "/truth", "/two/y", "y", "/", ""]
+)
 CHANNELS = st.lists(
     st.sampled_from(
-        ["q", "V", "p", "r", "elevator", "thrust", "t", "x.q", "mode", "dt", "age", "late", "number", "e.q", "u.elevator"]
+        [
+            "q",
+            "V",
+            "p",
+            "r",
+            "elevator",
+            "thrust",
+            "t",
+            "x.q",
+            "mode",
+            "dt",
+            "age",
+            "late",
+            "number",
+            "e.q",
+            "u.elevator",
+        ]
     )
     | st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=6),
     max_size=5,
@@ -191,18 +259,32 @@ NUMBER = st.floats() | st.sampled_from([0.0, 1.0, 1e300, -1e300, 5e-324])
 def flights(draw: st.DrawFn, complete: dict[str, tuple[str, ...]]) -> list[tuple[str, str, bytes]]:
     """Messages of a flight with some correct topics, channels, stamps and values."""
     messages = []
-    for topic, names in [*complete.items(), *draw(st.dictionaries(TOPICS, CHANNELS.map(tuple), max_size=2)).items()]:
+    for topic, names in [
+        *complete.items(),
+        *draw(st.dictionaries(TOPICS, CHANNELS.map(tuple), max_size=2)).items(),
+    ]:
         for k in range(draw(st.integers(0, 4))):
             given_names = draw(st.just(names) | st.permutations(names) | CHANNELS)
             values = draw(st.lists(NUMBER, min_size=len(given_names), max_size=len(given_names)))
             stamp = draw(st.just(10_000_000 * k) | st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
-            messages.append((topic, JOINT_STATE, vector(stamp, given_names, values, draw(st.text("a/#;=", max_size=3)))))
+            messages.append(
+                (
+                    topic,
+                    JOINT_STATE,
+                    vector(stamp, given_names, values, draw(st.text("a/#;=", max_size=3))),
+                )
+            )
     return messages
 
 
 def channels(scenario: Scenario) -> dict[str, tuple[str, ...]]:
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
-    return {"/y": outputs, "/y_m": outputs, "/u": inputs, "/truth": ("t", *(f"x.{name}" for name in outputs))}
+    return {
+        "/y": outputs,
+        "/y_m": outputs,
+        "/u": inputs,
+        "/truth": ("t", *(f"x.{name}" for name in outputs)),
+    }
 
 
 @pytest.fixture
@@ -210,7 +292,9 @@ def reported(tmp_path: Path, osprey_gust: Scenario) -> Report:
     """Reads messages as a flight of the default scenario."""
 
     def report(read: Callable[[Path], object], messages: list[tuple[str, str, bytes]]) -> None:
-        run = write_run(tmp_path, log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
+        run = write_run(
+            tmp_path, log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()})
+        )
         with np.errstate(all="ignore"):
             rejected(lambda: read(run))
 
@@ -223,12 +307,16 @@ FLIGHTS = flights(channels(find_scenario("osprey_gust")))
 @few
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
-def test_flight_of_any_values_has_summary_or_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+def test_flight_of_any_values_has_summary_or_rejected(
+    reported: Report, messages: list[tuple[str, str, bytes]]
+) -> None:
     reported(read_flight, messages)
 
 
 @settings(few, max_examples=5)  # each page takes half a second
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_flight_of_any_values_has_page_or_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+def test_flight_of_any_values_has_page_or_rejected(
+    reported: Report, messages: list[tuple[str, str, bytes]]
+) -> None:
     reported(write_report, messages)

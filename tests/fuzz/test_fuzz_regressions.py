@@ -30,10 +30,15 @@ from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
 Y = [("/y", JOINT_STATE, vector(10_000_000 * k, ("q", "V"), (0.1 * k, k))) for k in range(20)]
-BOMBS = [*sorted(path.name for path in (CORPUS / "mcap").glob("*bomb*")), "zstd_header_says_a_terabyte"]
+BOMBS = [
+    *sorted(path.name for path in (CORPUS / "mcap").glob("*bomb*")),
+    "zstd_header_says_a_terabyte",
+]
 
 
-def constant_flight(scenario: Scenario, value: float = 0.0, name: str = "osprey_gust.yaml") -> bytes:
+def constant_flight(
+    scenario: Scenario, value: float = 0.0, name: str = "osprey_gust.yaml"
+) -> bytes:
     """The log of three samples of y, y_m and u with one value, and of its scenario."""
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     messages = [
@@ -58,7 +63,9 @@ def test_chunk_decompressed_to_declared_size_and_64_mb_at_most(name: str) -> Non
 
 
 @pytest.mark.parametrize("read", [Scan.records, Scan.batches])
-def test_a_chunk_inside_a_chunk_is_damaged(read: Callable[[Scan], Iterator[object]], tmp_path: Path) -> None:
+def test_a_chunk_inside_a_chunk_is_damaged(
+    read: Callable[[Scan], Iterator[object]], tmp_path: Path
+) -> None:
     content = b""
     for _ in range(2000):  # a reader that follows them exceeds the interpreter's depth
         chunk = CHUNK.pack(0, 0, len(content), 0, 0) + LENGTH.pack(len(content)) + content
@@ -82,12 +89,21 @@ def test_lz4_chunk_with_changed_bytes_skipped(tmp_path: Path) -> None:
 def test_channel_with_invalid_quality_of_service_repaired(tmp_path: Path) -> None:
     run = write_run(tmp_path, log(Y).replace(b"- depth: 1\n", b"[: \x01 depth:"))
     assert repair(run).wrote_metadata
-    information = yaml.safe_load((run / METADATA).read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-    assert information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"] == []
+    information = yaml.safe_load((run / METADATA).read_text(encoding="utf-8"))[
+        "rosbag2_bagfile_information"
+    ]
+    assert (
+        information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"] == []
+    )
 
 
-@pytest.mark.parametrize("name", ["run_0.mcap", "metadata.yaml", "", "..", "../../x.yaml", "a\x00.yaml", "x" * 300 + ".yaml"])
-def test_scenario_in_log_extracted_without_overwriting_log(name: str, tmp_path: Path, osprey_gust: Scenario) -> None:
+@pytest.mark.parametrize(
+    "name",
+    ["run_0.mcap", "metadata.yaml", "", "..", "../../x.yaml", "a\x00.yaml", "x" * 300 + ".yaml"],
+)
+def test_scenario_in_log_extracted_without_overwriting_log(
+    name: str, tmp_path: Path, osprey_gust: Scenario
+) -> None:
     log_before = constant_flight(osprey_gust, name=name)
     run = write_run(tmp_path, log_before)
     recorded_scenario(run)
@@ -99,26 +115,35 @@ def test_scenario_in_log_extracted_without_overwriting_log(name: str, tmp_path: 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf"), -1e300])
 def test_with_invalid_flight_time_first_sample_is_at_0(t: float, tmp_path: Path) -> None:
-    run = write_run(tmp_path, log([*Y[3:], ("/truth", JOINT_STATE, vector(50_000_000, ("t",), (t,)))]))
+    run = write_run(
+        tmp_path, log([*Y[3:], ("/truth", JOINT_STATE, vector(50_000_000, ("t",), (t,)))])
+    )
     assert read_run(run).tape.start_ns == 30_000_000
     assert read_playback(run).start_ns == read_playback(run).messages[0].due_ns
 
 
 def test_invalid_topic_names_are_rejected(tmp_path: Path) -> None:
     run = write_run(tmp_path, log([("y", kind, data) for _, kind, data in Y]))
-    with pytest.raises(ParameterError, match="found topics that begin with no slash: y, expected a recorded flight"):
+    with pytest.raises(
+        ParameterError, match="found topics that begin with no slash: y, expected a recorded flight"
+    ):
         read_run(run)
 
 
 @pytest.mark.parametrize("last", [".inf", "0x" + "f" * 40, "[1]"])
 def test_metadata_with_an_invalid_end_is_rejected(last: str, tmp_path: Path) -> None:
-    text = f"rosbag2_bagfile_information: {{starting_time: {{nanoseconds_since_epoch: 0}}, duration: {{nanoseconds: {last}}}}}"
+    text = (
+        f"rosbag2_bagfile_information: {{starting_time: {{nanoseconds_since_epoch: 0}}, "
+        f"duration: {{nanoseconds: {last}}}}}"
+    )
     (tmp_path / METADATA).write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"metadata\.yaml: found .*, expected that of rosbag2"):
         read_bag_metadata(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"", b"[: x", b"5", b"/**/flight: {ros__parameters: {duration: [1]}}"])
+@pytest.mark.parametrize(
+    "content", [b"", b"[: x", b"5", b"/**/flight: {ros__parameters: {duration: [1]}}"]
+)
 def test_a_log_with_any_parameters_is_repaired(content: bytes, tmp_path: Path) -> None:
     whole = log(Y).replace(b"rise_di_lost", b"rise_di_more")
     run = write_run(tmp_path, whole[: len(whole) // 2])
@@ -135,7 +160,9 @@ def test_exponential_and_recursive_aliases_are_rejected() -> None:
 
 
 def test_notes_of_log_contain_no_terminal_control_codes(tmp_path: Path) -> None:
-    hostile = [("/\x1b[2Jz", JOINT_STATE, vector(k, (name,), (1.0,))) for k, name in ((1, "a"), (2, "b"))]
+    hostile = [
+        ("/\x1b[2Jz", JOINT_STATE, vector(k, (name,), (1.0,))) for k, name in ((1, "a"), (2, "b"))
+    ]
     notes = read_run(write_run(tmp_path, log([*Y, *hostile]))).tape.notes
     assert r"\x1b[2Jz: 1 samples refused: damaged, not finite, or of other channels" in notes
     assert all(note.isprintable() for note in notes)
@@ -155,8 +182,11 @@ def test_text_of_log_cannot_end_script_of_page() -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("-inf")])
-def test_log_without_finite_value_is_refused(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
+def test_log_without_finite_value_is_refused(
+    value: float, tmp_path: Path, osprey_gust: Scenario
+) -> None:
     with pytest.raises(
-        ParameterError, match=r"found no sample of a flight among .*/y: \d+ samples refused: damaged, not finite"
+        ParameterError,
+        match=r"found no sample of a flight among .*/y: \d+ samples refused: damaged, not finite",
     ):
         read_flight(write_run(tmp_path, constant_flight(osprey_gust, value)))

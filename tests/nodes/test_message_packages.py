@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`make messages`: two small packages, one of which contains messages of the other, built and imported."""
+"""`make messages`: two small packages, one of which contains messages of the other, built and
+imported.
+"""
 
 import os
 import shutil
@@ -41,7 +43,9 @@ def write_package(folder: Path, name: str, files: dict[str, str], dependencies: 
     depends = "".join(f"<depend>{dependency}</depend>" for dependency in dependencies)
     found = "\n".join(f"find_package({dependency} REQUIRED)" for dependency in dependencies)
     listed = " ".join(f'"{path}"' for path in files)
-    (folder / name / "package.xml").write_text(PACKAGE_XML.format(name=name, depends=depends), encoding="utf-8")
+    (folder / name / "package.xml").write_text(
+        PACKAGE_XML.format(name=name, depends=depends), encoding="utf-8"
+    )
     text = CMAKE.format(name=name, found=found, files=listed, dependencies=" ".join(dependencies))
     (folder / name / "CMakeLists.txt").write_text(text, encoding="utf-8")
 
@@ -68,12 +72,16 @@ def build_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 def test_package_built_after_those_that_it_contains_messages_of(sources: Path) -> None:
     assert in_order("plane_msgs", find_sources([sources])) == ["air_msgs", "plane_msgs"]
-    assert in_order("plane_msgs", find_sources([sources / "plane"])) == ["plane_msgs"]  # air_msgs may be installed
+    assert in_order("plane_msgs", find_sources([sources / "plane"])) == [
+        "plane_msgs"
+    ]  # air_msgs may be installed
 
 
 def test_installed_package_in_place_of_sources_is_one_sentence(sources: Path) -> None:
     (sources / "air" / "air_msgs" / "CMakeLists.txt").unlink()
-    with pytest.raises(MessagesError, match=r"SOURCE: found no CMakeLists\.txt in .*air_msgs, expected sources"):
+    with pytest.raises(
+        MessagesError, match=r"SOURCE: found no CMakeLists\.txt in .*air_msgs, expected sources"
+    ):
         in_order("plane_msgs", find_sources([sources]))
 
 
@@ -81,31 +89,49 @@ def test_part_of_package_holds_what_messages_contain(sources: Path) -> None:
     plane = sources / "plane" / "plane_msgs"
     assert closure("plane_msgs", plane, ["State"]) == {"State", "Mode"}
     assert closure("plane_msgs", plane, ["Arm"]) == {"Arm", "Mode"}
-    with pytest.raises(MessagesError, match="MESSAGES: found Speed, expected interfaces of plane_msgs"):
+    with pytest.raises(
+        MessagesError, match="MESSAGES: found Speed, expected interfaces of plane_msgs"
+    ):
         closure("plane_msgs", plane, ["State", "Speed"])
 
 
-def test_package_that_is_not_among_sources_refused(sources: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_package_that_is_not_among_sources_refused(
+    sources: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["px4_msgs", str(sources)]) == 2
-    assert "PACKAGE: found px4_msgs, expected one of SOURCE: air_msgs, plane_msgs" in capsys.readouterr().err
+    assert (
+        "PACKAGE: found px4_msgs, expected one of SOURCE: air_msgs, plane_msgs"
+        in capsys.readouterr().err
+    )
     assert main(["px4_msgs", str(sources / "nowhere")]) == 2
-    assert "nowhere, expected a folder with the sources of message packages" in capsys.readouterr().err
+    assert (
+        "nowhere, expected a folder with the sources of message packages" in capsys.readouterr().err
+    )
 
 
 needs_compiler = pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler here")
 
 
 @needs_compiler
-def test_a_missing_dependency_is_named(sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_dependency_is_named(
+    sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["plane_msgs", str(sources / "plane"), "--prefix", str(tmp_path / "prefix")]) == 2
-    expected = "plane_msgs needs air_msgs, which is neither installed nor below SOURCE: add the folder that holds it"
+    expected = (
+        "plane_msgs needs air_msgs, which is neither installed nor below SOURCE: add the "
+        "folder that holds it"
+    )
     assert expected in capsys.readouterr().err
 
 
 @needs_compiler
-def test_built_packages_are_imported_and_serialized(sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_built_packages_are_imported_and_serialized(
+    sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     prefix = tmp_path / "prefix"
-    assert main(["plane_msgs", str(sources), "--messages", "State", "--prefix", str(prefix)]) == 0, capsys.readouterr().err
+    assert (
+        main(["plane_msgs", str(sources), "--messages", "State", "--prefix", str(prefix)]) == 0
+    ), capsys.readouterr().err
     (site_packages,) = prefix.glob("lib/python3*/site-packages")
     program = """
 from rclpy.serialization import deserialize_message, serialize_message
@@ -117,5 +143,11 @@ print(copy.wind.v.tolist(), copy.modes[1].mode, hasattr(msg, "Unused"))
 """
     libraries = f"{prefix / 'lib'}{os.pathsep}{os.environ['LD_LIBRARY_PATH']}"
     environment = {**os.environ, "PYTHONPATH": str(site_packages), "LD_LIBRARY_PATH": libraries}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.stdout.strip() == "[1.0, 2.0, 3.0] 7 False", done.stderr

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in the process of a test: their time is moved by the test, and their topics are queues. Nothing else differs.
+"""Nodes in the process of a test: their time is moved by the test, and their topics are queues.
+Nothing else differs.
 
-A node is its class of the stack on a node of rclpy, with its parameters, its services and its ticks. Three things are replaced:
-the functions that make publishers, subscriptions and clients; the module `time`, as the modules of the stack see it; and the
-logger. A message is serialised where it is published, and waits in the queue of each subscription until the node takes it.
+A node is its class of the stack on a node of rclpy, with its parameters, its services and its
+ticks. Three things are replaced: the functions that make publishers, subscriptions and clients; the
+module `time`, as the modules of the stack see it; and the logger. A message is serialised where it
+is published, and waits in the queue of each subscription until the node takes it.
 """
 
 import sys
@@ -43,7 +45,9 @@ LIMIT = 60.0  # s of the time of the test, until a wait fails
 
 
 class Clock:
-    """The time of the host, in place of the module `time`; other functions of the module are unchanged."""
+    """The time of the host, in place of the module `time`; other functions of the module are
+    unchanged.
+    """
 
     def __init__(self) -> None:
         self.now_ns = 1000 * NANOSECONDS
@@ -92,7 +96,9 @@ class Endpoint(NamedTuple):
 class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
     """A publisher of a node, or of the test."""
 
-    def __init__(self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str) -> None:
+    def __init__(
+        self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str
+    ) -> None:
         self.kind, self.sequence = kind, 0
         self._world, self._topic = world, topic
         self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.PUBLISHER)
@@ -124,10 +130,14 @@ class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
 class Subscription:
     """A subscription of a node; `handle`, as rclpy has it, is itself."""
 
-    def __init__(self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool) -> None:
+    def __init__(
+        self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool
+    ) -> None:
         self.topic_name, self.msg_type, self.raw = topic, kind, raw
         self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.SUBSCRIPTION)
-        self.queue: deque[tuple[bytes, dict[str, int]]] = deque(maxlen=self.endpoint.qos_profile.depth)
+        self.queue: deque[tuple[bytes, dict[str, int]]] = deque(
+            maxlen=self.endpoint.qos_profile.depth
+        )
         self._world = world
 
     @property
@@ -186,7 +196,9 @@ class Log:
 
 
 class InWorld:
-    """Of a node before its class: publishers, subscriptions, clients and logger are those of the world."""
+    """Of a node before its class: publishers, subscriptions, clients and logger are those of the
+    world.
+    """
 
     world: "World"
     log: Log
@@ -195,12 +207,23 @@ class InWorld:
         """The lines."""
         return self.log
 
-    def create_publisher(self: Any, kind: type, topic: str, qos: QoSProfile | int, **_: object) -> Publisher:
+    def create_publisher(
+        self: Any, kind: type, topic: str, qos: QoSProfile | int, **_: object
+    ) -> Publisher:
         """A publisher of the world."""
-        return Publisher(self.world, kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name())
+        return Publisher(
+            self.world, kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name()
+        )
 
     def create_subscription(
-        self: Any, kind: type, topic: str, callback: object, qos: QoSProfile | int, *, raw: bool = False, **_: object
+        self: Any,
+        kind: type,
+        topic: str,
+        callback: object,
+        qos: QoSProfile | int,
+        *,
+        raw: bool = False,
+        **_: object,
     ) -> Subscription:
         """A subscription of the world."""
         name, node = self.resolve_topic_name(topic), self.get_fully_qualified_name()
@@ -226,21 +249,31 @@ class InWorld:
     def get_subscriptions_info_by_topic(self, topic: str) -> list[Endpoint]:
         """Of a topic by its full name."""
         kind = TopicEndpointTypeEnum.SUBSCRIPTION
-        return [each for each in self.world.graph if each.topic == topic and each.endpoint_type is kind]
+        return [
+            each for each in self.world.graph if each.topic == topic and each.endpoint_type is kind
+        ]
 
 
 class World:
-    """The nodes of a test, the graph between them, their time, and the messages that they have published."""
+    """The nodes of a test, the graph between them, their time, and the messages that they have
+    published.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self.graph: list[Endpoint] = []
         self.subscriptions: list[Subscription] = []
-        self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(list)  # by the full name of the topic
-        self.answers: dict[str, Callable[[Any], Any]] = {}  # services of the test, by their full names
+        self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(
+            list
+        )  # by the full name of the topic
+        self.answers: dict[
+            str, Callable[[Any], Any]
+        ] = {}  # services of the test, by their full names
         self.loops: dict[AnyNode, RealTime] = {}
         self.nodes: list[AnyNode] = []
-        self.listeners: dict[str, list[Callable[[Any], object]]] = defaultdict(list)  # of the test, by full topic
+        self.listeners: dict[str, list[Callable[[Any], object]]] = defaultdict(
+            list
+        )  # of the test, by full topic
         self._own: dict[tuple[str, type], Publisher] = {}  # publishers of the test
 
     # Nodes
@@ -276,7 +309,9 @@ class World:
         node.destroy_node()
 
     def kill(self, node: AnyNode) -> None:
-        """SIGKILL. What the node published stays in the graph, as for the lease of a participant."""
+        """SIGKILL. What the node published stays in the graph, as for the lease of a
+        participant.
+        """
         self.loops.pop(node, None)
         self.nodes.remove(node)
         node.destroy_node()
@@ -288,11 +323,17 @@ class World:
         end_ns = self.clock.now_ns + nanoseconds(duration)
         self._run(lambda: self.clock.now_ns >= end_ns, each, end_ns)
 
-    def until(self, condition: Callable[[], T], because: str, each: Callable[[], object] | None = None) -> T:
+    def until(
+        self, condition: Callable[[], T], because: str, each: Callable[[], object] | None = None
+    ) -> T:
         """Run the nodes until a condition is true; what it returned."""
         end_ns = self.clock.now_ns + nanoseconds(LIMIT)
         value = self._run(condition, each, end_ns)
-        lines = [f"{node.get_name()}: {line}" for node in self.nodes for line in node.get_logger().lines[-20:]]
+        lines = [
+            f"{node.get_name()}: {line}"
+            for node in self.nodes
+            for line in node.get_logger().lines[-20:]
+        ]
         assert value, "\n".join([f"not within {LIMIT:g} s: {because}", *lines])
         return value
 
@@ -305,13 +346,21 @@ class World:
             for loop in list(self.loops.values()):
                 while loop.run_due_tick():
                     loop.report()
-            deadlines = [self.clock.now_ns + nanoseconds(loop.ticker.remaining()) for loop in self.loops.values()]
-            self.clock.now_ns = max(min([*deadlines, end_ns, call_ns if each is not None else end_ns]), self.clock.now_ns + 1)
+            deadlines = [
+                self.clock.now_ns + nanoseconds(loop.ticker.remaining())
+                for loop in self.loops.values()
+            ]
+            self.clock.now_ns = max(
+                min([*deadlines, end_ns, call_ns if each is not None else end_ns]),
+                self.clock.now_ns + 1,
+            )
         return value
 
     # Messages
 
-    def endpoint(self, topic: str, kind: type, qos: QoSProfile | int, node: str, role: TopicEndpointTypeEnum) -> Endpoint:
+    def endpoint(
+        self, topic: str, kind: type, qos: QoSProfile | int, node: str, role: TopicEndpointTypeEnum
+    ) -> Endpoint:
         """Add an endpoint to the graph."""
         namespace, _, name = node.rpartition("/")
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
@@ -323,7 +372,9 @@ class World:
         kind = TopicEndpointTypeEnum.PUBLISHER
         return [each for each in self.graph if each.topic == topic and each.endpoint_type is kind]
 
-    def subscribe(self, kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool) -> Subscription:
+    def subscribe(
+        self, kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool
+    ) -> Subscription:
         """Add a subscription."""
         self.subscriptions.append(Subscription(self, kind, topic, qos, node, raw=raw))
         return self.subscriptions[-1]
@@ -332,14 +383,20 @@ class World:
         """Put a message into the queue of each subscription of its topic and type."""
         self.sent[topic].append((kind, raw))
         now_ns = self.clock.time_ns()
-        information = {"source_timestamp": now_ns, "received_timestamp": now_ns, "publication_sequence_number": sequence}
+        information = {
+            "source_timestamp": now_ns,
+            "received_timestamp": now_ns,
+            "publication_sequence_number": sequence,
+        }
         for subscription in self.subscriptions:
             if subscription.topic_name == topic and subscription.msg_type is kind:
                 subscription.queue.append((raw, information))
         for listener in self.listeners[topic]:
             listener(deserialize_message(raw, kind))
 
-    def publisher(self, kind: type, topic: str, qos: QoSProfile | int = PUBLISH, node: str = "/peer") -> Publisher:
+    def publisher(
+        self, kind: type, topic: str, qos: QoSProfile | int = PUBLISH, node: str = "/peer"
+    ) -> Publisher:
         """A publisher of the test."""
         return Publisher(self, kind, topic, qos, node)
 
@@ -349,7 +406,9 @@ class World:
         """A publisher of the test."""
         return self.publisher(kind, topic, qos)
 
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile | int) -> None:
+    def create_subscription(
+        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile | int
+    ) -> None:
         """Call back with each message of a topic."""
         self.listeners[topic].append(callback)
 
@@ -360,10 +419,14 @@ class World:
             self._own[key] = self.publisher(type(message), topic)
         self._own[key].publish(message)
 
-    def send(self, topic: str, channels: Mapping[str, float], sender: str = "/peer#1", age: float = 0.0) -> None:
+    def send(
+        self, topic: str, channels: Mapping[str, float], sender: str = "/peer#1", age: float = 0.0
+    ) -> None:
         """Publish a named vector of the test, with a stamp of `age` s ago."""
         stamp_ns = self.clock.time_ns() - nanoseconds(age)
-        raw = Encoder([*channels], sender).encode(stamp_ns, np.array([*channels.values()], dtype=np.float64))
+        raw = Encoder([*channels], sender).encode(
+            stamp_ns, np.array([*channels.values()], dtype=np.float64)
+        )
         key = topic, JointState
         if key not in self._own:
             self._own[key] = self.publisher(JointState, topic)
@@ -412,13 +475,24 @@ def stamp_ns(message: Any) -> int:
 
 def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
     """Sentence and figures of the newest diagnostics of a node by its full name."""
-    reports = [status for message in world.messages("/diagnostics") for status in message.status if status.name == node]
-    return (reports[-1].message, {value.key: value.value for value in reports[-1].values}) if reports else ("", {})
+    reports = [
+        status
+        for message in world.messages("/diagnostics")
+        for status in message.status
+        if status.name == node
+    ]
+    return (
+        (reports[-1].message, {value.key: value.value for value in reports[-1].values})
+        if reports
+        else ("", {})
+    )
 
 
 @contextmanager
 def world_of(*arguments: str) -> Iterator[World]:
-    """A world whose nodes have these arguments of ROS. Its time is that of the modules of the stack."""
+    """A world whose nodes have these arguments of ROS. Its time is that of the modules of the
+    stack.
+    """
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
@@ -441,9 +515,15 @@ PACKAGES = {path.parent.name for path in SOURCES.glob("*/package.xml")}
 
 def modules_of_stack() -> Iterable[Any]:
     """The loaded modules of the packages."""
-    return [module for name, module in sys.modules.copy().items() if name.partition(".")[0] in PACKAGES]
+    return [
+        module for name, module in sys.modules.copy().items() if name.partition(".")[0] in PACKAGES
+    ]
 
 
 def parameters(values: Mapping[str, object]) -> Sequence[str]:
     """Arguments that set parameters of nodes, by "NODE.NAME"."""
-    return [word for key, value in values.items() for word in ("-p", f"{key.replace('.', ':', 1)}:={value}")]
+    return [
+        word
+        for key, value in values.items()
+        for word in ("-p", f"{key.replace('.', ':', 1)}:={value}")
+    ]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units, output matrix and identities of an airframe file, against published factors, python-control and wrong files."""
+"""Units, output matrix and identities of an airframe file, against published factors,
+python-control and wrong files.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,9 +21,17 @@ NAVION: dict[str, Any] = {
     "source": "R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), p. 158, in SI",
     "speed": 53.64,
     "states": {"V": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
-    "inputs": {"elevator": {"unit": "rad", "positive": "nose down"}, "thrust": {"unit": "1", "positive": "more thrust"}},
+    "inputs": {
+        "elevator": {"unit": "rad", "positive": "nose down"},
+        "thrust": {"unit": "1", "positive": "more thrust"},
+    },
     "outputs": ["q", "V"],
-    "A": [[-0.045, 0.036, 0.0, -9.81], [-0.369, -2.02, 53.64, 0.0], [0.0062, -0.130, -2.948, 0.0], [0.0, 0.0, 1.0, 0.0]],
+    "A": [
+        [-0.045, 0.036, 0.0, -9.81],
+        [-0.369, -2.02, 53.64, 0.0],
+        [0.0062, -0.130, -2.948, 0.0],
+        [0.0, 0.0, 1.0, 0.0],
+    ],
     "B": [[0.0, 9.81], [-8.586, 0.0], [-11.044, 0.0], [0.0, 0.0]],
 }
 F4C: dict[str, Any] = {
@@ -29,7 +39,10 @@ F4C: dict[str, Any] = {
     "source": "lateral F-4C of M. V. Cook, Flight Dynamics Principles, example 4.3",
     "speed": 178.0,
     "states": {"v": "m/s", "p": "rad/s", "r": "rad/s", "phi": "rad", "psi": "rad"},
-    "inputs": {"aileron": {"unit": "rad", "positive": "roll right"}, "rudder": {"unit": "rad", "positive": "nose left"}},
+    "inputs": {
+        "aileron": {"unit": "rad", "positive": "roll right"},
+        "rudder": {"unit": "rad", "positive": "nose left"},
+    },
     "outputs": ["p", "r"],
     "A": [
         [-0.0565, 29.072, -175.610, 9.6783, 0.0],
@@ -49,7 +62,9 @@ def airframe(values: Mapping[str, Any]) -> Airframe:
     return checked
 
 
-def exchanged(key: str, i: int, j: int, axis: int = 0) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+def exchanged(
+    key: str, i: int, j: int, axis: int = 0
+) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     """A change that exchanges two rows or columns of a matrix."""
 
     def change(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,7 +76,9 @@ def exchanged(key: str, i: int, j: int, axis: int = 0) -> Callable[[Mapping[str,
     return change
 
 
-def scaled(key: str, i: int, j: int, factor: float) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+def scaled(
+    key: str, i: int, j: int, factor: float
+) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     """A change that multiplies an entry of a matrix."""
 
     def change(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,30 +94,40 @@ def states(**units: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     return lambda values: {"states": values["states"] | units}
 
 
-WRONG: dict[str, tuple[dict[str, Any], Callable[[Mapping[str, Any]], dict[str, Any]], tuple[str, ...]]] = {
+WRONG: dict[str, tuple[dict[str, Any], Callable[[Mapping[str, Any]], dict[str, Any]],
+tuple[str, ...]]] = {
     "transposed": (NAVION, lambda v: {"A": np.transpose(v["A"]).tolist()}, ("A is transposed",)),
     "rows of B": (NAVION, exchanged("B", 2, 3), ("rows of B", "A and B need one order")),
     "no kinematics": (NAVION, scaled("A", 3, 2, 0.0), ("theta_dot = 0 q", "expected 1")),
-    "sign of gravity": (NAVION, scaled("A", 0, 3, -1.0), ("V_dot = 9.81 theta", "sign is reversed")),
+    "sign of gravity": (NAVION, scaled("A", 0, 3, -1.0),
+    ("V_dot = 9.81 theta", "sign is reversed")),
     "g in ft/s^2": (NAVION, scaled("A", 0, 3, 3.28084), ("expected -g = -9.81", "feet and metres")),
     "speed in ft/s": (NAVION, lambda _: {"speed": 176.0}, ("speed", "A fits 53.64 m/s")),
     "SI declared ft/s": (NAVION, states(V="ft/s", w="ft/s"), ("feet and metres",)),
-    "alpha as w": (NAVION, states(w="rad"), ("states.w: found rad, expected a speed", "alpha perhaps")),
+    "alpha as w": (NAVION, states(w="rad"),
+    ("states.w: found rad, expected a speed", "alpha perhaps")),
     "elevator per rad declared deg": (
         NAVION,
         lambda v: {"inputs": v["inputs"] | {"elevator": {"unit": "deg", "positive": "nose down"}}},
         ("inputs.elevator.unit", "B is per rad, and the unit deg?"),
     ),
-    "sign of the elevator": (NAVION, lambda v: {"B": (np.array(v["B"]) * [-1.0, 1.0]).tolist()}, ("q_dot = 11.04",)),
-    "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]}, ("no input moves theta at once",)),
+    "sign of the elevator": (NAVION, lambda v: {"B": (np.array(v["B"]) * [-1.0, 1.0]).tolist()},
+    ("q_dot = 11.04",)),
+    "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]},
+    ("no input moves theta at once",)),
     "pitch driven by its rate": (NAVION, scaled("A", 2, 2, -1.0), ("q_dot = 2.948 q", "air damps")),
-    "sign of v and r": (F4C, scaled("A", 0, 2, -1.0), ("v_dot = 175.6 r", "-V0 = -178", "sign is reversed")),
+    "sign of v and r": (F4C, scaled("A", 0, 2, -1.0),
+    ("v_dot = 175.6 r", "-V0 = -178", "sign is reversed")),
     "heading in deg": (F4C, states(psi="deg"), ("psi_dot = 0.01769 r", "degrees and radians")),
-    "a state missing": (F4C, lambda v: {"states": {name: v["states"][name] for name in "vpr"}}, ("expected 3 rows of 3",)),
+    "a state missing": (F4C, lambda v: {"states": {name: v["states"][name] for name in "vpr"}},
+    ("expected 3 rows of 3",)),
     "unknown unit": (F4C, states(v="furlong/h"), ("states.v: found 'furlong/h'", "ft/s^2")),
-    "feedthrough": (F4C, lambda _: {"D": [[0.0, 0.0], [0.1, 0.0]]}, ("D: found a feedthrough of 0.1", "take an output")),
-    "output without a unit": (NAVION, lambda _: {"outputs": ["q", "n"], "C": [[0, 0, 1, 0]] * 2}, ("output_units.n",)),
-    "rows of C exchanged": (NAVION, lambda _: {"C": [[1, 0, 0, 0], [0, 0, 1, 0]]}, ("a row of q with V", "the state q alone")),
+    "feedthrough": (F4C, lambda _: {"D": [[0.0, 0.0], [0.1, 0.0]]},
+    ("D: found a feedthrough of 0.1", "take an output")),
+    "output without a unit": (NAVION, lambda _: {"outputs": ["q", "n"], "C": [[0, 0, 1, 0]] * 2},
+    ("output_units.n",)),
+    "rows of C exchanged": (NAVION, lambda _: {"C": [[1, 0, 0, 0], [0, 0, 1, 0]]},
+    ("a row of q with V", "the state q alone")),
 }  # fmt: skip
 
 
@@ -134,7 +161,10 @@ def test_multirotor_in_hover_is_not_refused() -> None:
     """No control surface: the coupling with the speed is absent near hover."""
     values = {
         "states": {"q": "rad/s", "w": "m/s", "theta": "rad"},
-        "inputs": {"moment": {"unit": "1", "positive": "nose up"}, "lift": {"unit": "1", "positive": "up"}},
+        "inputs": {
+            "moment": {"unit": "1", "positive": "nose up"},
+            "lift": {"unit": "1", "positive": "up"},
+        },
         "outputs": ["q", "w"],
         "A": [[-2.0, 0.0, 0.0], [0.0, -0.3, 0.0], [1.0, 0.0, 0.0]],
         "B": [[80.0, 0.0], [0.0, -20.0], [0.0, 0.0]],
@@ -156,18 +186,32 @@ def test_height_is_a_state() -> None:
             [0.0, 0.0, 1.0, 0.0, 0.0],
             [0.0, -V0 / ft * np.pi / 180.0, 0.0, V0 / ft * np.pi / 180.0, 0.0],
         ],
-        "B": [[0.0, 12.0 / kt], [-0.2 * 180.0 / np.pi, 0.0], [-60.0 * 180.0 / np.pi, 0.0], [0.0, 0.0], [0.0, 0.0]],
+        "B": [
+            [0.0, 12.0 / kt],
+            [-0.2 * 180.0 / np.pi, 0.0],
+            [-60.0 * 180.0 / np.pi, 0.0],
+            [0.0, 0.0],
+            [0.0, 0.0],
+        ],
     }
     A = airframe(values).matrix_a()
-    expected = [[-0.19, 9.4, 0.0, -9.81, 0.0], [-0.05, -3.0, 0.98, 0.0, 0.0], [0.0, -46.0, -3.6, 0.0, 0.0]]
-    np.testing.assert_allclose(A, [*expected, [0.0, 0.0, 1.0, 0.0, 0.0], [0.0, -V0, 0.0, V0, 0.0]], atol=1e-12)
+    expected = [
+        [-0.19, 9.4, 0.0, -9.81, 0.0],
+        [-0.05, -3.0, 0.98, 0.0, 0.0],
+        [0.0, -46.0, -3.6, 0.0, 0.0],
+    ]
+    np.testing.assert_allclose(
+        A, [*expected, [0.0, 0.0, 1.0, 0.0, 0.0], [0.0, -V0, 0.0, V0, 0.0]], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
     ("unit", "factor"),
     [
-        ("ft", 0.3048), ("kt", 0.514444), ("mph", 0.44704), ("km/h", 0.277778), ("nmi", 1852.0), ("slug", 14.5939),
-        ("lb", 0.45359237), ("lbf", 4.448222), ("slug*ft^2", 1.355818), ("slug/ft^3", 515.3788), ("ft/s^2", 0.3048),
+        ("ft", 0.3048), ("kt", 0.514444), ("mph", 0.44704), ("km/h", 0.277778), ("nmi", 1852.0),
+        ("slug", 14.5939),
+        ("lb", 0.45359237), ("lbf", 4.448222), ("slug*ft^2", 1.355818), ("slug/ft^3", 515.3788),
+        ("ft/s^2", 0.3048),
         ("lbf/ft^2", 47.88026), ("deg/s", 0.01745329), ("s^-1", 1.0),
     ],
 )  # fmt: skip
@@ -199,10 +243,15 @@ def test_text_with_a_unit_becomes_si() -> None:
 
 
 def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
-    """The Navion turned by a trim angle of attack to u, w of body axes, with V = u cos + w sin; and the same in V, w."""
+    """The Navion turned by a trim angle of attack to u, w of body axes, with V = u cos + w sin; and
+    the same in V, w.
+    """
     sine, cosine = np.sin(alpha), np.cos(alpha)
     turn = np.eye(4)
-    turn[:2, :2] = [[cosine, -sine], [sine, cosine]]  # u, w of body axes from those of stability axes
+    turn[:2, :2] = [
+        [cosine, -sine],
+        [sine, cosine],
+    ]  # u, w of body axes from those of stability axes
     values = NAVION | {
         "states": {"u": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
         "A": (turn @ NAVION["A"] @ turn.T).tolist(),
@@ -218,7 +267,8 @@ def test_output_of_body_axes_has_the_transfer_function_of_stability_axes() -> No
     values, stability = body_axes()
     body = airframe(values)
     responses = [
-        control.ss(frame.matrix_a(), frame.matrix_b(), frame.matrix_c(), np.zeros((2, 2)))(1j) for frame in (body, stability)
+        control.ss(frame.matrix_a(), frame.matrix_b(), frame.matrix_c(), np.zeros((2, 2)))(1j)
+        for frame in (body, stability)
     ]
     np.testing.assert_allclose(responses[0], responses[1], rtol=1e-9)
     plant = control.ss(body.matrix_a(), body.matrix_b(), body.matrix_c(), np.zeros((2, 2)))

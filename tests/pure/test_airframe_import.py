@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes from python-control, SciPy, MATLAB, AVL and XFLR5, against the printed matrices of a book and the library."""
+"""Airframes from python-control, SciPy, MATLAB, AVL and XFLR5, against the printed matrices of a
+book and the library.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -23,9 +25,15 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di.own_airframe import new_airframe
 
-# R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), p. 158, with the elevator of NASA CR-96008, in ft.
+# R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), p. 158, with the elevator of
+# NASA CR-96008, in ft.
 A: FloatArray = np.array(
-    [[-0.045, 0.036, 0.0, -32.2], [-0.369, -2.02, 176.0, 0.0], [0.0019, -0.0396, -2.948, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    [
+        [-0.045, 0.036, 0.0, -32.2],
+        [-0.369, -2.02, 176.0, 0.0],
+        [0.0019, -0.0396, -2.948, 0.0],
+        [0.0, 0.0, 1.0, 0.0],
+    ]
 )
 B: FloatArray = np.array([[0.0], [-28.17], [-11.044], [0.0]])
 NAMES: dict[str, Any] = {
@@ -70,7 +78,8 @@ AVL_ST = """\
  z' mom.  Cn'|   Cnd1 =   0.000000   Cnd2 =  -0.000061   Cnd3 =  -0.001257
  Neutral point  Xnp =   2.0
 """
-"""The derivatives of the Navion, Nelson, table B.1, in the form of AVL's command ST; per deg of a control."""
+"""The derivatives of the Navion, Nelson, table B.1, in the form of AVL's command ST; per deg of a
+control."""
 BODY = {
     "mass": "2750 lb",
     "Ixx": "1048 slug*ft^2",
@@ -89,36 +98,52 @@ def tool_file(folder: Path, name: str, text: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    "system", [SYSTEM, scipy.signal.StateSpace(A, B, np.eye(4), np.zeros((4, 1)))], ids=["control", "scipy"]
+    "system",
+    [SYSTEM, scipy.signal.StateSpace(A, B, np.eye(4), np.zeros((4, 1)))],
+    ids=["control", "scipy"],
 )
 def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
     frame, _ = import_airframe(system, thrust=True, **NAMES)
     library = load_airframe("navion_longitudinal")
     np.testing.assert_allclose(frame.matrix_a(), library.matrix_a(), rtol=1e-12, atol=0.0)
-    np.testing.assert_allclose(frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0)  # g of 32.2 ft/s^2 in the thrust
+    np.testing.assert_allclose(
+        frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0
+    )  # g of 32.2 ft/s^2 in the thrust
     assert frame.speed == pytest.approx(library.speed)
-    np.testing.assert_allclose(frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12)  # alpha_0 is 0 in stability axes
+    np.testing.assert_allclose(
+        frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12
+    )  # alpha_0 is 0 in stability axes
     assert frame.outputs == ("q", "V")
 
 
 def test_gusts_are_minus_the_columns_of_the_flow() -> None:
     """W. MacKunis et al. 2010 take the gust as minus the column of alpha; w is V0 alpha."""
     frame, _ = import_airframe(SYSTEM, thrust=True, **NAMES)
-    np.testing.assert_allclose(frame.gust_direction("vertical")[:3], -frame.matrix_a()[:3, 1], rtol=1e-4)
+    np.testing.assert_allclose(
+        frame.gust_direction("vertical")[:3], -frame.matrix_a()[:3, 1], rtol=1e-4
+    )
     assert "theta" not in frame.gusts["vertical"]
 
 
 def test_body_axes_give_the_airspeed_along_the_path() -> None:
-    """u_dot has -W0 q and w_dot has U0 q, so V = u cos(alpha_0) + w sin(alpha_0): 9.4 deg in Cook's example 4.2."""
+    """u_dot has -W0 q and w_dot has U0 q, so V = u cos(alpha_0) + w sin(alpha_0): 9.4 deg in Cook's
+    example 4.2.
+    """
     f4c = np.array(
         [
-            [7.181e-4, 4.57e-3, -29.072, -9.678], [-0.0687, -0.2953, 174.868, -1.601], [1.73e-3, -0.0105, -0.4462, 1.277e-3],
+            [7.181e-4, 4.57e-3, -29.072, -9.678], [-0.0687, -0.2953, 174.868, -1.601],
+            [1.73e-3, -0.0105, -0.4462, 1.277e-3],
             [0.0, 0.0, 1.0, 0.0],
         ]
     )  # fmt: skip
     system = control.ss(f4c, [[1.041], [-6.294], [-4.888], [0.0]], np.eye(4), np.zeros((4, 1)))
     frame, _ = import_airframe(
-        system, name="f4c", speed=178.0, states=["u", "w", "q", "theta"], inputs="elevator: rad nose down", thrust=True
+        system,
+        name="f4c",
+        speed=178.0,
+        states=["u", "w", "q", "theta"],
+        inputs="elevator: rad nose down",
+        thrust=True,
     )
     u, w, *_ = frame.matrix_c()[1]
     assert np.degrees(np.arctan2(w, u)) == pytest.approx(9.4, abs=0.05)
@@ -134,7 +159,9 @@ def test_names_of_python_control_are_taken() -> None:
         inputs=["elevator"],
         outputs=["u", "w", "q", "theta"],
     )
-    with pytest.raises(ParameterError, match=r"feet and metres"):  # the labels have no unit, and A is in ft
+    with pytest.raises(
+        ParameterError, match=r"feet and metres"
+    ):  # the labels have no unit, and A is in ft
         import_airframe(system, thrust=True, speed="176 ft/s")
     frame, _ = import_airframe(system, thrust=True, speed="176 ft/s", states=NAMES["states"])
     assert list(frame.inputs) == ["elevator", "thrust"]
@@ -147,7 +174,9 @@ def test_matlab_file_carries_names(tmp_path: Path) -> None:
         "InputName": np.array(["elevator"], dtype=object),
     }
     scipy.io.savemat(tmp_path / "flat.mat", {"A": A, "B": B, **names})
-    scipy.io.savemat(tmp_path / "group.mat", {"sys": {"a": A, "b": B, "c": np.eye(4), "d": np.zeros((4, 1))}})
+    scipy.io.savemat(
+        tmp_path / "group.mat", {"sys": {"a": A, "b": B, "c": np.eye(4), "d": np.zeros((4, 1))}}
+    )
     given: dict[str, Any] = {"speed": "176 ft/s", "thrust": True, "states": NAMES["states"]}
     flat, note = import_airframe(tmp_path / "flat.mat", **given)
     group, _ = import_airframe(tmp_path / "group.mat", **given, inputs="elevator: rad nose down")
@@ -157,28 +186,50 @@ def test_matlab_file_carries_names(tmp_path: Path) -> None:
 
 
 def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
-    """Nelson prints the lateral matrix on p. 199 and the longitudinal derivatives on p. 153, without alpha_dot: M_q = -2.05."""
-    frame, note = import_airframe(tool_file(tmp_path, "navion.st", AVL_ST), speed="176 ft/s", thrust=True, **BODY)
+    """Nelson prints the lateral matrix on p. 199 and the longitudinal derivatives on p. 153,
+    without alpha_dot: M_q = -2.05.
+    """
+    frame, note = import_airframe(
+        tool_file(tmp_path, "navion.st", AVL_ST), speed="176 ft/s", thrust=True, **BODY
+    )
     matrix, x = frame.matrix_a(), list(frame.states)
     lateral = matrix[
-        np.ix_([x.index(name) for name in ("beta", "p", "r", "phi")], [x.index(n) for n in ("beta", "p", "r", "phi")])
+        np.ix_(
+            [x.index(name) for name in ("beta", "p", "r", "phi")],
+            [x.index(n) for n in ("beta", "p", "r", "phi")],
+        )
     ]
-    printed = [[-0.254, 0.0, -1.0, 0.182], [-16.02, -8.40, 2.19, 0.0], [4.488, -0.350, -0.760, 0.0], [0.0, 1.0, 0.0, 0.0]]
+    printed = [
+        [-0.254, 0.0, -1.0, 0.182],
+        [-16.02, -8.40, 2.19, 0.0],
+        [4.488, -0.350, -0.760, 0.0],
+        [0.0, 1.0, 0.0, 0.0],
+    ]
     np.testing.assert_allclose(lateral, printed, rtol=0.03, atol=1e-9)
     entry = {(row, column): matrix[x.index(row), x.index(column)] for row in x for column in x}
     assert entry["V", "V"] == pytest.approx(-0.045, rel=0.02)
-    assert entry["alpha", "V"] * 176.0 * 0.3048 == pytest.approx(-0.369, rel=0.02)  # Z_u of w = V0 alpha
+    assert entry["alpha", "V"] * 176.0 * 0.3048 == pytest.approx(
+        -0.369, rel=0.02
+    )  # Z_u of w = V0 alpha
     assert entry["alpha", "alpha"] == pytest.approx(-2.02, rel=0.02)
     assert entry["q", "alpha"] == pytest.approx(-8.8, rel=0.02)  # M_alpha, p. 153
     assert entry["q", "q"] == pytest.approx(-2.05, rel=0.03)
-    np.testing.assert_allclose(frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005)  # by hand: q S c C_m / I_y
+    np.testing.assert_allclose(
+        frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005
+    )  # by hand: q S c C_m / I_y
     assert frame.inputs["elevator"].unit == "deg"
-    assert [given.positive for given in frame.inputs.values()][:3] == ["nose down", "roll right", "nose left"]
+    assert [given.positive for given in frame.inputs.values()][:3] == [
+        "nose down",
+        "roll right",
+        "nose left",
+    ]
     assert "without those of alpha_dot" in note
 
 
 def supra(axes: float) -> str:
-    """AVL's system matrix of the sailplane Supra as a user of AVL posted it, longitudinal, with an elevator per deg."""
+    """AVL's system matrix of the sailplane Supra as a user of AVL posted it, longitudinal, with an
+    elevator per deg.
+    """
     longitudinal = [
         [-0.0486, 2.397, -0.6799, -9.81],
         [-1.4589, -11.0072, 4.693, 0.0],
@@ -187,18 +238,30 @@ def supra(axes: float) -> str:
     ]
     full = np.zeros((12, 12))
     full[:4, :4] = np.array(longitudinal)
-    full[4:8, 4:8] = [[-0.5, 0.7, -6.6, 9.81], [-1.4, -9.0, 2.0, 0.0], [0.9, -0.6, -0.8, 0.0], [0.0, 1.0, 0.0, 0.0]]
+    full[4:8, 4:8] = [
+        [-0.5, 0.7, -6.6, 9.81],
+        [-1.4, -9.0, 2.0, 0.0],
+        [0.9, -0.6, -0.8, 0.0],
+        [0.0, 1.0, 0.0, 0.0],
+    ]
     B = np.zeros((12, 2))
     B[:3, 0] = [0.0, -0.09, -1.03]
     B[4:7, 1] = [0.05, 0.02, -0.2]
     turn = np.array([axes, axes, 1, 1, 1, axes, axes, axes, axes, 1, axes, 1])
     rows = np.hstack([turn[:, None] * full * turn, turn[:, None] * B])
-    header = "     u    w    q    the    v    p    r    phi    x    y    z    psi  |  elevator  rudder"
+    header = (
+        "     u    w    q    the    v    p    r    phi    x    y    z    psi  |  elevator  rudder"
+    )
     return "\n".join(
         [
             " A Matrix",
             header,
-            *(" ".join(f"{v:.4f}" for v in row[:12]) + " | " + " ".join(f"{v:.4f}" for v in row[12:]) for row in rows),
+            *(
+                " ".join(f"{v:.4f}" for v in row[:12])
+                + " | "
+                + " ".join(f"{v:.4f}" for v in row[12:])
+                for row in rows
+            ),
         ]
     )
 
@@ -209,9 +272,14 @@ def test_avl_system_matrix_has_the_published_eigenvalues(tmp_path: Path, axes: f
     frame, _ = import_airframe(tool_file(tmp_path, "supra.txt", supra(axes)), speed=6.824)
     poles = np.linalg.eigvals(frame.matrix_a()[:4, :4])
     np.testing.assert_allclose(
-        np.sort_complex(poles), [-9.4662 - 3.2089j, -9.4662 + 3.2089j, -0.1385 - 0.668j, -0.1385 + 0.668j], atol=2e-3
+        np.sort_complex(poles),
+        [-9.4662 - 3.2089j, -9.4662 + 3.2089j, -0.1385 - 0.668j, -0.1385 + 0.668j],
+        atol=2e-3,
     )
-    assert [frame.inputs[name].positive for name in ("elevator", "rudder")] == ["nose down", "nose left"]
+    assert [frame.inputs[name].positive for name in ("elevator", "rudder")] == [
+        "nose down",
+        "nose left",
+    ]
     assert frame.outputs == ("q", "r")
 
 
@@ -222,16 +290,23 @@ def test_xflr5_log_gives_both_motions(tmp_path: Path) -> None:
     longitudinal[1, 0] *= f16.speed / 25.0
 
     def matrix(values: FloatArray) -> str:
-        return "\n".join("   ".join(f"{value:13g}" for value in row) for row in np.atleast_2d(values))
+        return "\n".join(
+            "   ".join(f"{value:13g}" for value in row) for row in np.atleast_2d(values)
+        )
 
     log = "\n".join(
         [
-            "      _____State matrices__________", "       Longitudinal state matrix", matrix(longitudinal),
+            "      _____State matrices__________", "       Longitudinal state matrix",
+            matrix(longitudinal),
             "       Lateral state matrix", matrix(lateral), "",
-            "      _____Control Matrices for set Elevator __________", "       Longitudinal control matrix",
-            matrix(f16.matrix_b()[:, :1]), "       Lateral control matrix", matrix(np.zeros((4, 1))),
-            "      _____Control Matrices for set Rudder __________", "       Longitudinal control matrix",
-            matrix(np.zeros((4, 1))), "       Lateral control matrix", matrix(b747.matrix_b()[:, 1:]),
+            "      _____Control Matrices for set Elevator __________",
+            "       Longitudinal control matrix",
+            matrix(f16.matrix_b()[:, :1]), "       Lateral control matrix",
+            matrix(np.zeros((4, 1))),
+            "      _____Control Matrices for set Rudder __________",
+            "       Longitudinal control matrix",
+            matrix(np.zeros((4, 1))), "       Lateral control matrix",
+            matrix(b747.matrix_b()[:, 1:]),
         ]
     )  # fmt: skip
     frame, note = import_airframe(tool_file(tmp_path, "plane.log", log))
@@ -250,15 +325,27 @@ REFUSED: dict[str, tuple[Any, dict[str, Any], str]] = {
     ),
     "no state space": ([1.0], {}, "found list, expected a state space"),
     "no names": (SYSTEM, {"states": ""}, "states: found no names beside 4 rows of A"),
-    "a state missing": (SYSTEM, {"states": "u: ft/s, w: ft/s, q: rad/s"}, "states: found u, w, q beside 4 rows of A"),
+    "a state missing": (
+        SYSTEM,
+        {"states": "u: ft/s, w: ft/s, q: rad/s"},
+        "states: found u, w, q beside 4 rows of A",
+    ),
     "unit of speed": (SYSTEM, {"speed": "176 ft"}, "expected a unit like m/s"),
     "feedthrough": (
         control.ss(A, np.hstack([B, B]), A[1:3], [[-28.17, 0.0], [0.0, 0.0]]),
         {"inputs": "elevator: rad nose down, flap: rad", "outputs": "n: ft/s^2, q_dot: rad/s^2"},
         "D: found a feedthrough of 28.17",
     ),
-    "not finite": (control.ss(np.where(A == 1.0, np.inf, A), B, np.eye(4), np.zeros((4, 1))), {}, "not finite"),
-    "wrong units": (SYSTEM, {"states": "u: m/s, w: m/s, q: rad/s, theta: rad"}, "feet and metres are mixed up"),
+    "not finite": (
+        control.ss(np.where(A == 1.0, np.inf, A), B, np.eye(4), np.zeros((4, 1))),
+        {},
+        "not finite",
+    ),
+    "wrong units": (
+        SYSTEM,
+        {"states": "u: m/s, w: m/s, q: rad/s, theta: rad"},
+        "feet and metres are mixed up",
+    ),
 }
 
 
@@ -278,7 +365,9 @@ def test_wrong_model_is_told_in_one_sentence(mistake: str) -> None:
     [("a.txt", "no matrix here", {}, "found none of these"), ("a.mat", "no MAT-file", {}, "-v7"),
         ("a.st", AVL_ST.replace("Clp =", "Clx ="), BODY | {"speed": "176 ft/s"}, "no Clp"),],
 )  # fmt: skip
-def test_wrong_file_is_told_in_one_sentence(tmp_path: Path, name: str, text: str, changes: dict[str, Any], words: str) -> None:
+def test_wrong_file_is_told_in_one_sentence(
+    tmp_path: Path, name: str, text: str, changes: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ParameterError) as refusal:
         import_airframe(tool_file(tmp_path, name, text), **changes)
     assert words in str(refusal.value)
@@ -288,7 +377,10 @@ def test_wrong_file_is_told_in_one_sentence(tmp_path: Path, name: str, text: str
 def test_new_airframe_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     made = new_airframe(SYSTEM, thrust=True, **NAMES)
-    assert (made.airframe_file, made.scenario_file) == (Path("navion.yaml"), Path("navion_flight.yaml"))
+    assert (made.airframe_file, made.scenario_file) == (
+        Path("navion.yaml"),
+        Path("navion_flight.yaml"),
+    )
     tape = simulate(find_scenario("navion_flight.yaml"))
     assert tape.outcome == "completed"
     error = np.abs(tape["y"]["V"] - np.interp(tape.time("y"), tape.time("y_m"), tape["y_m"]["V"]))
@@ -298,7 +390,9 @@ def test_new_airframe_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-def test_command_writes_airframe_and_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_writes_airframe_and_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     scipy.io.savemat("navion.mat", {"A": A, "B": B})
     arguments = [
@@ -319,16 +413,26 @@ def test_command_writes_airframe_and_scenario(tmp_path: Path, monkeypatch: pytes
     assert result.exit_code == 0
     assert "elevator (rad, positive: nose down)" in result.stdout
     read: Airframe = load_airframe("navion.yaml")
-    np.testing.assert_allclose(read.matrix_a(), load_airframe("navion_longitudinal").matrix_a(), rtol=1e-12)
+    np.testing.assert_allclose(
+        read.matrix_a(), load_airframe("navion_longitudinal").matrix_a(), rtol=1e-12
+    )
     assert find_scenario("navion_flight.yaml").controller.D == (-1, 1)
 
 
 def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
-    """Cook, examples 4.2 and 4.3: the dimensionless derivatives in body axes, kg, m, s; mass matrix with w_dot and Ixz."""
+    """Cook, examples 4.2 and 4.3: the dimensionless derivatives in body axes, kg, m, s; mass matrix
+    with w_dot and Ixz.
+    """
     m, Ix, Iy, Iz, Ixz = 17642.0, 33898.0, 165669.0, 189496.0, 2952.0
     S, b, c, rho, V0, theta, g = 49.239, 11.787, 4.889, 0.3809, 178.0, np.radians(9.4), 9.81
     U, W, force = V0 * np.cos(theta), V0 * np.sin(theta), 0.5 * rho * V0 * S
-    mass = np.array([[m, 0.0, 0.0], [0.0, m + 0.3997 * 0.5 * rho * S * c, 0.0], [0.0, 0.5910 * 0.5 * rho * S * c**2, Iy]])
+    mass = np.array(
+        [
+            [m, 0.0, 0.0],
+            [0.0, m + 0.3997 * 0.5 * rho * S * c, 0.0],
+            [0.0, 0.5910 * 0.5 * rho * S * c**2, Iy],
+        ]
+    )
     forces = np.array(
         [
             [0.0076 * force, 0.0483 * force, -m * W, -m * g * np.cos(theta)],
@@ -348,5 +452,9 @@ def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
     page = yaml.safe_load(text.split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0])
     A = np.array(page["A"])
     np.testing.assert_allclose(A[:3, :4], np.linalg.solve(mass, forces), rtol=0.01, atol=1e-4)
-    np.testing.assert_allclose(A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4)
-    assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == pytest.approx([np.cos(theta), np.sin(theta)], abs=1e-4)
+    np.testing.assert_allclose(
+        A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4
+    )
+    assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == pytest.approx(
+        [np.cos(theta), np.sin(theta)], abs=1e-4
+    )

@@ -15,7 +15,9 @@ from flight_cli.cli import application
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCKER = ROOT / "docker"
-AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load((DOCKER / "autopilot.yaml").read_text(encoding="utf-8"))["services"]
+AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load(
+    (DOCKER / "autopilot.yaml").read_text(encoding="utf-8")
+)["services"]
 DOCKERFILES = sorted(DOCKER.glob("Dockerfile*"))
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
@@ -23,7 +25,11 @@ SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 
 def instructions(dockerfile: Path) -> list[tuple[str, str]]:
     """Each instruction of a Dockerfile with its arguments, in order."""
-    lines = [line for line in dockerfile.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
+    lines = [
+        line
+        for line in dockerfile.read_text(encoding="utf-8").splitlines()
+        if line and not line.startswith("#")
+    ]
     joined = re.sub(r"\s*\\\n\s*", " ", "\n".join(lines)).splitlines()
     return [(word, rest) for word, _, rest in (line.partition(" ") for line in joined)]
 
@@ -36,36 +42,62 @@ def test_image_is_small_and_user_is_not_root(dockerfile: Path) -> None:
     last = dict(words[stages[-1] :])
     assert int(last["USER"]) > 0, "a number, which needs no user list of the image"
     assert last["VOLUME"] == "/runs"
-    assert not re.search(r"\bpip\b|build-essential|gcc|colcon", " ".join(rest for _, rest in words[stages[-1] :]))
+    assert not re.search(
+        r"\bpip\b|build-essential|gcc|colcon", " ".join(rest for _, rest in words[stages[-1] :])
+    )
     bases = [rest.partition("=")[2] for word, rest in words if word == "ARG" and "BASE=" in rest]
-    assert all(re.fullmatch(r"[\w./-]+:[\w.-]+", base) and not base.endswith(":latest") for base in bases)
+    assert all(
+        re.fullmatch(r"[\w./-]+:[\w.-]+", base) and not base.endswith(":latest") for base in bases
+    )
 
 
 def test_no_service_has_a_network() -> None:
     # One network namespace with the loopback interface only; the stack's DDS profile uses it.
     assert SERVICES["recorder"]["network_mode"] == "none"
-    assert {service["network_mode"] for name, service in SERVICES.items() if name != "recorder"} == {"service:recorder"}
+    assert {
+        service["network_mode"] for name, service in SERVICES.items() if name != "recorder"
+    } == {"service:recorder"}
     for service in SERVICES.values():
-        assert not service.keys() & {"ports", "networks", "privileged", "user", "pid", "ipc", "environment"}
+        assert not service.keys() & {
+            "ports",
+            "networks",
+            "privileged",
+            "user",
+            "pid",
+            "ipc",
+            "environment",
+        }
         assert service["cap_drop"] == ["ALL"]
         assert service["security_opt"] == ["no-new-privileges:true"]
         assert service["read_only"] is True
 
 
 def test_only_link_of_autopilot_is_open() -> None:
-    """The agent's topics and the flight's are on one loopback interface, with the stack's own profile."""
+    """The agent's topics and the flight's are on one loopback interface, with the stack's own
+    profile.
+    """
     agent, flight = AUTOPILOT["agent"], AUTOPILOT["flight"]
     assert AUTOPILOT.keys() == {"agent", "flight"}
     (profile,) = agent["volumes"]
     source, target, access = profile.split(":")
-    assert (DOCKER / source).resolve() == ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
+    assert (
+        DOCKER / source
+    ).resolve() == ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
     assert (DOCKER / source).is_file()
     assert agent["environment"] == {"FASTRTPS_DEFAULT_PROFILES_FILE": target}
     assert access == "ro"
     (port,) = agent["ports"]
     assert port == f"{agent['command'][-1]}:{agent['command'][-1]}/udp"
     assert flight["network_mode"] == "service:agent"
-    assert not flight.keys() & {"ports", "networks", "privileged", "user", "pid", "ipc", "environment"}
+    assert not flight.keys() & {
+        "ports",
+        "networks",
+        "privileged",
+        "user",
+        "pid",
+        "ipc",
+        "environment",
+    }
     for service in AUTOPILOT.values():
         assert service["cap_drop"] == ["ALL"]
         assert service["security_opt"] == ["no-new-privileges:true"]
@@ -73,8 +105,12 @@ def test_only_link_of_autopilot_is_open() -> None:
 
 
 def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> None:
-    """The command as compose expands it without variables, but for the scenario. It ends at the scenario, which is missing."""
-    command = re.sub(r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"])
+    """The command as compose expands it without variables, but for the scenario. It ends at the
+    scenario, which is missing.
+    """
+    command = re.sub(
+        r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"]
+    )
     words = re.sub(r"\$\{\w+:-(.*?)\}", r"\1", command).split()
     assert words[0] == "rise-di"
     assert "--send" not in words

@@ -6,7 +6,13 @@ import re
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md", "examples/pid_law/README.md")
+TOP = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "docker/README.md",
+    "examples/pid_law/README.md",
+)
 PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").rglob("*.md"))]
 MAX_LINE = 200
 LINKED = (
@@ -51,7 +57,12 @@ WORDS = re.compile(f"(?<![a-z])({'|'.join(REPLACED).replace(' ', '[ _]')})(?![a-
 
 def prose(page: Path) -> str:
     """The text of a page without code blocks, code spans and formulas."""
-    text = re.sub(r"^(```.*?^```|    .*?$)", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^(```.*?^```|    .*?$)",
+        "",
+        page.read_text(encoding="utf-8"),
+        flags=re.MULTILINE | re.DOTALL,
+    )
     return re.sub(r"`[^`\n]*`|\$\$.*?\$\$|\$[^$]*\$", "", text, flags=re.DOTALL)
 
 
@@ -62,7 +73,9 @@ def links(page: Path) -> list[str]:
 def anchors(page: Path) -> set[str]:
     """The anchors that GitHub gives to the headings of a page."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
+    }
 
 
 def name(path: Path) -> str:
@@ -84,7 +97,9 @@ def test_rows_have_a_cell_for_each_column() -> None:
     """Below a heading; a | in a formula would begin a cell, on GitHub and on the site."""
     bad = []
     for page in PAGES:
-        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        text = re.sub(
+            r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+        )
         for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
             cells = {len(re.split(r"(?<!\\)\|", row)) for row in table.splitlines()}
             if len(cells) != 1 or not re.match(r".*\n\|( ?:?-+:? ?\|)+\n", table):
@@ -98,15 +113,27 @@ def test_relative_links_and_anchors_exist() -> None:
         for link in links(page):
             path, _, anchor = link.partition("#")
             target = (page.parent / path).resolve() if path else page
-            if not re.match(r"[a-z]+:", link) and not (target.exists() and (not anchor or anchor in anchors(target))):
+            if not re.match(r"[a-z]+:", link) and not (
+                target.exists() and (not anchor or anchor in anchors(target))
+            ):
                 broken.append(f"{name(page)}: {link}")
     assert not broken, "\n".join(broken)
 
 
 def test_tests_that_pages_name_exist() -> None:
-    tests = "".join(path.read_text(encoding="utf-8") for path in (REPOSITORY / "tests").rglob("*.py"))
-    named = {(name(page), test) for page in PAGES for test in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))}
-    unknown = [f"{page}: {test}" for page, test in sorted(named) if not re.search(rf"^def {test}\(", tests, re.MULTILINE)]
+    tests = "".join(
+        path.read_text(encoding="utf-8") for path in (REPOSITORY / "tests").rglob("*.py")
+    )
+    named = {
+        (name(page), test)
+        for page in PAGES
+        for test in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))
+    }
+    unknown = [
+        f"{page}: {test}"
+        for page, test in sorted(named)
+        if not re.search(rf"^def {test}\(", tests, re.MULTILINE)
+    ]
     assert not unknown, "\n".join(unknown)
 
 
@@ -115,10 +142,19 @@ def test_the_readme_links_the_main_pages() -> None:
 
 
 def test_sources_tests_and_pages_use_words_of_field() -> None:
-    files = [path for folder in FOLDERS for path in sorted((REPOSITORY / folder).rglob("*")) if path.suffix in TEXTS]
-    files += [REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "Makefile", "pyproject.toml")]
+    files = [
+        path
+        for folder in FOLDERS
+        for path in sorted((REPOSITORY / folder).rglob("*"))
+        if path.suffix in TEXTS
+    ]
+    files += [
+        REPOSITORY / name
+        for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "Makefile", "pyproject.toml")
+    ]
     occurrences = [
-        f"{name(path)}:{number}: {match.group()}: {REPLACED[match.group().lower().replace('_', ' ')]}"
+        f"{name(path)}:{number}: {match.group()}: "
+        f"{REPLACED[match.group().lower().replace('_', ' ')]}"
         for path in files
         if path != Path(__file__).resolve() and not {"corpus", "vendor"} & set(path.parts)
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of autopilots from elsewhere: decoded in an isolated process, in time and memory that follow from their size."""
+"""Logs of autopilots from elsewhere: decoded in an isolated process, in time and memory that follow
+from their size.
+"""
 
 import struct
 from pathlib import Path
@@ -25,15 +27,24 @@ def nested(count: int) -> bytes:
     """A ULog with `count` x `count` fields in a message: pyulog makes a name for each of them."""
     formats = (f"bomb:uint64_t timestamp;b[{count}] x;", f"b:float[{count}] y;")
     added = message("A", struct.pack("<BH", 0, 1) + b"bomb")
-    return HEAD + message("B", bytes(40)) + b"".join(message("F", text.encode()) for text in formats) + added
+    return (
+        HEAD
+        + message("B", bytes(40))
+        + b"".join(message("F", text.encode()) for text in formats)
+        + added
+    )
 
 
 @pytest.mark.parametrize("count", [256, 3000, 65535])
-def test_log_that_claims_more_values_than_a_message_holds_is_refused(count: int, tmp_path: Path) -> None:
+def test_log_that_claims_more_values_than_a_message_holds_is_refused(
+    count: int, tmp_path: Path
+) -> None:
     """65,535 bytes at most, the length of a message in 16 bits (PX4 guide, ULog file format)."""
     path = tmp_path / "nested.ulg"
     path.write_bytes(nested(count))
-    with pytest.raises(ParameterError, match=rf"cannot be decoded \(a message bomb of {count * count + 1} values\)"):
+    with pytest.raises(
+        ParameterError, match=rf"cannot be decoded \(a message bomb of {count * count + 1} values\)"
+    ):
         read_vehicle_log(path)
 
 
@@ -44,11 +55,16 @@ def test_log_of_long_messages_is_read(tmp_path: Path) -> None:
         read_vehicle_log(path)
 
 
-def test_decoding_without_end_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decoding_without_end_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "log.ulg"
     path.write_bytes(HEAD)
     monkeypatch.setattr(isolated, "WAIT", 0.0)
-    with pytest.raises(ParameterError, match=r"log\.ulg: found a ULog of PX4 whose decoding timed out after 0 s, expected"):
+    with pytest.raises(
+        ParameterError,
+        match=r"log\.ulg: found a ULog of PX4 whose decoding timed out after 0 s, expected",
+    ):
         read_foreign_log(path)
 
 
@@ -73,7 +89,10 @@ def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> No
     assert there.tables.keys() == here.tables.keys()
     for name, table in here.tables.items():
         assert np.array_equal(there.tables[name].stamp_ns, table.stamp_ns)
-        assert all(np.array_equal(there.tables[name].fields[field], values) for field, values in table.fields.items())
+        assert all(
+            np.array_equal(there.tables[name].fields[field], values)
+            for field, values in table.fields.items()
+        )
     assert there.source("theta") == here.source("theta")
 
 

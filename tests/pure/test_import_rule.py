@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may import whom: one table, held against the imports of every source file and against docs/architecture.md."""
+"""Who may import whom: one table, held against the imports of every source file and against
+docs/architecture.md.
+"""
 
 import ast
 import re
@@ -30,55 +32,72 @@ IMPORTS: dict[str, set[str]] = {
     "flight_recorder": {"flight_core", "flight_log"},
     "control_laws": {"flight_core", "rise_di_controller"},
     "flight_analysis.closed_loop": {
-        "aircraft_sim", "flight_core", "flight_guidance", "flight_log", "flight_recorder", "reference_model",
+        "aircraft_sim", "flight_core", "flight_guidance", "flight_log", "flight_recorder",
+        "reference_model",
         "rise_di_controller",
     },
     "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
     "flight_analysis.report": {
-        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_guidance",
+        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core",
+        "flight_guidance",
         "flight_log", "rise_di_controller",
     },
     "c_export": {"flight_analysis.closed_loop", "flight_core", "flight_log", "rise_di_controller"},
     "flight_design.gains": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core", "reference_model", "rise_di_controller",
+        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
+        "reference_model", "rise_di_controller",
     },
     "flight_design.identification": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop",
+        "flight_analysis.metrics",
         "flight_core", "flight_design.gains", "flight_log", "reference_model", "rise_di_controller",
     },
     "flight_design.learning": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core", "flight_design.gains",
+        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
+        "flight_design.gains",
         "flight_design.identification", "rise_di_controller",
     },
     "flight_campaign": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report",
-        "flight_core", "flight_design.gains", "flight_guidance", "reference_model", "rise_di_controller",
+        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
+        "flight_analysis.report",
+        "flight_core", "flight_design.gains", "flight_guidance", "reference_model",
+        "rise_di_controller",
     },
     "flight_bringup": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_guidance",
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core",
+        "flight_guidance",
         "flight_log", "rise_di_controller",
     },
     "flight_view": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core",
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics",
+        "flight_analysis.report", "flight_core",
         "flight_log", "flight_guidance", "rise_di_controller",
     },
     "rise_di": {
-        "aircraft_sim", "c_export", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report",
-        "flight_bringup", "flight_campaign", "flight_core", "flight_design.gains", "flight_design.learning", "flight_log",
+        "aircraft_sim", "c_export", "flight_analysis.closed_loop", "flight_analysis.metrics",
+        "flight_analysis.report",
+        "flight_bringup", "flight_campaign", "flight_core", "flight_design.gains",
+        "flight_design.learning", "flight_log",
         "reference_model", "rise_di_controller",
     },
     "flight_cli": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_design.gains",
-        "flight_design.identification", "flight_design.learning", "flight_guidance", "flight_log", "flight_view", "rise_di",
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop",
+        "flight_analysis.metrics",
+        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core",
+        "flight_design.gains",
+        "flight_design.identification", "flight_design.learning", "flight_guidance", "flight_log",
+        "flight_view", "rise_di",
         "rise_di_controller",
     },
 }  # fmt: skip
-"""Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""
+"""Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside
+these."""
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, wherever in the file; for `from a import b` both a and a.b."""
+    """Full names of all modules that a file imports, wherever in the file; for `from a import b`
+    both a and a.b.
+    """
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -128,17 +147,33 @@ def test_units_import_what_the_table_says() -> None:
     for path in FILES:
         if (unit := unit_of(module_of(path))) is None:
             continue
-        units = {other_unit for module in imported_modules(path) if (other_unit := unit_of(module)) is not None} - {unit}
+        units = {
+            other_unit
+            for module in imported_modules(path)
+            if (other_unit := unit_of(module)) is not None
+        } - {unit}
         ros = {"flight_ros"} if may_import_ros(path) else set()
-        wrong += [f"{path.relative_to(SOURCES)} imports {name}" for name in units - IMPORTS[unit] - ros]
+        wrong += [
+            f"{path.relative_to(SOURCES)} imports {name}" for name in units - IMPORTS[unit] - ros
+        ]
         unused[unit] -= units
-    wrong += [f"the table lets {unit} import {name}, which it does not" for unit, names in unused.items() for name in names]
+    wrong += [
+        f"the table lets {unit} import {name}, which it does not"
+        for unit, names in unused.items()
+        for name in names
+    ]
     assert not wrong, "\n".join(wrong)
 
 
 def test_every_source_file_belongs_to_unit_of_table() -> None:
-    packages = {"flight_analysis", "flight_design", "flight_design.main"}  # their units are their subpackages, and metrics
-    strays = [path for path in FILES if "launch" not in path.parts and unit_of(module_of(path)) is None]
+    packages = {
+        "flight_analysis",
+        "flight_design",
+        "flight_design.main",
+    }  # their units are their subpackages, and metrics
+    strays = [
+        path for path in FILES if "launch" not in path.parts and unit_of(module_of(path)) is None
+    ]
     assert {module_of(path).removesuffix(".__init__") for path in strays} <= packages
 
 
@@ -166,25 +201,62 @@ def modules_loaded_by(code: str) -> set[str]:
 
 
 def test_command_line_shows_help_without_loading_what_commands_need() -> None:
-    heavy = {"rclpy", "flight_ros", "numpy", "scipy", "pydantic", "jax", "plotly", "polars", "jsbsim", "rosbags"}
+    heavy = {
+        "rclpy",
+        "flight_ros",
+        "numpy",
+        "scipy",
+        "pydantic",
+        "jax",
+        "plotly",
+        "polars",
+        "jsbsim",
+        "rosbags",
+    }
     assert not modules_loaded_by("from flight_cli.cli import application\napplication([])") & heavy
 
 
-NODES = ["rise_di_controller", "reference_model", "flight_guidance", "autopilot_bridge", "flight_recorder", "aircraft_sim"]
+NODES = [
+    "rise_di_controller",
+    "reference_model",
+    "flight_guidance",
+    "autopilot_bridge",
+    "flight_recorder",
+    "aircraft_sim",
+]
 
 
 @pytest.mark.parametrize("node", NODES)
 def test_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
-    assert not modules_loaded_by(f"import {node}.node") & {"scipy", "jsbsim", "plotly", "jax", "rosbags"}
+    assert not modules_loaded_by(f"import {node}.node") & {
+        "scipy",
+        "jsbsim",
+        "plotly",
+        "jax",
+        "rosbags",
+    }
 
 
-@pytest.mark.parametrize("module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"])
+@pytest.mark.parametrize(
+    "module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"]
+)
 def test_flight_loads_no_library_of_report(module: str) -> None:
-    assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib", "ruamel"}
+    assert not modules_loaded_by(f"import {module}") & {
+        "scipy",
+        "plotly",
+        "jinja2",
+        "polars",
+        "matplotlib",
+        "ruamel",
+    }
 
 
 def test_private_names_of_rclpy_are_in_one_file() -> None:
-    files = [str(path.relative_to(SOURCES)) for path in FILES if path.name != "rclpy_private.py" and has_private_names(path)]
+    files = [
+        str(path.relative_to(SOURCES))
+        for path in FILES
+        if path.name != "rclpy_private.py" and has_private_names(path)
+    ]
     assert not files, "\n".join(files)
 
 
@@ -194,4 +266,7 @@ def has_private_names(path: Path) -> bool:
     nodes = list(ast.walk(ast.parse(text))) if "rclpy" in text else []
     modules = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     reads_handle = any(isinstance(node, ast.Attribute) and node.attr == "handle" for node in nodes)
-    return any(name.startswith("rclpy.impl") or (name.startswith("rclpy") and reads_handle) for name in modules)
+    return any(
+        name.startswith("rclpy.impl") or (name.startswith("rclpy") and reads_handle)
+        for name in modules
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The isolated process: what foreign code or a foreign file can reach from it, and what comes back."""
+"""The isolated process: what foreign code or a foreign file can reach from it, and what comes
+back.
+"""
 
 import ctypes
 import logging
@@ -47,14 +49,19 @@ def call(function: Any, *arguments: Any, **limits: Any) -> Any:
 @pytest.fixture(autouse=True)
 def of_this_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The subprocess finds this module."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv(
+        "PYTHONPATH",
+        os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]),
+    )
     notes.note.cache_clear()
     yield
     notes.note.cache_clear()
 
 
 def values() -> Found:
-    return Found({"a": np.array([1, 2, 3]), "b": np.array([0.5, np.nan])}, MappingProxyType({"x": 1}))
+    return Found(
+        {"a": np.array([1, 2, 3]), "b": np.array([0.5, np.nan])}, MappingProxyType({"x": 1})
+    )
 
 
 def test_arrays_and_named_tuples_come_back_bit_by_bit() -> None:
@@ -66,7 +73,9 @@ def test_arrays_and_named_tuples_come_back_bit_by_bit() -> None:
 
 
 def test_result_that_names_a_function_is_refused() -> None:
-    with pytest.raises(isolated.IsolatedCallError, match=r"^returned (posix|os)\.system, which is no plain value$"):
+    with pytest.raises(
+        isolated.IsolatedCallError, match=r"^returned (posix|os)\.system, which is no plain value$"
+    ):
         call(Evil)
 
 
@@ -75,7 +84,9 @@ def path() -> Path:
 
 
 def test_result_of_another_module_is_refused() -> None:
-    with pytest.raises(isolated.IsolatedCallError, match=r"^returned pathlib.*, which is no plain value$"):
+    with pytest.raises(
+        isolated.IsolatedCallError, match=r"^returned pathlib.*, which is no plain value$"
+    ):
         call(path)
 
 
@@ -107,7 +118,10 @@ def test_memory_is_limited() -> None:
 @cache
 def confines() -> bool:
     """Whether this kernel permits all of it, asked in a process that loses it."""
-    code = "from pathlib import Path; from flight_core.confinement import confine; raise SystemExit(len(confine(Path())))"
+    code = (
+        "from pathlib import Path; from flight_core.confinement import confine; raise "
+        "SystemExit(len(confine(Path())))"
+    )
     return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

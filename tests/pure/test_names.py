@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of channels, states and inputs: one grammar at every file, and an escape in every text of another language."""
+"""Names of channels, states and inputs: one grammar at every file, and an escape in every text of
+another language.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,12 +27,23 @@ from rise_di import new_airframe
 
 FREE = {"conditions", "messages", "overrides", "topics", "fence", "link", "values"}
 """Sections of a map and of guidance whose keys name no channel."""
-NAME_KEYS = {"states", "inputs", "outputs", "output_units", "sensors", "effectors", "priority", "channels"}
+NAME_KEYS = {
+    "states",
+    "inputs",
+    "outputs",
+    "output_units",
+    "sensors",
+    "effectors",
+    "priority",
+    "channels",
+}
 HOSTILE = ("q*/", 'q"', "q\\", "??/", "<q>", "q: 1", "q\n", "1q", "", "q,p", "naïve", "../q")
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths of the names of channels, states and inputs in a file: entries of a list, and keys of a mapping."""
+    """The paths of the names of channels, states and inputs in a file: entries of a list, and keys
+    of a mapping.
+    """
     if not isinstance(tree, dict):
         return []
     found = []
@@ -53,13 +66,22 @@ def renamed(tree: Any, path: tuple[Any, ...], name: str) -> Any:
 
 
 def sections(path: Path) -> list[tuple[type[Config], dict[str, Any]]]:
-    tree = {key.removeprefix("/**/"): value["ros__parameters"] for key, value in yaml.safe_load(path.read_text()).items()}
+    tree = {
+        key.removeprefix("/**/"): value["ros__parameters"]
+        for key, value in yaml.safe_load(path.read_text()).items()
+    }
     return [(SCHEMAS[name], values) for name, values in tree.items()]
 
 
 FILES = [
-    *((Airframe, yaml.safe_load(path.read_text(encoding="utf-8"))) for path in sorted(AIRFRAMES.glob("*.yaml"))),
-    *((ChannelMap, yaml.safe_load(path.read_text(encoding="utf-8"))) for path in MAP_FILES.values()),
+    *(
+        (Airframe, yaml.safe_load(path.read_text(encoding="utf-8")))
+        for path in sorted(AIRFRAMES.glob("*.yaml"))
+    ),
+    *(
+        (ChannelMap, yaml.safe_load(path.read_text(encoding="utf-8")))
+        for path in MAP_FILES.values()
+    ),
     *(section for path in sorted(SCENARIOS.glob("*.yaml")) for section in sections(path)),
 ]
 DOORS = {
@@ -68,13 +90,25 @@ DOORS = {
     for path in places(values)
     if schema is not AircraftConfig
 }
-"""A name of each place that has names: the last one of the files. The names in `aircraft` are compared with the airframe's."""
+"""A name of each place that has names: the last one of the files. The names in `aircraft` are
+compared with the airframe's."""
 
 
 def test_the_places_are_those_of_channels_states_and_inputs() -> None:
     listed = {".".join(place) for place in DOORS}
-    assert {"Airframe.states", "Airframe.inputs", "Airframe.outputs", "ChannelMap.inputs", "ChannelMap.outputs"} <= listed
-    assert {"AnyLaw.outputs", "AnyLaw.inputs", "AnyLaw.feedforward.states", "AnyLaw.observer.states"} <= listed
+    assert {
+        "Airframe.states",
+        "Airframe.inputs",
+        "Airframe.outputs",
+        "ChannelMap.inputs",
+        "ChannelMap.outputs",
+    } <= listed
+    assert {
+        "AnyLaw.outputs",
+        "AnyLaw.inputs",
+        "AnyLaw.feedforward.states",
+        "AnyLaw.observer.states",
+    } <= listed
     assert {"ReferenceModelConfig.outputs", "AnyLaw.allocation.effectors"} <= listed
 
 
@@ -84,23 +118,42 @@ def test_name_outside_of_the_grammar_is_refused_at_each_place(
     door: tuple[type[Config], dict[str, Any], tuple[Any, ...]], name: str
 ) -> None:
     schema, values, path = door
-    with pytest.raises(ParameterError, match=r"expected (a string that matches \[A-Za-z\]|printable characters)"):
+    with pytest.raises(
+        ParameterError, match=r"expected (a string that matches \[A-Za-z\]|printable characters)"
+    ):
         schema.validate_mapping(renamed(values, path, name), "set")
 
 
 def test_every_file_of_the_repository_has_names_of_the_grammar() -> None:
     """With the examples, whose files other tests read."""
-    files = [path for path in sorted((REPOSITORY / "examples").rglob("*.yaml")) if path not in MAP_FILES.values()]
-    names = {path[-1] for file in files for path in places(yaml.safe_load(file.read_text(encoding="utf-8")))}
-    assert all(name.replace("_", "").replace(".", "").isalnum() and name[0].isalpha() for name in names)
+    files = [
+        path
+        for path in sorted((REPOSITORY / "examples").rglob("*.yaml"))
+        if path not in MAP_FILES.values()
+    ]
+    names = {
+        path[-1]
+        for file in files
+        for path in places(yaml.safe_load(file.read_text(encoding="utf-8")))
+    }
+    assert all(
+        name.replace("_", "").replace(".", "").isalnum() and name[0].isalpha() for name in names
+    )
 
 
 @pytest.mark.parametrize("name", ["../osprey", "a/b", "/x"])
 def test_airframe_whose_name_leaves_the_folder_is_refused(name: str, tmp_path: Path) -> None:
     """NAME.yaml is written into the folder that the user gives."""
     source = tmp_path / "source.yaml"
-    source.write_text(dump_yaml(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")) | {"name": name}))
-    with pytest.raises(ParameterError, match=r"^name: found .*, expected the name of a file in the folder, without a /$"):
+    source.write_text(
+        dump_yaml(
+            yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")) | {"name": name}
+        )
+    )
+    with pytest.raises(
+        ParameterError,
+        match=r"^name: found .*, expected the name of a file in the folder, without a /$",
+    ):
         new_airframe(source, folder=tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["source.yaml"]
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own and in python-control, and the aircraft as an environment of gymnasium."""
+"""The controller in a loop of the user's own and in python-control, and the aircraft as an
+environment of gymnasium.
+"""
 
 from typing import Any
 
@@ -61,7 +63,11 @@ def test_lost_samples_start_failsafe() -> None:
 @pytest.mark.parametrize(
     ("t", "y", "sentence"),
     [
-        (1.0, [0.0, 0.0, np.nan, 0.0], "y: found [0.0, 0.0, nan, 0.0], expected 4 finite numbers: q, p, r, V"),
+        (
+            1.0,
+            [0.0, 0.0, np.nan, 0.0],
+            "y: found [0.0, 0.0, nan, 0.0], expected 4 finite numbers: q, p, r, V",
+        ),
         (0.0, np.zeros(4), "t: found 0 s, expected more than 0.5 s, the t of the last tick"),
     ],
 )
@@ -97,13 +103,21 @@ PARTS: dict[str, Any] = {
 
 
 def test_scenario_of_parts_flies_as_its_file(flown: Tape) -> None:
-    assert np.array_equal(rise_di.simulate(rise_di.Scenario.from_parts("own", **PARTS))["u"].values, flown["u"].values)
+    assert np.array_equal(
+        rise_di.simulate(rise_di.Scenario.from_parts("own", **PARTS))["u"].values, flown["u"].values
+    )
 
 
 @pytest.mark.parametrize(
     ("parts", "sentence"),
     [
-        ({}, "own: found no section flight, aircraft, reference_model, controller, expected the sections flight"),
+        (
+            {},
+            (
+                "own: found no section flight, aircraft, reference_model, controller, expected the "
+                "sections flight"
+            ),
+        ),
         (PARTS | {"controller": {"rate": 100.0}}, "controller."),
     ],
 )
@@ -118,9 +132,13 @@ def test_wrong_parts_are_refused(parts: dict[str, Any], sentence: str) -> None:
 def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     law = rise_di.as_control(CONTROLLER)
     y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
-    v = np.concatenate([y - y[0], y_m], axis=1).T  # from trim: the engagement of x = 0 has y = y_m = 0
+    v = np.concatenate(
+        [y - y[0], y_m], axis=1
+    ).T  # from trim: the engagement of x = 0 has y = y_m = 0
     loop = rise_di.Loop(CONTROLLER)
-    u = np.array([loop.step(t, *np.split(row, 2)) for t, row in zip(flown.time("u"), v.T, strict=True)])
+    u = np.array(
+        [loop.step(t, *np.split(row, 2)) for t, row in zip(flown.time("u"), v.T, strict=True)]
+    )
     response = control.input_output_response(law, np.arange(v.shape[1]) / CONTROLLER.rate, v)
     # stamps in ns against t = k T: dt of the law differs in the last bits
     np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
@@ -163,17 +181,28 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(Simulator, "sample", diverge)
     _, reward, terminated, truncated, info = env.step(u)
     assert (terminated, truncated, info) == (True, False, {"outcome": "diverged at t = 0.02 s"})
-    assert reward == pytest.approx(-10.0 * (3.0 - 0.01))  # the score of a loss of track for the seconds from the last tick on
+    assert reward == pytest.approx(
+        -10.0 * (3.0 - 0.01)
+    )  # the score of a loss of track for the seconds from the last tick on
     with pytest.raises(rise_di.ParameterError, match="expected reset"):
         env.step(u)
 
 
 def test_environments_draw_entries_of_scenario() -> None:
-    """An entry at one of its limits: after the same thrust, V is that of 10 % or of 190 % of the effect."""
-    own = SCENARIO.vary(aircraft={"uncertainty": {"entries": ["B[V,thrust]"], "parts": [0.9], "distribution": "corners"}})
+    """An entry at one of its limits: after the same thrust, V is that of 10 % or of 190 % of the
+    effect.
+    """
+    own = SCENARIO.vary(
+        aircraft={
+            "uncertainty": {"entries": ["B[V,thrust]"], "parts": [0.9], "distribution": "corners"}
+        }
+    )
     calm = own.vary(aircraft={"sensors": {}})
     u, place = 0.1 * np.eye(M)[CONTROLLER.inputs.index("thrust")], CONTROLLER.outputs.index("V")
-    flights, alone = rise_di.FlightVectorEnv(calm, 8, uncertainty=0.0), rise_di.FlightEnv(calm, uncertainty=0.0)
+    flights, alone = (
+        rise_di.FlightVectorEnv(calm, 8, uncertainty=0.0),
+        rise_di.FlightEnv(calm, uncertainty=0.0),
+    )
     flights.reset(seed=1)
     together = [flights.step(np.tile(u, (8, 1)))[0] for _ in range(50)][-1][:, place]
     one_by_one = []
@@ -186,14 +215,21 @@ def test_environments_draw_entries_of_scenario() -> None:
 
 
 def test_vector_environment_flies_as_environments_one_by_one() -> None:
-    """The fleet's linear steps against the simulator's integration: their difference is that of the campaign's figures."""
-    flights, alone = rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0), rise_di.FlightEnv(SCENARIO)
+    """The fleet's linear steps against the simulator's integration: their difference is that of the
+    campaign's figures.
+    """
+    flights, alone = (
+        rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0),
+        rise_di.FlightEnv(SCENARIO),
+    )
     observed, _ = flights.reset(seed=1)
     expected, _ = alone.reset(seed=1)
     assert flights.observation_space.contains(observed)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        assert observed == pytest.approx(np.tile(expected, (3, 1)), abs=1e-6)  # rad/s and m/s; y is of the order of 1e-2
+        assert observed == pytest.approx(
+            np.tile(expected, (3, 1)), abs=1e-6
+        )  # rad/s and m/s; y is of the order of 1e-2
         u = 0.01 * generator.standard_normal(M)
         observed, rewards, terminated, truncated, _ = flights.step(np.tile(u, (3, 1)))
         expected, reward, *_ = alone.step(u)
@@ -204,10 +240,16 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
 
 
 def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() -> None:
-    flights = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_gust", 3.0), 2)  # without end stops
+    flights = rise_di.FlightVectorEnv(
+        rise_di.find_scenario("osprey_gust", 3.0), 2
+    )  # without end stops
     first, _ = flights.reset(seed=3)
     u, terminations, still = np.zeros((2, M)), 0, None
-    u[1] = 1e9  # far beyond the limits of the law, so that the second aircraft leaves every bound within some steps
+    u[1] = (
+        # far beyond the limits of the law, so that the second aircraft leaves every bound within
+        # some steps
+        1e9
+    )
     for k in range(1, round(3.0 * CONTROLLER.rate) + 1):
         observed, rewards, terminated, truncated, _ = flights.step(u)
         if still is not None:

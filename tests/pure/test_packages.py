@@ -31,7 +31,9 @@ TEST_DEPENDENCIES = {"python3-hypothesis", "python3-pytest", "python3-pytest-tim
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
 PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "rich", "scipy", "tornado", "typer", "yaml")
-KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}  # which depends on it
+KEYS = {name: f"python3-{name}" for name in PYTHON3} | {
+    "markupsafe": "python3-jinja2"
+}  # which depends on it
 # Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",
@@ -74,11 +76,16 @@ def disagreements(package: Path) -> list[str]:
         "name": root.findtext("name") == name,
         "licence": root.findtext("license") == "Apache-2.0",
         "build type": root.findtext("export/build_type") == "ament_python",
-        "version from package.xml": 'version=ElementTree.parse("package.xml").findtext("version")' in setup,
-        "extra test, by which colcon test chooses pytest": 'extras_require={"test": ["pytest"]}' in setup,
-        "test dependencies": {node.text for node in root.findall("test_depend")} == TEST_DEPENDENCIES,
-        # colcon builds a package with an e-mail it cannot parse as plain Python, with a warning only
-        "e-mail": email is not None and re.fullmatch(r"[\w.-]+@[\w-]+(\.[\w-]+)+", email.attrib["email"]) is not None,
+        "version from package.xml": 'version=ElementTree.parse("package.xml").findtext("version")'
+        in setup,
+        "extra test, by which colcon test chooses pytest": 'extras_require={"test": ["pytest"]}'
+        in setup,
+        "test dependencies": {node.text for node in root.findall("test_depend")}
+        == TEST_DEPENDENCIES,
+        # colcon builds a package with an e-mail it cannot parse as plain Python, with a warning
+        # only
+        "e-mail": email is not None
+        and re.fullmatch(r"[\w.-]+@[\w-]+(\.[\w-]+)+", email.attrib["email"]) is not None,
         "scripts where ros2 run looks": config["install"]["install_scripts"] == f"$base/lib/{name}",
         "resource": (package / "resource" / name).is_file(),
         "types for users (PEP 561)": (package / name / "py.typed").is_file(),
@@ -95,7 +102,12 @@ def undeclared(package: Path) -> set[str]:
     root = ElementTree.parse(package / "package.xml").getroot()
     declared = {node.text for node in root.findall("exec_depend")}
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
-    external = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
+    external = (
+        set().union(*map(imported, sources))
+        - sys.stdlib_module_names
+        - {package.name}
+        - WITHOUT_KEY
+    )
     return {KEYS.get(name, name) for name in external} - declared
 
 
@@ -112,8 +124,14 @@ def test_packages_citation_and_changelog_have_one_version() -> None:
     root = SOURCES.parents[1]
     files = [*PACKAGES, root / "examples" / "pid_law"]
     versions = {ElementTree.parse(package / "package.xml").findtext("version") for package in files}
-    cited = re.search(r"^version: (.+)$", (root / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
-    newest = re.search(r"^## (\d\S*) - \d{4}-\d\d-\d\d$", (root / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    cited = re.search(
+        r"^version: (.+)$", (root / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    newest = re.search(
+        r"^## (\d\S*) - \d{4}-\d\d-\d\d$",
+        (root / "CHANGELOG.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
     assert cited is not None
     assert newest is not None
     assert versions == {cited[1]} == {newest[1]}
@@ -121,16 +139,22 @@ def test_packages_citation_and_changelog_have_one_version() -> None:
 
 def test_each_folder_of_tests_is_of_a_package() -> None:
     levels = [TESTS / level for level in ("pure", "nodes", "ros")]
-    folders = {path.name for level in levels for path in level.iterdir() if any(path.rglob("test_*.py"))}
+    folders = {
+        path.name for level in levels for path in level.iterdir() if any(path.rglob("test_*.py"))
+    }
     assert folders == {package.name for package in PACKAGES}
 
 
 def test_pytest_runs_the_tests_of_a_package() -> None:
     """In its folder, with the arguments of `colcon test`."""
     command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
-    done = subprocess.run(command, cwd=SOURCES / "flight_core", capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=SOURCES / "flight_core", capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout
-    assert set(re.findall(r"test_\w+\.py", done.stdout)) == {path.name for path in files_of("flight_core")}
+    assert set(re.findall(r"test_\w+\.py", done.stdout)) == {
+        path.name for path in files_of("flight_core")
+    }
 
 
 def test_page_on_ros_names_what_rosdep_cannot_install() -> None:
@@ -143,11 +167,19 @@ def test_packages_install_their_data_files() -> None:
 
 
 def uninstalled_data(package: Path) -> set[Path]:
-    """Data files that setup.py does not name; a symlinked build has all files of the package folder."""
+    """Data files that setup.py does not name; a symlinked build has all files of the package
+    folder.
+    """
     setup = (package / "setup.py").read_text(encoding="utf-8")
-    named = {pattern for data in re.findall(r"package_data=\{[^}]*\}", setup) for pattern in re.findall(r'"([^"]+)"', data)}
+    named = {
+        pattern
+        for data in re.findall(r"package_data=\{[^}]*\}", setup)
+        for pattern in re.findall(r'"([^"]+)"', data)
+    }
     code = package / package.name
-    data = {path for path in code.rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}}
+    data = {
+        path for path in code.rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}
+    }
     return data - {path for pattern in named for path in code.glob(pattern)}
 
 
@@ -157,17 +189,31 @@ def test_packages_are_installed_with_their_index_entry() -> None:
 
 def missing_entries(package: Path) -> list[Path]:
     share = INSTALLED / package.name / "share"
-    entries = [share / "ament_index" / "resource_index" / "packages" / package.name, share / package.name / "package.xml"]
+    entries = [
+        share / "ament_index" / "resource_index" / "packages" / package.name,
+        share / package.name / "package.xml",
+    ]
     return [path for path in entries if not path.exists()]
 
 
 def test_executables_are_where_ros2_run_looks() -> None:
-    paths = [INSTALLED / package / "lib" / package / executable for package, executable in EXECUTABLES.items()]
+    paths = [
+        INSTALLED / package / "lib" / package / executable
+        for package, executable in EXECUTABLES.items()
+    ]
     assert [path for path in paths if not os.access(path, os.X_OK)] == []
 
 
 def test_every_source_file_states_its_licence() -> None:
     root = SOURCES.parents[1]
-    files = [*SOURCES.rglob("*.py"), *(root / "tests").rglob("*.py"), *(root / "benchmarks").rglob("*.py")]
-    unmarked = [path for path in files if "SPDX-License-Identifier: Apache-2.0" not in path.read_text(encoding="utf-8")[:200]]
+    files = [
+        *SOURCES.rglob("*.py"),
+        *(root / "tests").rglob("*.py"),
+        *(root / "benchmarks").rglob("*.py"),
+    ]
+    unmarked = [
+        path
+        for path in files
+        if "SPDX-License-Identifier: Apache-2.0" not in path.read_text(encoding="utf-8")[:200]
+    ]
     assert not unmarked

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the project takes from others: locked packages without an advisory, and releases that no package can change."""
+"""What the project takes from others: locked packages without an advisory, and releases that no
+package can change.
+"""
 
 import re
 from pathlib import Path
@@ -12,15 +14,26 @@ from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
-ADVISORIES: list[dict[str, str]] = yaml.safe_load((ROOT / ".ci/advisories.yaml").read_text(encoding="utf-8"))
+ADVISORIES: list[dict[str, str]] = yaml.safe_load(
+    (ROOT / ".ci/advisories.yaml").read_text(encoding="utf-8")
+)
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
-LOCKED = re.findall(r"^([a-z0-9][a-z0-9._-]*)==(\S+)", (ROOT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE)
+LOCKED = re.findall(
+    r"^([a-z0-9][a-z0-9._-]*)==(\S+)",
+    (ROOT / "requirements.lock").read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
 
 
 def affected(row: dict[str, str]) -> bool:
     """Whether a locked version is in one of the ranges, which "|" separates."""
     ranges = [SpecifierSet(text) for text in row["affected"].split("|")]
-    return any(Version(version) in versions for name, version in LOCKED if name == row["package"] for versions in ranges)
+    return any(
+        Version(version) in versions
+        for name, version in LOCKED
+        if name == row["package"]
+        for versions in ranges
+    )
 
 
 @pytest.mark.parametrize("row", ADVISORIES, ids=[row["name"] for row in ADVISORIES])
@@ -36,18 +49,27 @@ def test_workflow_is_of_fixed_commits_and_least_permissions(path: Path) -> None:
     workflow: dict[str, Any] = yaml.safe_load(text)
     assert workflow["permissions"] == {"contents": "read"}
     for action in re.findall(r"uses: (?!\./)(.*)", text):
-        # a tag can be moved to other code; the version beside the commit is for the reader and for updates
+        # a tag can be moved to other code; the version beside the commit is for the reader and for
+        # updates
         assert re.fullmatch(r"[\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action
 
 
 JOBS = [
-    (f"{path.stem}.{name}", job, job.get("permissions", yaml.safe_load(path.read_text(encoding="utf-8"))["permissions"]))
+    (
+        f"{path.stem}.{name}",
+        job,
+        job.get("permissions", yaml.safe_load(path.read_text(encoding="utf-8"))["permissions"]),
+    )
     for path in WORKFLOWS
     for name, job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].items()
 ]
 WITH_RIGHTS = [(name, job) for name, job, rights in JOBS if "write" in rights.values()]
-RELEASE: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8"))["jobs"]
-PROGRAM = re.compile(r"\.ci/|\b(pip|pipx|uv|uvx|npm|npx|yarn|conda|apt|apt-get|curl|wget|make|python[\d.]*|node|docker|git)\b")
+RELEASE: dict[str, Any] = yaml.safe_load(
+    (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
+)["jobs"]
+PROGRAM = re.compile(
+    r"\.ci/|\b(pip|pipx|uv|uvx|npm|npx|yarn|conda|apt|apt-get|curl|wget|make|python[\d.]*|node|docker|git)\b"
+)
 INSTALL = re.compile(r"pip\S* install\b[^\n]*(?:\\\n[^\n]*)*")
 UNLOCKED = {".ci/wheel": 2}
 """Installations of what PyPI has today, as a user gets it, by script."""
@@ -59,7 +81,9 @@ def test_one_job_has_rights() -> None:
 
 @pytest.mark.parametrize(("name", "job"), WITH_RIGHTS)
 def test_job_with_rights_runs_no_program_of_others(name: str, job: dict[str, Any]) -> None:
-    """A package that runs there could change what is published, or publish in the name of the project."""
+    """A package that runs there could change what is published, or publish in the name of the
+    project.
+    """
     steps = job["steps"]
     actions = {step["uses"].partition("@")[0] for step in steps if "uses" in step}
     assert actions == {"actions/download-artifact", "pypa/gh-action-pypi-publish"}
@@ -69,7 +93,11 @@ def test_job_with_rights_runs_no_program_of_others(name: str, job: dict[str, Any
 def test_what_is_published_has_the_checksums_of_the_build() -> None:
     steps = RELEASE["publish"]["steps"]
     check = next(k for k, step in enumerate(steps) if "sha256sum --check" in step.get("run", ""))
-    publishing = [k for k, step in enumerate(steps) if "gh release" in step.get("run", "") or "publish" in step.get("uses", "")]
+    publishing = [
+        k
+        for k, step in enumerate(steps)
+        if "gh release" in step.get("run", "") or "publish" in step.get("uses", "")
+    ]
     assert check < min(publishing)
     assert steps[check]["env"] == {"SUMS": "${{ needs.build.outputs.sums }}"}
     assert set(RELEASE["publish"]["needs"]) == RELEASE.keys() - {"publish"}
@@ -77,13 +105,23 @@ def test_what_is_published_has_the_checksums_of_the_build() -> None:
 
 def test_build_of_a_release_runs_one_script() -> None:
     """Of which the next test holds the installations."""
-    assert next(step["run"] for step in RELEASE["build"]["steps"] if "run" in step) == '.ci/release "$GITHUB_REF_NAME"'
-    uploads = [k for k, step in enumerate(RELEASE["build"]["steps"]) if "upload-artifact" in step.get("uses", "")]
+    assert (
+        next(step["run"] for step in RELEASE["build"]["steps"] if "run" in step)
+        == '.ci/release "$GITHUB_REF_NAME"'
+    )
+    uploads = [
+        k
+        for k, step in enumerate(RELEASE["build"]["steps"])
+        if "upload-artifact" in step.get("uses", "")
+    ]
     assert uploads == [len(RELEASE["build"]["steps"]) - 1]
     assert ".ci/wheel" not in re.sub(r"#.*", "", (ROOT / ".ci/release").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("path", ["Makefile", *(f".ci/{p.name}" for p in sorted((ROOT / ".ci").iterdir()) if not p.suffix)])
+@pytest.mark.parametrize(
+    "path",
+    ["Makefile", *(f".ci/{p.name}" for p in sorted((ROOT / ".ci").iterdir()) if not p.suffix)],
+)
 def test_installation_is_of_locked_hashes(path: str) -> None:
     text = (ROOT / path).read_text(encoding="utf-8")
     unlocked = [
@@ -97,11 +135,15 @@ def test_installation_is_of_locked_hashes(path: str) -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / ".ci").glob("*.txt")), ids=lambda path: path.stem)
 def test_list_of_a_script_has_a_hash_for_each_version(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    rows = re.findall(r"^[\w.-]+==\S+(?: ;[^\n\\]*)?(?: \\\n    --hash=sha256:[0-9a-f]{64})+", text, re.MULTILINE)
+    rows = re.findall(
+        r"^[\w.-]+==\S+(?: ;[^\n\\]*)?(?: \\\n    --hash=sha256:[0-9a-f]{64})+", text, re.MULTILINE
+    )
     assert len(rows) == len(re.findall(r"^\w", text, re.MULTILINE)) > 0
 
 
 def test_uv_is_that_of_the_makefile() -> None:
-    version = re.search(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    version = re.search(
+        r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert version is not None
     assert f"uv=={version[1]} " in (ROOT / ".ci/uv.txt").read_text(encoding="utf-8")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""docs/symbols.md against code and tests: each equation has a test, and a docstring that names it; each name exists."""
+"""docs/symbols.md against code and tests: each equation has a test, and a docstring that names it;
+each name exists.
+"""
 
 import ast
 import importlib
@@ -42,12 +44,18 @@ def numbers(text: str) -> set[int]:
 
 
 def resolve(name: str) -> Any:
-    """The object of a name that begins with a module of the packages. A field without a default is its annotation."""
+    """The object of a name that begins with a module of the packages. A field without a default is
+    its annotation.
+    """
     module, *parts = name.split(".")
     (path,) = SOURCES.glob(f"*/*/**/{module}.py")
-    value: Any = importlib.import_module(".".join(path.relative_to(SOURCES).with_suffix("").parts[1:]))
+    value: Any = importlib.import_module(
+        ".".join(path.relative_to(SOURCES).with_suffix("").parts[1:])
+    )
     for part in parts:
-        value = getattr(value, part) if hasattr(value, part) else inspect.get_annotations(value)[part]
+        value = (
+            getattr(value, part) if hasattr(value, part) else inspect.get_annotations(value)[part]
+        )
     return value
 
 
@@ -64,7 +72,9 @@ def test_the_page_names_every_equation() -> None:
     steps = re.search(r"^The others, (.*), are steps of the proofs", PAGE, re.MULTILINE)
     assert steps is not None
     assert numbers(steps[1]).isdisjoint(marked())
-    assert numbers(steps[1]).union(*(numbers(head) for head, *_ in rows(PAGE, "equation"))) == set(range(1, LAST_EQUATION + 1))
+    assert numbers(steps[1]).union(*(numbers(head) for head, *_ in rows(PAGE, "equation"))) == set(
+        range(1, LAST_EQUATION + 1)
+    )
 
 
 def test_each_equation_has_a_test() -> None:
@@ -118,11 +128,24 @@ def test_names_on_the_page_exist(channels: Mapping[str, Sequence[str]]) -> None:
         except (ValueError, AttributeError, KeyError):
             return False
 
-    cells = [cell for heading in ("equation", "symbol") for row in rows(PAGE, heading) for cell in row[2:]]
+    cells = [
+        cell
+        for heading in ("equation", "symbol")
+        for row in rows(PAGE, heading)
+        for cell in row[2:]
+    ]
     assert [name for cell in cells for name in spans(cell) if not exists(name)] == []
 
 
 @pytest.mark.parametrize("topic", ["internals", "truth"])
-def test_interfaces_explains_each_published_channel(topic: str, channels: Mapping[str, Sequence[str]]) -> None:
-    patterns = [pattern for head, _ in rows(INTERFACES, f"channels of `{topic}`") for pattern in spans(head)]
-    assert [name for name in channels[topic] if not any(fnmatchcase(name, pattern) for pattern in patterns)] == []
+def test_interfaces_explains_each_published_channel(
+    topic: str, channels: Mapping[str, Sequence[str]]
+) -> None:
+    patterns = [
+        pattern for head, _ in rows(INTERFACES, f"channels of `{topic}`") for pattern in spans(head)
+    ]
+    assert [
+        name
+        for name in channels[topic]
+        if not any(fnmatchcase(name, pattern) for pattern in patterns)
+    ] == []

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the tests over DDS wait: by tests/ros/waiting.py alone, never for a time, and for each message that they read."""
+"""How the tests over DDS wait: by tests/ros/waiting.py alone, never for a time, and for each
+message that they read.
+"""
 
 import ast
 from collections.abc import Iterator
@@ -9,15 +11,34 @@ from pathlib import Path
 import pytest
 
 ROS = Path(__file__).resolve().parents[1] / "ros"
-PROGRAMS = {"autopilot.py", "mavlink_autopilot.py", "relay.py", "attacker.py", "stopwatch.py", "foreign.py"}
+PROGRAMS = {
+    "autopilot.py",
+    "mavlink_autopilot.py",
+    "relay.py",
+    "attacker.py",
+    "stopwatch.py",
+    "foreign.py",
+}
 HELPERS = PROGRAMS | {"waiting.py", "test_lockstep_faults.py"}
-"""The helper; programs that the tests start, whose time is that of what they simulate; faults at random instants."""
+"""The helper; programs that the tests start, whose time is that of what they simulate; faults at
+random instants."""
 
 
 def appended(tree: ast.AST) -> set[str]:
-    """The names of the lists to which a subscription appends: `create_subscription(..., NAME.append, ...)`."""
-    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and name_of(node.func) == "create_subscription")
-    methods = (word for call in calls for word in call.args if isinstance(word, ast.Attribute) and word.attr == "append")
+    """The names of the lists to which a subscription appends: `create_subscription(...,
+    NAME.append, ...)`.
+    """
+    calls = (
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and name_of(node.func) == "create_subscription"
+    )
+    methods = (
+        word
+        for call in calls
+        for word in call.args
+        if isinstance(word, ast.Attribute) and word.attr == "append"
+    )
     return {name_of(method.value) for method in methods}
 
 
@@ -25,14 +46,28 @@ def name_of(node: ast.AST) -> str:
     """The last name of an expression; of `a.b["c"]` it is b."""
     if isinstance(node, ast.Subscript):
         return name_of(node.value)
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+    return (
+        node.attr
+        if isinstance(node, ast.Attribute)
+        else node.id
+        if isinstance(node, ast.Name)
+        else ""
+    )
 
 
 def aliases(tree: ast.AST) -> set[str]:
     """The names of the lists of a peer: `NAME = peer.received["y"]`."""
     assigned = (node for node in ast.walk(tree) if isinstance(node, ast.Assign))
-    pairs = (pair for node in assigned for pair in zip(targets(node.targets[0]), targets(node.value), strict=False))
-    return {name_of(target) for target, value in pairs if isinstance(value, ast.Subscript) and name_of(value) == "received"}
+    pairs = (
+        pair
+        for node in assigned
+        for pair in zip(targets(node.targets[0]), targets(node.value), strict=False)
+    )
+    return {
+        name_of(target)
+        for target, value in pairs
+        if isinstance(value, ast.Subscript) and name_of(value) == "received"
+    }
 
 
 def targets(node: ast.expr) -> list[ast.expr]:
@@ -47,14 +82,19 @@ def is_end(node: ast.expr) -> bool:
 
 
 def faults(source: str) -> Iterator[str]:
-    """Each wait for a time, and each index into a list that a message must have filled, with its line."""
+    """Each wait for a time, and each index into a list that a message must have filled, with its
+    line.
+    """
     tree = ast.parse(source)
     lists = appended(tree) | aliases(tree) | {"received"}
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and name_of(node.func) in {"sleep", "spin"}:
             yield f"{node.lineno}: waits for a time, expected until(condition, because)"
         if isinstance(node, ast.Subscript) and is_end(node.slice) and name_of(node.value) in lists:
-            yield f"{node.lineno}: index into {ast.unparse(node.value)}, expected what until() returned, or last()"
+            yield (
+                f"{node.lineno}: index into {ast.unparse(node.value)}, expected what until() "
+                "returned, or last()"
+            )
 
 
 @pytest.mark.parametrize(
@@ -78,5 +118,9 @@ def test_patterns_are_found(source: str, found: int) -> None:
 
 def test_tests_over_topics_wait_for_conditions() -> None:
     files = [path for path in sorted(ROS.rglob("*.py")) if path.name not in HELPERS]
-    lines = [f"{path.relative_to(ROS)}:{fault}" for path in files for fault in faults(path.read_text(encoding="utf-8"))]
+    lines = [
+        f"{path.relative_to(ROS)}:{fault}"
+        for path in files
+        for fault in faults(path.read_text(encoding="utf-8"))
+    ]
     assert not lines, "\n".join(lines)

@@ -1,14 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's DDS interface, as a process: python -m tests.ros.autopilot SCENARIO RELEASE_AFTER.
+"""A simulated autopilot with ArduPilot's DDS interface, as a process: python -m tests.ros.autopilot
+SCENARIO RELEASE_AFTER.
 
-It simulates the aircraft section of the scenario at its rate and publishes y as AP_DDS does (ENU and FLU, best effort, depth
-five). It subscribes to Joy as AP_DDS does: axes are scaled to full deflection, NaN releases a channel at once, and all channels
-are released after RELEASE_AFTER seconds without Joy. A released channel is at trim. It imports nothing from the bridge. It
-prints "y STAMP q V p r" without noise, and "timeout" when the channels are released without Joy.
+It simulates the aircraft section of the scenario at its rate and publishes y as AP_DDS does (ENU
+and FLU, best effort, depth five). It subscribes to Joy as AP_DDS does: axes are scaled to full
+deflection, NaN releases a channel at once, and all channels are released after RELEASE_AFTER
+seconds without Joy. A released channel is at trim. It imports nothing from the bridge. It prints "y
+STAMP q V p r" without noise, and "timeout" when the channels are released without Joy.
 
-With a third word `odometry` it is a simulator for the map of that name: Imu and Odometry in the frames of REP 103, and the last
-Float64 of each effector.
+With a third word `odometry` it is a simulator for the map of that name: Imu and Odometry in the
+frames of REP 103, and the last Float64 of each effector.
 """
 
 import math
@@ -44,7 +46,11 @@ class Autopilot:
     """The simulated aircraft, its publishers and its subscription."""
 
     def __init__(
-        self, scenario: Path, release_after: float, node: Any, monotonic: Callable[[], float] = time.monotonic
+        self,
+        scenario: Path,
+        release_after: float,
+        node: Any,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._simulator = Simulator(load_scenario(scenario).aircraft)
         self._release_after, self._monotonic = release_after, monotonic
@@ -57,11 +63,19 @@ class Autopilot:
 
     def _on_joy(self, message: Joy) -> None:
         if len(message.axes) >= 4:  # messages with fewer axes are ignored
-            self._axes, self._received = [float(axis) for axis in message.axes[:4]], self._monotonic()
+            self._axes, self._received = (
+                [float(axis) for axis in message.axes[:4]],
+                self._monotonic(),
+            )
 
     def _u(self) -> list[float]:
-        """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust; half throttle is trim."""
-        if any(math.isfinite(axis) for axis in self._axes) and self._monotonic() - self._received > self._release_after:
+        """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust;
+        half throttle is trim.
+        """
+        if (
+            any(math.isfinite(axis) for axis in self._axes)
+            and self._monotonic() - self._received > self._release_after
+        ):
             self._axes = [math.nan] * 4
             print("timeout", flush=True)
         roll, pitch, throttle, yaw = self._axes
@@ -104,13 +118,18 @@ class Autopilot:
         twist.twist.linear.y = SPEED + V  # north, in ENU
         twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z = p, -q, -r
         alpha = 0.05
-        airspeed.vector.x, airspeed.vector.z = (SPEED + V) * math.cos(alpha), (SPEED + V) * math.sin(alpha)
+        airspeed.vector.x, airspeed.vector.z = (
+            (SPEED + V) * math.cos(alpha),
+            (SPEED + V) * math.sin(alpha),
+        )
         self._twist.publish(twist)
         self._airspeed.publish(airspeed)
 
 
 class Odometer(Autopilot):
-    """A simulator that publishes Imu and Odometry and takes commands of joints and of the thrust."""
+    """A simulator that publishes Imu and Odometry and takes commands of joints and of the
+    thrust.
+    """
 
     def __init__(self, scenario: Path, release_after: float, node: Any) -> None:
         super().__init__(scenario, release_after, node)
@@ -132,12 +151,16 @@ class Odometer(Autopilot):
         for message in (imu, odometry):
             message.header.stamp.sec = 12  # simulated time
         imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = p, -q, -r
-        phi, theta, psi, north, east, altitude, v_north, v_east, climb, _ = self._simulator.pose().tolist()
+        phi, theta, psi, north, east, altitude, v_north, v_east, climb, _ = (
+            self._simulator.pose().tolist()
+        )
         attitude = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
         turn = Rotation.from_matrix(ENU_OF_NED @ attitude @ FLU_OF_FRD)
         place, velocity = odometry.pose.pose, odometry.twist.twist.linear
         place.position.x, place.position.y, place.position.z = east, north, altitude
-        place.orientation.x, place.orientation.y, place.orientation.z, place.orientation.w = turn.as_quat().tolist()
+        place.orientation.x, place.orientation.y, place.orientation.z, place.orientation.w = (
+            turn.as_quat().tolist()
+        )
         velocity.x, velocity.y, velocity.z = turn.inv().apply([v_east, v_north, climb]).tolist()
         self._imu.publish(imu)
         self._odometry.publish(odometry)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for real processes over real DDS. Each test has its own domain; its processes are killed afterwards."""
+"""Fixtures for real processes over real DDS. Each test has its own domain; its processes are killed
+afterwards.
+"""
 
 import fcntl
 import itertools
@@ -30,7 +32,9 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.processes import end_with_parent
 from flight_log.scan import Scan
 
-_numbers = itertools.count(os.getpid())  # a domain is used again late: processes may take a while to leave it
+_numbers = itertools.count(
+    os.getpid()
+)  # a domain is used again late: processes may take a while to leave it
 
 DEFAULT_SIGHUP = ("env", "--default-signal=HUP")
 """Prefix of a command under test: nohup ignores SIGHUP for all processes of the tests."""
@@ -41,11 +45,20 @@ T = TypeVar("T")
 
 
 class Process:
-    """A process under test and the lines of its output. It ends with pytest, also where no fixture ends it."""
+    """A process under test and the lines of its output. It ends with pytest, also where no fixture
+    ends it.
+    """
 
-    def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
-        command, pipe = [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
-        self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
+    def __init__(
+        self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None
+    ) -> None:
+        command, pipe = (
+            [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments],
+            subprocess.PIPE,
+        )
+        self.popen = subprocess.Popen(
+            command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True
+        )
         self.arguments, self.lines = arguments, list[str]()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -61,7 +74,9 @@ class Process:
         return "\n".join(self.lines)
 
     def has_logged(self, *parts: str) -> bool:
-        """Whether a line contains all parts. A process that has ended without one never will: its output is the error."""
+        """Whether a line contains all parts. A process that has ended without one never will: its
+        output is the error.
+        """
         ended = not self._reader.is_alive()
         logged = any(all(part in line for part in parts) for line in list(self.lines))
         assert logged or not ended, f"ended without {parts}; output:\n{self.output}"
@@ -92,7 +107,10 @@ class Process:
 
     def wait_for_log(self, folder: Path, size: int) -> None:
         """Wait until the logs below a folder have this size in bytes."""
-        self.until(lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size, f"a log of {size} bytes")
+        self.until(
+            lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size,
+            f"a log of {size} bytes",
+        )
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
@@ -134,8 +152,8 @@ def host_delays() -> HostDelays:
 
 
 LONGEST_PAUSE = 0.1
-"""s. The longest delay of the host that a test in real time bears, unless its mark `longest_pause` has another: the age limit
-of y and y_m in the shipped scenarios."""
+"""s. The longest delay of the host that a test in real time bears, unless its mark `longest_pause`
+has another: the age limit of y and y_m in the shipped scenarios."""
 
 IN_REAL_TIME = Path(__file__).parent  # the folder of the tests that may be run again
 ATTEMPTS = 3
@@ -144,10 +162,11 @@ INCONCLUSIVE = "inconclusive"  # key of the property of a report
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a test again where it failed beside a delay of the host beyond what it bears; a failure without one is a failure.
+    """Run a test again where it failed beside a delay of the host beyond what it bears; a failure
+    without one is a failure.
 
-    Where the host delayed each of three attempts, the test is skipped as inconclusive, but not where all failed alike: then
-    the host is not the cause. The summary names the test either way.
+    Where the host delayed each of three attempts, the test is skipped as inconclusive, but not
+    where all failed alike: then the host is not the cause. The summary names the test either way.
     """
     if not item.path.is_relative_to(IN_REAL_TIME):
         return None
@@ -163,13 +182,19 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         pause = HOST.longest(begin)
         if pause <= bears or not any(report.failed for report in reports):
             break
-        sentence = f"the host paused for {pause:.2f} s, the test bears {bears:g} s, in attempt {attempt} of {ATTEMPTS}"
+        sentence = (
+            f"the host paused for {pause:.2f} s, the test bears {bears:g} s, in attempt "
+            f"{attempt} of {ATTEMPTS}"
+        )
         item.user_properties.append((INCONCLUSIVE, sentence))
         failures.update(failure(report) for report in reports if report.failed)
     else:
         for report in reports:
             if report.failed and len(failures) > 1:
-                report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"inconclusive: {sentence}")
+                report.outcome, report.longrepr = (
+                    "skipped",
+                    (str(item.path), 0, f"inconclusive: {sentence}"),
+                )
     for report in reports:
         report.user_properties = list(item.user_properties)
         item.ihook.pytest_runtest_logreport(report=report)
@@ -199,18 +224,24 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def settable_clock(folder: Path) -> Path:
-    """A library, of faults/clock.c, that gives the processes that load it a system clock that can be set."""
+    """A library, of faults/clock.c, that gives the processes that load it a system clock that can
+    be set.
+    """
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")
     library, source = folder / "clock.so", Path(__file__).parent / "faults" / "clock.c"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"], check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"],
+        check=True,
+    )
     return library
 
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """A ROS domain that no other test of this host has until the block is left, also of another worker or checkout.
+    """A ROS domain that no other test of this host has until the block is left, also of another
+    worker or checkout.
 
     The ports of domains 1 to 100 are below the ephemeral ports of Linux.
     """
@@ -253,15 +284,24 @@ def start(tmp_path: Path) -> Iterator[Start]:
             for child in process.children():
                 child.kill()
             process.popen.kill()
-        print(*process.arguments, "ended with status", process.end())  # pytest shows it where the test failed
+        print(
+            *process.arguments, "ended with status", process.end()
+        )  # pytest shows it where the test failed
         print(*process.lines[-30:], sep="\n")
 
 
 @pytest.fixture
 def start_node(start: Start, osprey_gust: Scenario) -> Start:
-    """Start the node of a package with the parameters of the default scenario, and with more ROS arguments."""
+    """Start the node of a package with the parameters of the default scenario, and with more ROS
+    arguments.
+    """
     return lambda package, *arguments, within=(): start(
-        f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments, within=within
+        f"{package}.main",
+        "--ros-args",
+        "--params-file",
+        str(osprey_gust.path),
+        *arguments,
+        within=within,
     )
 
 
@@ -269,7 +309,12 @@ def start_node(start: Start, osprey_gust: Scenario) -> Start:
 def recorder(start_node: Start) -> Recorder:
     """Start a recorder with a folder and further parameters."""
     return lambda folder, *parameters: start_node(
-        "flight_recorder", *(word for parameter in (f"directory:={folder}", *parameters) for word in ("-p", parameter))
+        "flight_recorder",
+        *(
+            word
+            for parameter in (f"directory:={folder}", *parameters)
+            for word in ("-p", parameter)
+        ),
     )
 
 

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's MAVLink interface, as a process: python -m tests.ros.mavlink_autopilot SCENARIO PORT.
+"""A simulated autopilot with ArduPilot's MAVLink interface, as a process: python -m
+tests.ros.mavlink_autopilot SCENARIO PORT.
 
-It simulates the aircraft section of the scenario, sends ATTITUDE, VFR_HUD and more to a UDP port of this host at 50 Hz, and
-takes RC_CHANNELS_OVERRIDE of system 255: 0 releases a channel, 65535 leaves it. It imports nothing from the bridge. It prints
-"ready", and "channels ROLL PITCH THROTTLE YAW", us, whenever they change.
+It simulates the aircraft section of the scenario, sends ATTITUDE, VFR_HUD and more to a UDP port of
+this host at 50 Hz, and takes RC_CHANNELS_OVERRIDE of system 255: 0 releases a channel, 65535 leaves
+it. It imports nothing from the bridge. It prints "ready", and "channels ROLL PITCH THROTTLE YAW",
+us, whenever they change.
 """
 
 import math
@@ -42,11 +44,16 @@ def fly(scenario: Path, port: int) -> None:
             if message.get_type() == "COMMAND_LONG":
                 send.command_ack_send(message.command, 0)
             elif message.get_type() == "PARAM_REQUEST_READ":
-                send.param_value_send(OVERRIDE_TIME[0], OVERRIDE_TIME[1], mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+                send.param_value_send(
+                    OVERRIDE_TIME[0], OVERRIDE_TIME[1], mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
+                )
             elif message.get_type() == "RC_CHANNELS_OVERRIDE" and message.get_srcSystem() == 255:
                 pulses = [getattr(message, f"chan{k}_raw") for k in range(1, 5)]
                 before = channels
-                channels = [STICKS[k] if us == 0 else before[k] if us == LEAVE else us for k, us in enumerate(pulses)]
+                channels = [
+                    STICKS[k] if us == 0 else before[k] if us == LEAVE else us
+                    for k, us in enumerate(pulses)
+                ]
                 if channels != before:
                     print("channels", *channels, flush=True)
         roll, pitch, throttle, yaw = ((us - 1500) * PER_US for us in channels)
@@ -58,7 +65,9 @@ def fly(scenario: Path, port: int) -> None:
         send.local_position_ned_send(ms, 0.0, 0.0, -100.0, SPEED, 0.0, 0.0)
         send.rc_channels_send(ms, 16, *channels, *[1500] * 14, 255)
         if number % 10 == 0:
-            send.heartbeat_send(mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4)
+            send.heartbeat_send(
+                mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4
+            )
             send.extended_sys_state_send(0, 2)
         number = max(number + 1, int((time.monotonic() - begin) / period))
         time.sleep(max(begin + number * period - time.monotonic(), 0.0))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A peer of a node under test: publishes y and y_m, subscribes to topics of the node, calls its services."""
+"""A peer of a node under test: publishes y and y_m, subscribes to topics of the node, calls its
+services.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -36,7 +38,9 @@ def stamp_ns(message: Any) -> int:
 
 
 class Peer:
-    """A node that runs while `until` waits for a condition. `received` holds its messages by topic."""
+    """A node that runs while `until` waits for a condition. `received` holds its messages by
+    topic.
+    """
 
     def __init__(self, context: Context, topics: tuple[str, ...], qos: QoSProfile) -> None:
         self.node = Node("peer", context=context)
@@ -77,7 +81,9 @@ class Peer:
 
     def command(self, *u: float, sender: str = "peer", age: float = 0.0) -> None:
         """Publish u, stamped `age` s ago."""
-        self.publish("u", to_message(time.time_ns() - nanoseconds(age), INPUTS, np.array(u), sender))
+        self.publish(
+            "u", to_message(time.time_ns() - nanoseconds(age), INPUTS, np.array(u), sender)
+        )
 
     def publish(self, topic: str, message: JointState) -> None:
         """Publish a named vector on a topic."""
@@ -85,7 +91,9 @@ class Peer:
             self._publishers[topic] = self.node.create_publisher(JointState, topic, PUBLISH)
         self._publishers[topic].publish(message)
 
-    def call(self, kind: Any, name: str, request: Any, each: Callable[[], None] | None = None) -> Any:
+    def call(
+        self, kind: Any, name: str, request: Any, each: Callable[[], None] | None = None
+    ) -> Any:
         """Call a service and wait for its answer; `each` is called every 5 ms meanwhile."""
         client = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f"the service {name}", each=each)
@@ -100,18 +108,32 @@ class Peer:
 
     def set_parameters(self, **values: object) -> bool:
         """Set parameters of the controller at once; whether it took them."""
-        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
         request = SetParametersAtomically.Request(parameters=messages)
-        return bool(self.call(SetParametersAtomically, "controller/set_parameters_atomically", request).result.successful)
+        return bool(
+            self.call(
+                SetParametersAtomically, "controller/set_parameters_atomically", request
+            ).result.successful
+        )
 
     def counted(self, key: str, more_than: int = 0) -> bool:
         """Whether a counter in the received diagnostics has been above a number."""
-        values = [value for array in self.received["/diagnostics"] for status in array.status for value in status.values]
+        values = [
+            value
+            for array in self.received["/diagnostics"]
+            for status in array.status
+            for value in status.values
+        ]
         return any(value.key == key and int(value.value) > more_than for value in values)
 
     def modes(self) -> list[int]:
         """The sequence of modes in `internals`, without repetitions."""
-        modes = [int(message.position[message.name.index("mode")]) for message in self.received["internals"]]
+        modes = [
+            int(message.position[message.name.index("mode")])
+            for message in self.received["internals"]
+        ]
         return [mode for index, mode in enumerate(modes) if index == 0 or modes[index - 1] != mode]
 
     def u(self) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -120,7 +142,9 @@ class Peer:
 
 
 @contextmanager
-def peer(topics: tuple[str, ...] = ("u", "internals", "/diagnostics"), qos: QoSProfile | None = None) -> Iterator[Peer]:
+def peer(
+    topics: tuple[str, ...] = ("u", "internals", "/diagnostics"), qos: QoSProfile | None = None
+) -> Iterator[Peer]:
     """A peer in its own context with subscriptions to these topics."""
     transport.prepare()
     context = Context()

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A network between the network namespaces of two processes, with delay and loss: python -m tests.ros.relay PID PID DELAY LOSS.
+"""A network between the network namespaces of two processes, with delay and loss: python -m
+tests.ros.relay PID PID DELAY LOSS.
 
-It forwards the packets of two TUN devices, `net0` in each namespace, after DELAY s; a share LOSS is lost. It prints "up" once
-the devices exist. SIGUSR1 pulls the cable for a second.
+It forwards the packets of two TUN devices, `net0` in each namespace, after DELAY s; a share LOSS is
+lost. It prints "up" once the devices exist. SIGUSR1 pulls the cable for a second.
 """
 
 import ctypes
@@ -27,7 +28,10 @@ NAME = "net0"
 def device(pid: int) -> int:
     """A TUN device in the network namespace of a process. Raises OSError without the permission."""
     libc = ctypes.CDLL(None, use_errno=True)
-    with Path("/proc/self/ns/net").open("rb") as own, Path(f"/proc/{pid}/ns/net").open("rb") as there:
+    with (
+        Path("/proc/self/ns/net").open("rb") as own,
+        Path(f"/proc/{pid}/ns/net").open("rb") as there,
+    ):
         if libc.setns(there.fileno(), CLONE_NEWNET):
             raise OSError(ctypes.get_errno(), "setns")
         tun = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
@@ -66,4 +70,6 @@ def forward(ends: tuple[int, int], delay: float, loss: float) -> None:
 
 
 if __name__ == "__main__":
-    forward((device(int(sys.argv[1])), device(int(sys.argv[2]))), float(sys.argv[3]), float(sys.argv[4]))
+    forward(
+        (device(int(sys.argv[1])), device(int(sys.argv[2]))), float(sys.argv[3]), float(sys.argv[4])
+    )

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the age of u on the host of the aircraft, by rclpy alone, beside what the aircraft tells.
+"""Measures the age of u on the host of the aircraft, by rclpy alone, beside what the aircraft
+tells.
 
-As a process, python -m tests.ros.stopwatch. It prints "told MEAN measured MEAN", s, for each report of the aircraft.
+As a process, python -m tests.ros.stopwatch. It prints "told MEAN measured MEAN", s, for each report
+of the aircraft.
 """
 
 import rclpy
@@ -25,12 +27,21 @@ class Stopwatch(Node):  # type: ignore[misc]
 
     def _take(self, message: JointState) -> None:
         stamp = message.header.stamp
-        self._ages.append(self.get_clock().now().nanoseconds / 1e9 - stamp.sec - stamp.nanosec / 1e9)
+        self._ages.append(
+            self.get_clock().now().nanoseconds / 1e9 - stamp.sec - stamp.nanosec / 1e9
+        )
 
     def _compare(self, message: DiagnosticArray) -> None:
-        told = [float(value.value) for status in message.status for value in status.values if value.key == KEY]
+        told = [
+            float(value.value)
+            for status in message.status
+            for value in status.values
+            if value.key == KEY
+        ]
         if told and self._ages:
-            print(f"told {told[0]:.4f} measured {sum(self._ages) / len(self._ages):.4f}", flush=True)
+            print(
+                f"told {told[0]:.4f} measured {sum(self._ages) / len(self._ages):.4f}", flush=True
+            )
         if any(status.name == "/aircraft" for status in message.status):
             self._ages.clear()
 

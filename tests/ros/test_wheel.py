@@ -12,7 +12,9 @@ import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.waiting import HANG
 
-PACKAGES = sorted(path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml"))
+PACKAGES = sorted(
+    path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml")
+)
 DECOY = "raise RuntimeError(f'{__name__} of a foreign package')\n"
 
 Run = Callable[..., str]
@@ -30,20 +32,35 @@ def write_package(folder: Path, name: str) -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """The folder that holds the installed wheel, and a foreign package of the name guidance, as on PyPI."""
+    """The folder that holds the installed wheel, and a foreign package of the name guidance, as on
+    PyPI.
+    """
     built, target = tmp_path / "built", tmp_path / "installed"
-    build = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(built))
+    build = (
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "--target",
+        "wheel",
+        "--directory",
+        str(built),
+    )
     subprocess.run(build, cwd=REPOSITORY, check=True, capture_output=True, timeout=HANG)
     (wheel,) = built.glob("*.whl")
     options = ("--quiet", "--no-index", "--no-deps", "--target", str(target))
-    subprocess.run((sys.executable, "-m", "pip", "install", *options, str(wheel)), check=True, timeout=HANG)
+    subprocess.run(
+        (sys.executable, "-m", "pip", "install", *options, str(wheel)), check=True, timeout=HANG
+    )
     write_package(target, "guidance")
     return target
 
 
 @pytest.fixture
 def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs Python with the wheel. Strangers of all names are in the working folder and behind the wheel on the path."""
+    """Runs Python with the wheel. Strangers of all names are in the working folder and behind the
+    wheel on the path.
+    """
     behind, working = tmp_path / "behind", tmp_path / "working"
     for name in PACKAGES:
         write_package(behind, name)
@@ -52,7 +69,9 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
 
     def run_python(*arguments: str) -> str:
         command = [sys.executable, *arguments]
-        done = subprocess.run(command, cwd=working, capture_output=True, text=True, timeout=HANG, check=False)
+        done = subprocess.run(
+            command, cwd=working, capture_output=True, text=True, timeout=HANG, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -60,9 +79,15 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
 
 
 def test_the_wheel_flies_beside_strangers(installed: Path, run: Run) -> None:
-    """Every package is that of the wheel. In one process, and as four processes over DDS, the replay is equal to the bit."""
-    code = f"import importlib\nfor name in {PACKAGES}: print(importlib.import_module(name).__file__)"
-    assert run("-P", "-c", code).split() == [str(installed / name / "__init__.py") for name in PACKAGES]
+    """Every package is that of the wheel. In one process, and as four processes over DDS, the
+    replay is equal to the bit.
+    """
+    code = (
+        f"import importlib\nfor name in {PACKAGES}: print(importlib.import_module(name).__file__)"
+    )
+    assert run("-P", "-c", code).split() == [
+        str(installed / name / "__init__.py") for name in PACKAGES
+    ]
     assert [path.name for path in (installed / "bin").iterdir()] == ["rise-di"]
     rise_di = str(installed / "bin" / "rise-di")
     for option in ("--in-process", "--lockstep"):

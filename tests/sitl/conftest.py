@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests with a real autopilot in software: `make test-sitl`. They are skipped, with the reason, where the kit cannot run."""
+"""Tests with a real autopilot in software: `make test-sitl`. They are skipped, with the reason,
+where the kit cannot run.
+"""
 
 import os
 from collections.abc import Iterator
@@ -38,7 +40,9 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
 
 @pytest.fixture(scope="module")
 def px4(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Px4]:
-    """PX4's airplane in flight. Without a stick it goes on, and without an offboard heartbeat it changes to Hold."""
+    """PX4's airplane in flight. Without a stick it goes on, and without an offboard heartbeat it
+    changes to Hold.
+    """
     autopilot = Px4(tmp_path_factory.mktemp("run"))
     try:
         autopilot.up(COM_RCL_EXCEPT=7, COM_OBL_RC_ACT=5)

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The kits of autopilots in software: one is started and stopped, commanded, and flown by commands of the stack beside it.
+"""The kits of autopilots in software: one is started and stopped, commanded, and flown by commands
+of the stack beside it.
 
-The kits are no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default ../shared/sitl beside the
-checkout; that of PX4 is its folder px4. Their READMEs say what they need. PILOT_PYTHON is an interpreter with pymavlink, by
-default python3.
+The kits are no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default
+../shared/sitl beside the checkout; that of PX4 is its folder px4. Their READMEs say what they need.
+PILOT_PYTHON is an interpreter with pymavlink, by default python3.
 """
 
 import csv
@@ -40,25 +41,45 @@ from flight_log.tape_reader import read_run
 KIT = Path(os.environ.get("RISE_DI_SITL", REPOSITORY.parent / "shared" / "sitl"))
 PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
-OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO")  # of a rehearsal
+OWN_MAP, OWN_SCENARIO = (
+    os.environ.get("RISE_DI_MAP"),
+    os.environ.get("RISE_DI_SCENARIO"),
+)  # of a rehearsal
 POLL = 0.1  # s, between two questions to the autopilot
 ENGAGEMENTS = 4  # attempts: some seconds of level flight end the climb that a fault before has left
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
-MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
+# s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
+MAX_AGE = 1.0
 OVERRIDE_TIME = 0.5  # s, RC_OVERRIDE_TIME: the map of MAVLink requires 1 s or less
 OWN_SIGNALS = {
-    **{name: ("ATTITUDE", f"{axis}speed") for name, axis in (("q", "pitch"), ("p", "roll"), ("r", "yaw"))},
+    **{
+        name: ("ATTITUDE", f"{axis}speed")
+        for name, axis in (("q", "pitch"), ("p", "roll"), ("r", "yaw"))
+    },
     "V": ("VFR_HUD", "airspeed"),
 }
 """Message and field of the autopilot's log for each channel of y."""
 
-SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
-CRUISE = (25.0, 65.0)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
+SAFE_STICKS = (
+    1500,
+    1500,
+    1000,
+    1500,
+    1800,
+    1500,
+    1500,
+)  # us, as the kit begins; the throttle is closed
+CRUISE = (
+    25.0,
+    65.0,
+)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
 Program = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Commands of guidance by channel: times, s, and values."""
 
 TURN = 0.7  # rad, 40 deg
-ALTITUDE = 300.0  # m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
+ALTITUDE = (
+    300.0  # m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
+)
 
 
 def missing() -> str:
@@ -72,16 +93,22 @@ def missing() -> str:
         return "no ip here: apt-get install iproute2"
     environment = {**os.environ, "LD_LIBRARY_PATH": str(KIT / "lib")}
     ldd = (shutil.which("ldd") or "/usr/bin/ldd", str(KIT / "bin" / "MicroXRCEAgent"))
-    libraries = subprocess.run(ldd, env=environment, capture_output=True, text=True, check=False).stdout
+    libraries = subprocess.run(
+        ldd, env=environment, capture_output=True, text=True, check=False
+    ).stdout
     if absent := [line.split()[0] for line in libraries.splitlines() if "not found" in line]:
         return f"no {', '.join(absent)} here: the kit's README names its packages"
-    if subprocess.run([PILOT_PYTHON, "-c", "import pymavlink"], capture_output=True, check=False).returncode:
+    if subprocess.run(
+        [PILOT_PYTHON, "-c", "import pymavlink"], capture_output=True, check=False
+    ).returncode:
         return f"no pymavlink in {PILOT_PYTHON}: PILOT_PYTHON names an interpreter that has it"
     return ""
 
 
 class Autopilot:
-    """An autopilot and its agent in a network of their own, and the flights of the stack beside it."""
+    """An autopilot and its agent in a network of their own, and the flights of the stack beside
+    it.
+    """
 
     script: Path
     namespace: str  # of the network, as the kit names it
@@ -111,7 +138,8 @@ class Autopilot:
         output = self.folder / f"{action}.txt"
         with output.open("w", encoding="utf-8") as file:
             done = subprocess.run(
-                command, env={**os.environ, "PILOT_PYTHON": PILOT_PYTHON, **environment}, stdin=subprocess.DEVNULL,
+                command, env={**os.environ, "PILOT_PYTHON": PILOT_PYTHON, **environment},
+                stdin=subprocess.DEVNULL,
                 stdout=file, stderr=subprocess.STDOUT, timeout=timeout, check=False,
             )  # fmt: skip
         text = output.read_text(encoding="utf-8")
@@ -124,10 +152,19 @@ class Autopilot:
         parents = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
 
         def is_one(process: psutil.Process, program: str) -> bool:
-            return any(Path(word).name == program for member in (process, *process.children()) for word in member.cmdline())
+            return any(
+                Path(word).name == program
+                for member in (process, *process.children())
+                for word in member.cmdline()
+            )
 
-        chosen = [next(parent for parent in parents if is_one(parent, program)) for program in programs]
-        again = [(["ip", "netns", "exec", self.namespace, *process.cmdline()], process.environ()) for process in chosen]
+        chosen = [
+            next(parent for parent in parents if is_one(parent, program)) for program in programs
+        ]
+        again = [
+            (["ip", "netns", "exec", self.namespace, *process.cmdline()], process.environ())
+            for process in chosen
+        ]
         for parent in chosen:
             for process in (*parent.children(), parent):
                 process.kill()
@@ -137,7 +174,12 @@ class Autopilot:
             for program, (command, environment) in zip(programs, again, strict=True):
                 with (self.folder / f"{program}_again.log").open("w", encoding="utf-8") as log:
                     started = subprocess.Popen(
-                        command, env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+                        command,
+                        env=environment,
+                        cwd=self.folder,
+                        stdin=subprocess.DEVNULL,
+                        stdout=log,
+                        stderr=log,
                     )
                 self._restarted.append(started)
                 with (self.folder / "pids").open("a", encoding="utf-8") as file:
@@ -159,7 +201,9 @@ class Autopilot:
         """What the autopilot says of itself now."""
         raise NotImplementedError
 
-    def until(self, condition: Callable[[dict[str, Any]], bool], timeout: float = 60.0) -> dict[str, Any]:
+    def until(
+        self, condition: Callable[[dict[str, Any]], bool], timeout: float = 60.0
+    ) -> dict[str, Any]:
         """Poll the state until a condition holds."""
         deadline = time.monotonic() + timeout
         while not condition(state := self.state()):
@@ -172,12 +216,18 @@ class Autopilot:
         raise NotImplementedError
 
     def hand_over(self) -> None:
-        """Change to the mode in which the stack is engaged, where the bridge does not ask for it."""
+        """Change to the mode in which the stack is engaged, where the bridge does not ask for
+        it.
+        """
 
     def patient_map(self, name: str, *changes: tuple[str, str]) -> str:
         """A copy of a map with longer ages, and further changes of its text."""
         text = find_map(name).read_text(encoding="utf-8")
-        for old, new in (("max_age: 0.2 ", f"max_age: {MAX_AGE} "), ("max_age: 0.35 ", f"max_age: {MAX_AGE} "), *changes):
+        for old, new in (
+            ("max_age: 0.2 ", f"max_age: {MAX_AGE} "),
+            ("max_age: 0.35 ", f"max_age: {MAX_AGE} "),
+            *changes,
+        ):
             text = text.replace(old, new)
         path = self.folder / f"{Path(name).stem}.yaml"
         path.write_text(text, encoding="utf-8")
@@ -201,8 +251,11 @@ class Autopilot:
         return self.start("fly", *arguments, *options)
 
     @contextmanager
-    def engaged(self, scenario: Path, channel_map: str, duration: float, *, transmitter: bool = False) -> Iterator[Process]:
-        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in its own mode.
+    def engaged(
+        self, scenario: Path, channel_map: str, duration: float, *, transmitter: bool = False
+    ) -> Iterator[Process]:
+        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in
+        its own mode.
 
         `transmitter`: whether the bridge watches the transmitter.
         """
@@ -220,7 +273,9 @@ class Autopilot:
             self.level()
 
     def requested(self, *options: str) -> Process:
-        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known, 2 s after its begin."""
+        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known,
+        2 s after its begin.
+        """
         for _ in range(ENGAGEMENTS):
             request = self.start("engage", *options)
             if request.end() == 0 or "not known yet" not in request.output:
@@ -228,7 +283,9 @@ class Autopilot:
         return request
 
     def _engage_level(self, *options: str) -> None:
-        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over, as after a jammed surface."""
+        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over, as
+        after a jammed surface.
+        """
         for _ in range(ENGAGEMENTS):
             self.hand_over()
             engaged = self.requested(*options)
@@ -238,7 +295,9 @@ class Autopilot:
         engaged.succeed()
 
     def experiment(self, *command: str) -> Process:
-        """Fly the experiment of `identify --bridge`, with the arguments of the command, to its end in the air."""
+        """Fly the experiment of `identify --bridge`, with the arguments of the command, to its end
+        in the air.
+        """
         self.level()
         excited = self.start(*command)
         excited.wait_for("DISENGAGED")
@@ -254,27 +313,37 @@ class Autopilot:
         return (self.folder / "runs" / "latest").resolve()
 
     def summary(self) -> dict[str, Any]:
-        """The summary of the last flight: its outcome, and its engagements with start, stop, reason."""
+        """The summary of the last flight: its outcome, and its engagements with start, stop,
+        reason.
+        """
         found: dict[str, Any] = json.loads((self.run / "summary.json").read_text(encoding="utf-8"))
         return found
 
 
 def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
-    """The text of a scenario under guidance by rule in place of its commands; `program` has times, s, and values by channel.
+    """The text of a scenario under guidance by rule in place of its commands; `program` has times,
+    s, and values by channel.
 
     The poses of a busy host may be MAX_AGE old.
     """
     content = yaml.safe_load(scenario.read_text(encoding="utf-8"))
     reference = content["/**/reference_model"]["ros__parameters"]
-    kept = {key: value for key, value in reference.items() if key not in {"pulses", "coordinated_turn"}}
+    kept = {
+        key: value for key, value in reference.items() if key not in {"pulses", "coordinated_turn"}
+    }
     content["/**/reference_model"]["ros__parameters"] = kept | {"live": {"speed": speed}}
-    steps = {name: {"start": list(start), "value": list(value)} for name, (start, value) in program.items()}
+    steps = {
+        name: {"start": list(start), "value": list(value)}
+        for name, (start, value) in program.items()
+    }
     content["/**/guidance"] = {"ros__parameters": {"max_age": MAX_AGE, "program": steps}}
     return str(yaml.safe_dump(content))
 
 
 def followed(tape: Tape, name: str, start: float, stop: float) -> float:
-    """The part of y that goes along with y_m from start to stop, s, over y_m: the largest at a delay below 0.6 s."""
+    """The part of y that goes along with y_m from start to stop, s, over y_m: the largest at a
+    delay below 0.6 s.
+    """
     y, y_m = tape["y"], tape["y_m"]
     t, t_m = tape.time("y"), tape.time("y_m")
     inside, parts = (t > start) & (t < stop), []
@@ -286,9 +355,13 @@ def followed(tape: Tape, name: str, start: float, stop: float) -> float:
 
 
 class Agreement(NamedTuple):
-    """A signal of the stack over the autopilot's own, at the delay between both with the smallest residual."""
+    """A signal of the stack over the autopilot's own, at the delay between both with the smallest
+    residual.
+    """
 
-    slope: float  # by orthogonal regression: the instants of both jitter, so an ordinary one, with noise in one alone, is low
+    # by orthogonal regression: the instants of both jitter, so an ordinary one, with noise in one
+    # alone, is low
+    slope: float
     offset: float  # difference of the means
     delay: float  # s
 
@@ -299,7 +372,11 @@ def agreement(t: FloatArray, logged: FloatArray, t_y: FloatArray, y: FloatArray)
     for delay in np.arange(-0.3, 0.3, 0.005):
         delayed = np.interp(t + delay, t_y, y)
         variances, directions = np.linalg.eigh(np.cov(logged, delayed))
-        found = Agreement(float(directions[1, 1] / directions[0, 1]), float(np.mean(delayed - logged)), float(delay))
+        found = Agreement(
+            float(directions[1, 1] / directions[0, 1]),
+            float(np.mean(delayed - logged)),
+            float(delay),
+        )
         fits.append((float(variances[0]), found))
     return min(fits)[1]
 
@@ -321,7 +398,14 @@ LOGGED: tuple[tuple[str, str, dict[str, str]], ...] = (
     (
         "pose",
         "GLOBAL_POSITION_INT",
-        {"north": "lat", "east": "lon", "altitude": "relative_alt", "v_north": "vx", "v_east": "vy", "climb": "vz"},
+        {
+            "north": "lat",
+            "east": "lon",
+            "altitude": "relative_alt",
+            "v_north": "vx",
+            "v_east": "vy",
+            "climb": "vz",
+        },
     ),
 )
 """Topic, message of MAVLink, and its field for each channel."""
@@ -338,7 +422,9 @@ class ArduPlane(Autopilot):
     def up(self, **parameters: float) -> None:
         """Start agent, autopilot and transmitter, with parameters of the autopilot."""
         extra = self.folder / "extra.parm"
-        extra.write_text("".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="utf-8")
+        extra.write_text(
+            "".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="utf-8"
+        )
         self._call("up", str(PROFILE), timeout=90.0, EXTRA_PARM=str(extra))
 
     def state(self) -> dict[str, Any]:
@@ -380,12 +466,16 @@ class ArduPlane(Autopilot):
             self.say("param", "SIM_RC_FAIL", "0")
 
     def hand_over(self) -> None:
-        """Change to MANUAL with the sticks where the servos are, so that the aircraft stays in trim."""
+        """Change to MANUAL with the sticks where the servos are, so that the aircraft stays in
+        trim.
+        """
         self.say("sticks_from_servos")
         assert "ok" in self.say("mode", "MANUAL")
 
     def restart(self) -> None:
-        """End the autopilot and start it again, on the ground. Its ground station notices no other way."""
+        """End the autopilot and start it again, on the ground. Its ground station notices no other
+        way.
+        """
         again = self.kill("pilot.py", "arduplane")
         (self.folder / "pilot.sock").unlink()
         again()
@@ -395,22 +485,40 @@ class ArduPlane(Autopilot):
             time.sleep(POLL)
 
     def log(self, kind: str, *fields: str) -> tuple[FloatArray, FloatArray]:
-        """The autopilot's own log over MAVLink: the times of arrival, s of the system clock, and the fields."""
+        """The autopilot's own log over MAVLink: the times of arrival, s of the system clock, and
+        the fields.
+        """
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
-            rows = [(float(row[0]), json.loads(row[2])) for row in csv.reader(file) if len(row) == 3 and row[1] == kind]
-        return np.array([t for t, _ in rows]), np.array([[row[field] for field in fields] for _, row in rows])
+            rows = [
+                (float(row[0]), json.loads(row[2]))
+                for row in csv.reader(file)
+                if len(row) == 3 and row[1] == kind
+            ]
+        return np.array([t for t, _ in rows]), np.array(
+            [[row[field] for field in fields] for _, row in rows]
+        )
 
     def mavlink_map(self, *changes: tuple[str, str]) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the second serial port, beside the ground station of the kit."""
-        return self.patient_map("ardupilot_mavlink", ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), *changes)
+        """The map `ardupilot_mavlink` with longer ages, on the second serial port, beside the
+        ground station of the kit.
+        """
+        return self.patient_map(
+            "ardupilot_mavlink", ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), *changes
+        )
 
     def shared_map(self) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`, with the number of its station."""
-        return self.patient_map("ardupilot_mavlink", ("source_system: 255", f"source_system: {STATION}"))
+        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`, with the
+        number of its station.
+        """
+        return self.patient_map(
+            "ardupilot_mavlink", ("source_system: 255", f"source_system: {STATION}")
+        )
 
     @contextmanager
     def shared_link(self) -> Iterator[Callable[[str], None]]:
-        """Start `tests.sitl.shared_link`, whose station is the autopilot's; what is given sends it a word."""
+        """Start `tests.sitl.shared_link`, whose station is the autopilot's; what is given sends it
+        a word.
+        """
         path = str(self.folder / "link.sock")
         link = self._module("tests.sitl.shared_link", path)
         self.say("param", "MAV_GCS_SYSID", str(STATION))
@@ -433,13 +541,18 @@ class ArduPlane(Autopilot):
         return max((self.folder / "logs").glob("*.BIN"), key=lambda path: path.stat().st_mtime)
 
     def own_errors(self, ratio: float = 1.0) -> dict[str, tuple[float, float]]:
-        """The rms of the autopilot's own log less y_m, and of y_m, by channel, in the engaged time in which it is commanded.
+        """The rms of the autopilot's own log less y_m, and of y_m, by channel, in the engaged time
+        in which it is commanded.
 
-        V is the sensor's, as a deviation from its value at the engagement, times `ratio`, of true over equivalent airspeed.
+        V is the sensor's, as a deviation from its value at the engagement, times `ratio`, of true
+        over equivalent airspeed.
         """
         log = read_run(self.run)
         (span,) = log.engagements or []
-        y_m, pulses = log.tape["y_m"], load_scenario(self.run / "parameters.yaml").reference_model.pulses
+        y_m, pulses = (
+            log.tape["y_m"],
+            load_scenario(self.run / "parameters.yaml").reference_model.pulses,
+        )
         stop_ns = span.stop_ns or int(y_m.stamp_ns[-1])
         errors = {}
         for name, (kind, field) in OWN_SIGNALS.items():
@@ -447,25 +560,35 @@ class ArduPlane(Autopilot):
             own = values[:, 0]
             if name == "V":
                 own = ratio * (own - np.interp(span.start_ns / 1e9, t, own))
-            pulse = pulses.get(name, pulses["p"]) if name == "r" else pulses[name]  # r follows p in coordinated turns
+            pulse = (
+                pulses.get(name, pulses["p"]) if name == "r" else pulses[name]
+            )  # r follows p in coordinated turns
             edges = zip(pulse.start, pulse.stop, strict=True)
             begin = log.tape.start_ns / 1e9
             commanded = in_spans(t, [(begin + start, begin + stop + 1.0) for start, stop in edges])
             commanded &= (t > span.start_ns / 1e9) & (t < stop_ns / 1e9)
             reference = np.interp(t[commanded], y_m.stamp_ns / 1e9, y_m[name])
             if commanded.any():
-                errors[name] = float(np.sqrt(np.mean((own[commanded] - reference) ** 2))), float(np.sqrt(np.mean(reference**2)))
+                errors[name] = (
+                    float(np.sqrt(np.mean((own[commanded] - reference) ** 2))),
+                    float(np.sqrt(np.mean(reference**2))),
+                )
         return errors
 
     def turns(
         self, starts: Sequence[float], altitude: float, speed: float
     ) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
-        """A program of guidance: at each start, s, a turn by TURN, a climb or sink of 15 m, and 1 m/s more or less."""
+        """A program of guidance: at each start, s, a turn by TURN, a climb or sink of 15 m, and 1
+        m/s more or less.
+        """
         self.state()  # writes the log
         heading = float(self.log("ATTITUDE", "yaw")[1][-1, 0])
         numbers = range(1, len(starts) + 1)
         return {
-            "heading": (starts, [math.remainder(heading + TURN * k, 2.0 * math.pi) for k in numbers]),
+            "heading": (
+                starts,
+                [math.remainder(heading + TURN * k, 2.0 * math.pi) for k in numbers],
+            ),
             "altitude": (starts, [altitude + 15.0 * (k % 2) for k in numbers]),
             "V": (starts, [speed + k % 2 for k in numbers]),
         }
@@ -511,12 +634,18 @@ class Px4(Autopilot):
     def up(self, **parameters: float) -> None:
         """Start agent and autopilot, with parameters of the autopilot."""
         self._call(
-            "up", str(PROFILE), timeout=60.0, **{f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()}
+            "up",
+            str(PROFILE),
+            timeout=60.0,
+            **{f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()},
         )
 
     def listen(self, topic: str, *names: str) -> dict[str, float]:
         """Fields of the newest message of a topic of uORB."""
-        lines = [line.strip().partition(":") for line in self.say("listener", topic, "-n", "1").splitlines()]
+        lines = [
+            line.strip().partition(":")
+            for line in self.say("listener", topic, "-n", "1").splitlines()
+        ]
         found = {name: value.split() for name, _, value in lines if name in names and value.strip()}
         numbers = {name: float(words[0].removesuffix(",")) for name, words in found.items()}
         if "timestamp" in found:  # "308080000 (0.320000 seconds ago)"
@@ -530,17 +659,23 @@ class Px4(Autopilot):
         return {**state, "alt": -height.get("z", 0.0), "climb": -height.get("vz", 0.0)}
 
     def take_off(self) -> None:
-        """Take off from the runway, into Hold. The airplane cannot hold its default speed of 15 m/s."""
+        """Take off from the runway, into Hold. The airplane cannot hold its default speed of 15
+        m/s.
+        """
         deadline, armed = time.monotonic() + 60.0, False
         while not armed:
             assert time.monotonic() < deadline, "PX4 does not arm"
             time.sleep(1.0)
-            with suppress(AssertionError):  # not running yet, or refused until its estimator is ready
+            with suppress(
+                AssertionError
+            ):  # not running yet, or refused until its estimator is ready
                 self.say("commander", "takeoff")
                 armed = self.state()["arming_state"] == ARMED
 
         def climbed(state: dict[str, Any]) -> bool:
-            if state["nav_state"] == HOLD and state["alt"] < 5.0:  # armed before its estimator had a position
+            if (
+                state["nav_state"] == HOLD and state["alt"] < 5.0
+            ):  # armed before its estimator had a position
                 self.say("commander", "takeoff")
             return bool(state["alt"] > 20.0)
 
@@ -549,10 +684,17 @@ class Px4(Autopilot):
         self.say("param", "set", "FW_AIRSPD_TRIM", "11.2")
 
     def level(self) -> None:
-        """Fly straight ahead in Hold, towards a place 20 km to the north, 150 m above the ground."""
-        self.until(lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0)  # not before its agent is connected
+        """Fly straight ahead in Hold, towards a place 20 km to the north, 150 m above the
+        ground.
+        """
         self.until(
-            lambda state: state["nav_state"] == HOLD and state["alt"] > 100.0 and abs(state["climb"]) < 0.5, timeout=120.0
+            lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0
+        )  # not before its agent is connected
+        self.until(
+            lambda state: (
+                state["nav_state"] == HOLD and state["alt"] > 100.0 and abs(state["climb"]) < 0.5
+            ),
+            timeout=120.0,
         )
 
     def tool(self, name: str, *arguments: str) -> Process:
@@ -569,18 +711,37 @@ class Px4(Autopilot):
 
     @contextmanager
     def watching_truth(self) -> Iterator[Callable[[], Signal]]:
-        """Ask the simulator for its own p, q, r ten times a second. What is given returns them, rad/s, by the system clock."""
+        """Ask the simulator for its own p, q, r ten times a second. What is given returns them,
+        rad/s, by the system clock.
+        """
         asked: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
         ended = Event()
 
         def ask() -> None:
-            command = (str(self.script), "say", str(self.folder), "listener", "vehicle_angular_velocity_groundtruth", "-n", "1")
+            command = (
+                str(self.script),
+                "say",
+                str(self.folder),
+                "listener",
+                "vehicle_angular_velocity_groundtruth",
+                "-n",
+                "1",
+            )
             while not ended.wait(POLL):
-                answer = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False).stdout
-                now = time.time()  # the client ends with the answer; most of its time goes by before the question
+                answer = subprocess.run(
+                    command, capture_output=True, text=True, timeout=30.0, check=False
+                ).stdout
+                now = (
+                    time.time()
+                )  # the client ends with the answer; most of its time goes by before the question
                 found = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
                 if found is not None:
-                    asked.append((now - float(found[1]), np.array([float(coordinate) for coordinate in found[2].split(",")])))
+                    asked.append(
+                        (
+                            now - float(found[1]),
+                            np.array([float(coordinate) for coordinate in found[2].split(",")]),
+                        )
+                    )
 
         def truth() -> Signal:
             stamps = np.round(np.array([t for t, _ in asked]) * 1e9).astype(np.int64)
@@ -597,7 +758,11 @@ class Px4(Autopilot):
     def mode_changed(self) -> float:
         """When nav_state changed last, s of the monotonic clock."""
         status = self.listen("vehicle_status", "timestamp", "nav_state_timestamp")
-        return time.monotonic() - status["ago"] - 1e-6 * (status["timestamp"] - status["nav_state_timestamp"])
+        return (
+            time.monotonic()
+            - status["ago"]
+            - 1e-6 * (status["timestamp"] - status["nav_state_timestamp"])
+        )
 
 
 class Quadrotor(Px4):
@@ -609,7 +774,10 @@ class Quadrotor(Px4):
         super().__init__(folder)
         self.script = folder / "sitl"
         text = Px4.script.read_text(encoding="utf-8")
-        for pattern, value in ((r"^KIT=.*$", f"KIT={Px4.script.parent}"), (r"PX4_SIM_MODEL=\S+", "PX4_SIM_MODEL=sihsim_quadx")):
+        for pattern, value in (
+            (r"^KIT=.*$", f"KIT={Px4.script.parent}"),
+            (r"PX4_SIM_MODEL=\S+", "PX4_SIM_MODEL=sihsim_quadx"),
+        ):
             text, count = re.subn(pattern, value, text, flags=re.MULTILINE)
             assert count == 1, f"{Px4.script}: {pattern}"
         self.script.write_text(text, encoding="utf-8")
@@ -621,7 +789,9 @@ class Quadrotor(Px4):
         while self.state().get("arming_state") != ARMED:
             assert time.monotonic() < deadline, "PX4 does not arm"
             time.sleep(1.0)
-            with suppress(AssertionError):  # not running yet, or refused until its estimator is ready
+            with suppress(
+                AssertionError
+            ):  # not running yet, or refused until its estimator is ready
                 self.say("commander", "takeoff")
         self.until(lambda state: state["alt"] > self.hover - 5.0, timeout=120.0)
         self.level()
@@ -630,7 +800,10 @@ class Quadrotor(Px4):
         """Hover in Hold."""
         self.say("commander", "mode", "auto:loiter")
         self.until(
-            lambda state: state["nav_state"] == HOLD and abs(state["climb"]) < 0.3 and state["alt"] > 15.0, timeout=120.0
+            lambda state: (
+                state["nav_state"] == HOLD and abs(state["climb"]) < 0.3 and state["alt"] > 15.0
+            ),
+            timeout=120.0,
         )
 
 
@@ -640,4 +813,7 @@ HOLD, OFFBOARD, ARMED = 4, 14, 2  # nav_state of PX4: AUTO_LOITER, OFFBOARD; its
 def burn(seconds: float, per_core: int = 4) -> Sequence[subprocess.Popen[bytes]]:
     """Keep every core busy with several processes at once for a time."""
     code = f"import time; end = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
-    return [subprocess.Popen([sys.executable, "-c", code]) for _ in range(per_core * (os.cpu_count() or 1))]
+    return [
+        subprocess.Popen([sys.executable, "-c", code])
+        for _ in range(per_core * (os.cpu_count() or 1))
+    ]

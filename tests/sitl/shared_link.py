@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A link that the bridge shares with a ground station, and that can be cut.
 
-It is started in the autopilot's network: `python -m tests.sitl.shared_link SOCKET`. Bytes pass between the autopilot's second
-serial port (TCP) and the bridge (UDP). The station sends a heartbeat each second, both ways.
-The datagrams on SOCKET are `cut`, `join`, `silence`, `speak` and `take`: request 4 Hz of all messages, as MAVProxy does.
+It is started in the autopilot's network: `python -m tests.sitl.shared_link SOCKET`. Bytes pass
+between the autopilot's second serial port (TCP) and the bridge (UDP). The station sends a heartbeat
+each second, both ways. The datagrams on SOCKET are `cut`, `join`, `silence`, `speak` and `take`:
+request 4 Hz of all messages, as MAVProxy does.
 """
 
 import select
@@ -29,9 +30,15 @@ def main(path: str) -> None:
     autopilot.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     bridge = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     bridge.bind(("127.0.0.1", 0))
-    station = mavlink.MAVLink(None, srcSystem=STATION, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
-    beat: Any = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
-    take: Any = mavlink.MAVLink_request_data_stream_message(1, 1, mavlink.MAV_DATA_STREAM_ALL, TAKEN, 1)
+    station = mavlink.MAVLink(
+        None, srcSystem=STATION, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER
+    )
+    beat: Any = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+    )
+    take: Any = mavlink.MAVLink_request_data_stream_message(
+        1, 1, mavlink.MAV_DATA_STREAM_ALL, TAKEN, 1
+    )
     joined = speaks = True
     sent = 0.0
     print("ready", flush=True)

@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import ALTITUDE, MAX_AGE, OWN_MAP, OWN_SCENARIO, ArduPlane, burn, guided_scenario
+from tests.sitl.kit import (
+    ALTITUDE,
+    MAX_AGE,
+    OWN_MAP,
+    OWN_SCENARIO,
+    ArduPlane,
+    burn,
+    guided_scenario,
+)
 
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -21,10 +29,15 @@ from flight_analysis.report.guided import BANDS, control_errors
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
 
-SCENARIO = find_scenario(OWN_SCENARIO or str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml"))
-MARK = 1550  # us, where the stick of the rudder is during an engagement, so that its return to the pilot shows
+SCENARIO = find_scenario(
+    OWN_SCENARIO or str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml")
+)
+# us, where the stick of the rudder is during an engagement, so that its return to the pilot shows
+MARK = 1550
 RC_PERIOD = 0.1  # s, of RC_CHANNELS in the autopilot's log
-LATE = 0.4  # s, for a busy host: commands of the pilot and of the log pass through several processes
+LATE = (
+    0.4  # s, for a busy host: commands of the pilot and of the log pass through several processes
+)
 RC_OVERRIDE_TIME = 3.0  # s, the autopilot's default: without a new Joy the last one acts so long
 
 
@@ -40,9 +53,11 @@ def engaged(plane: ArduPlane, duration: float) -> AbstractContextManager[Process
 
 
 def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
-    """In turns and climbs rates and pose are those of its own log: slopes of 1 within 1 %, and V its airspeed within 5 %.
+    """In turns and climbs rates and pose are those of its own log: slopes of 1 within 1 %, and V
+    its airspeed within 5 %.
 
-    V is the airspeed of its estimator, VFR_HUD that of the sensor, an equivalent one. In the autopilot they differ by 3 %.
+    V is the airspeed of its estimator, VFR_HUD that of the sensor, an equivalent one. In the
+    autopilot they differ by 3 %.
     """
     plane.level()
     channel_map = map_of(plane, captured=False)  # V before an engagement too
@@ -55,21 +70,39 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     t, equivalent = plane.log("VFR_HUD", "airspeed")
     inside = (t > t_y[0]) & (t < t_y[-1])
     # the last field of ardupilot_msgs/msg/Airspeed is true over equivalent airspeed
-    ratio = np.mean([struct.unpack("<f", message.data[-4:])[0] for message in messages if message.topic == "/ap/airspeed"])
+    ratio = np.mean(
+        [
+            struct.unpack("<f", message.data[-4:])[0]
+            for message in messages
+            if message.topic == "/ap/airspeed"
+        ]
+    )
     row = load_map(channel_map).outputs["V"]
-    airspeed = (np.interp(t[inside], t_y, tape["y"]["V"]).mean() - row.offset) / (equivalent[inside].mean() * ratio)
-    assert {name: fit.slope for name, fit in compared.items()} == pytest.approx(dict.fromkeys(compared, 1.0), abs=0.01)
-    assert max(abs(compared[name].offset) for name in ("p", "q", "r", "phi", "theta", "psi")) < 0.01  # rad/s, rad
-    assert max(abs(compared[name].offset) for name in ("north", "east", "altitude")) < 2.0  # m: home and the estimator's origin
-    assert row.captured or airspeed == pytest.approx(1.0, abs=0.05)  # a captured V is 0 in a dry run
+    airspeed = (np.interp(t[inside], t_y, tape["y"]["V"]).mean() - row.offset) / (
+        equivalent[inside].mean() * ratio
+    )
+    assert {name: fit.slope for name, fit in compared.items()} == pytest.approx(
+        dict.fromkeys(compared, 1.0), abs=0.01
+    )
+    assert (
+        max(abs(compared[name].offset) for name in ("p", "q", "r", "phi", "theta", "psi")) < 0.01
+    )  # rad/s, rad
+    assert (
+        max(abs(compared[name].offset) for name in ("north", "east", "altitude")) < 2.0
+    )  # m: home and the estimator's origin
+    assert row.captured or airspeed == pytest.approx(
+        1.0, abs=0.05
+    )  # a captured V is 0 in a dry run
     assert "sample refused" not in (plane.run / "log" / "bridge.log").read_text(encoding="utf-8")
     assert "/ap/joy" not in {message.topic for message in messages}, "a dry run sends nothing"
 
 
 def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
-    """While they are commanded the errors of q and p stay below y_m, and every tick of the log replays.
+    """While they are commanded the errors of q and p stay below y_m, and every tick of the log
+    replays.
 
-    An aircraft that does not follow has a ratio of 1 or more. Calm flights had 0.63, 0.49; with identified gains 0.43, 0.17.
+    An aircraft that does not follow has a ratio of 1 or more. Calm flights had 0.63, 0.49; with
+    identified gains 0.43, 0.17.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -79,11 +112,15 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
     y, y_m = tape["y"], tape["y_m"]
     t = (y.stamp_ns - tape.start_ns) / 1e9
     pulses = SCENARIO.reference_model.pulses
-    assert one["start"] < min(pulse.start[0] for pulse in pulses.values()), "engaged after the first command"
+    assert one["start"] < min(pulse.start[0] for pulse in pulses.values()), (
+        "engaged after the first command"
+    )
     figures = {}
     for name in pulses.keys() & set("qp"):
         edges = zip(pulses[name].start, pulses[name].stop, strict=True)
-        commanded = in_spans(t, [(start, stop + 1.0) for start, stop in edges])  # elsewhere y_m is 0, and e is noise
+        commanded = in_spans(
+            t, [(start, stop + 1.0) for start, stop in edges]
+        )  # elsewhere y_m is 0, and e is noise
         reference = np.interp(y.stamp_ns[commanded], y_m.stamp_ns, y_m[name])
         figures[name] = float(np.std(y[name][commanded] - reference) / np.std(reference))
     assert max(figures.values()) < 0.75
@@ -91,10 +128,12 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
 
 
 def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: ArduPlane) -> None:
-    """The rms of q while engaged is at most twice that in GUIDED just before, by the autopilot's log; the envelope may end it.
+    """The rms of q while engaged is at most twice that in GUIDED just before, by the autopilot's
+    log; the envelope may end it.
 
-    SIM_WIND_TURB 2 moves q by 0.4 rad/s in GUIDED, far more than a command: an error would tell of the wind. The rms of 8 s
-    differs from one time to the next; a law at its limit of stability has several times as much.
+    SIM_WIND_TURB 2 moves q by 0.4 rad/s in GUIDED, far more than a command: an error would tell of
+    the wind. The rms of 8 s differs from one time to the next; a law at its limit of stability has
+    several times as much.
     """
     before = 8.0  # s in GUIDED
     with ExitStack() as afterwards:
@@ -108,19 +147,26 @@ def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: Ar
     (one,) = plane.summary()["engagements"]
     ended = began + (one["stop"] or SCENARIO.flight.duration) - one["start"]
     t, q = plane.log("ATTITUDE", "pitchspeed")
-    own, law = (np.std(q[(t > start) & (t < stop)]) for start, stop in ((began - before, began), (began, ended)))
+    own, law = (
+        np.std(q[(t > start) & (t < stop)])
+        for start, stop in ((began - before, began), (began, ended))
+    )
     assert ended - began > before / 2.0, f"too short for an rms: {one['reason']}"
     assert law < 2.0 * own
     assert one["stop"] is None or "outside the envelope" in one["reason"]
 
 
-@pytest.mark.parametrize("turns", [1, pytest.param(10, marks=[pytest.mark.long, pytest.mark.timeout(1000)])])
+@pytest.mark.parametrize(
+    "turns", [1, pytest.param(10, marks=[pytest.mark.long, pytest.mark.timeout(1000)])]
+)
 def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: int) -> None:
-    """A minute for each turn, climb and change of airspeed: engaged to the end, and all are held again after 45 s.
+    """A minute for each turn, climb and change of airspeed: engaged to the end, and all are held
+    again after 45 s.
 
-    Altitude and airspeed within the bands in which a guided flight counts as settled, 5 m and 1 m/s. The gyro of the simulator
-    drifts by up to b = 4.4 mrad/s, SIM_DRIFT_SPEED 0.05 deg/s a minute for 5 minutes, and heading is off by
-    b g / (k_phi k_chi V): 2.6 deg for the bandwidth of p in the example. 2 deg are those of a settled heading.
+    Altitude and airspeed within the bands in which a guided flight counts as settled, 5 m and 1
+    m/s. The gyro of the simulator drifts by up to b = 4.4 mrad/s, SIM_DRIFT_SPEED 0.05 deg/s a
+    minute for 5 minutes, and heading is off by b g / (k_phi k_chi V): 2.6 deg for the bandwidth of
+    p in the example. 2 deg are those of a settled heading.
     """
     first, each = 15.0, 60.0  # s
     starts = (first + each * np.arange(turns)).tolist()
@@ -135,14 +181,20 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
     tape = read_run(plane.run).tape
     t, errors = tape.time("guidance"), control_errors(tape)
     held = in_spans(t, [(start + 45.0, start + each) for start in starts])
-    largest = {name: float(np.max(np.abs(errors[name][held]))) for name in ("heading", "altitude", "V")}
-    bands = {name: BANDS[name] for name in largest} | {"heading": BANDS["heading"] + np.radians(2.6)}
+    largest = {
+        name: float(np.max(np.abs(errors[name][held]))) for name in ("heading", "altitude", "V")
+    }
+    bands = {name: BANDS[name] for name in largest} | {
+        "heading": BANDS["heading"] + np.radians(2.6)
+    }
     assert {name for name, error in largest.items() if error > bands[name]} == set(), largest
     plane.start("replay", str(plane.run)).succeed(120.0)
 
 
 class Event(NamedTuple):
-    """What ends an engagement, the reason in the summary, and when the sticks act again, s after the event."""
+    """What ends an engagement, the reason in the summary, and when the sticks act again, s after
+    the event.
+    """
 
     act: Callable[[ArduPlane, Process], Callable[[], object] | None]
     reason: str
@@ -190,22 +242,33 @@ def kill_agent(plane: ArduPlane, _: Process) -> Callable[[], object]:
 AT_ONCE = (-RC_PERIOD, RC_PERIOD + LATE)
 AFTER_STATUS = (-RC_PERIOD, 1.5 + RC_PERIOD + LATE)  # a message of /ap/status every 0.5 s
 AFTER_TIMEOUT = (0.0, MAX_AGE + RC_PERIOD + LATE)  # of u, by `silence.max_age`
-AFTER_OVERRIDE_TIME = (RC_OVERRIDE_TIME - 0.5, RC_OVERRIDE_TIME + RC_PERIOD + LATE)  # no release reaches the autopilot
+AFTER_OVERRIDE_TIME = (
+    RC_OVERRIDE_TIME - 0.5,
+    RC_OVERRIDE_TIME + RC_PERIOD + LATE,
+)  # no release reaches the autopilot
 
 EVENTS = {
     "override by a switch": Event(override, "pilot override by switch", AT_ONCE),
-    "override by a moved stick": Event(move_a_stick, "pilot override by switch", AT_ONCE, ("above: 1700.0", "moved: 100.0")),
+    "override by a moved stick": Event(
+        move_a_stick, "pilot override by switch", AT_ONCE, ("above: 1700.0", "moved: 100.0")
+    ),
     "release": Event(release, "disengaged by request", AT_ONCE),
     "mode changed": Event(change_mode, "the mode is not MANUAL", AFTER_STATUS),
-    "controller killed": Event(kill("rise_di_controller.main"), "controller was killed", AFTER_TIMEOUT),
+    "controller killed": Event(
+        kill("rise_di_controller.main"), "controller was killed", AFTER_TIMEOUT
+    ),
     "bridge killed": Event(kill("autopilot_bridge.main"), "bridge was killed", AFTER_OVERRIDE_TIME),
     "agent killed": Event(kill_agent, "s old", AFTER_OVERRIDE_TIME),
     "disarmed": Event(disarm, "the aircraft is not armed", AFTER_STATUS),
 }
 
 
-def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(plane: ArduPlane) -> None:
-    """The autopilot shows Joy in channels 1 to 4, so that an override by a stick of these would act on the law's own u."""
+def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(
+    plane: ArduPlane,
+) -> None:
+    """The autopilot shows Joy in channels 1 to 4, so that an override by a stick of these would act
+    on the law's own u.
+    """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
         time.sleep(2.0)
@@ -221,17 +284,22 @@ def test_the_pilot_has_the_aircraft_again(
 ) -> None:
     """Within the time of the event the sticks act, and the log says why the engagement ended.
 
-    The time of a release begins with it in the log: `rise-di engage --off` takes half a second to start.
+    The time of a release begins with it in the log: `rise-di engage --off` takes half a second to
+    start.
     """
     event = EVENTS[name]
-    channel_map = map_of(plane) if event.change is None else plane.patient_map("ardupilot", event.change)
+    channel_map = (
+        map_of(plane) if event.change is None else plane.patient_map("ardupilot", event.change)
+    )
     with ExitStack() as afterwards, plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
         began = time.time()
         if (undo := event.act(plane, flight)) is not None:
             afterwards.callback(undo)
         sticks_at = sticks_act(plane, began)
-        if "killed" not in name or event.act is kill_agent:  # without one of its nodes the flight ends by itself
+        if (
+            "killed" not in name or event.act is kill_agent
+        ):  # without one of its nodes the flight ends by itself
             flight.interrupt()
         flight.end()
         afterwards.close()
@@ -245,7 +313,9 @@ def test_the_pilot_has_the_aircraft_again(
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:
-    """The time from which on the rudder channel is where its stick is, for 0.5 s at least; s of the system clock."""
+    """The time from which on the rudder channel is where its stick is, for 0.5 s at least; s of the
+    system clock.
+    """
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
         plane.state()  # writes the log
@@ -258,7 +328,9 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
 
 
 def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) -> None:
-    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off: the failsafe acts after the release."""
+    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off: the failsafe acts
+    after the release.
+    """
     bound = 20.0
     channel_map = plane.patient_map("ardupilot", ("max_engaged: 120.0", f"max_engaged: {bound}"))
     with plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
@@ -276,7 +348,9 @@ def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) ->
 
 
 def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a release acts at once."""
+    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a
+    release acts at once.
+    """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
         for process in burn(3.0):
@@ -292,7 +366,9 @@ def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane)
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(plane: ArduPlane, what: str) -> None:
-    """One flight of the stack goes on while agent or autopilot are away. The restarted aircraft takes off again."""
+    """One flight of the stack goes on while agent or autopilot are away. The restarted aircraft
+    takes off again.
+    """
     with engaged(plane, 400.0) as flight:
         if what == "agent":
             again = plane.kill("MicroXRCEAgent")

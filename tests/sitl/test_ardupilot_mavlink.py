@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map `ardupilot_mavlink` against ArduPlane's MAVLink: what the bridge releases, refuses and flies through."""
+"""The map `ardupilot_mavlink` against ArduPlane's MAVLink: what the bridge releases, refuses and
+flies through.
+"""
 
 import re
 import time
@@ -34,24 +36,32 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
         autopilot.down()
 
 
-def engaged(plane: ArduPlane, duration: float, *changes: tuple[str, str]) -> AbstractContextManager[Process]:
+def engaged(
+    plane: ArduPlane, duration: float, *changes: tuple[str, str]
+) -> AbstractContextManager[Process]:
     """A flight of the stack, engaged from level flight with the sticks in trim."""
     return plane.engaged(SCENARIO.path, plane.mavlink_map(*changes), duration)
 
 
 def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> None:
-    """As over DDS: while they are commanded the errors of q and p stay below y_m, by the autopilot's log, and ticks replay."""
+    """As over DDS: while they are commanded the errors of q and p stay below y_m, by the
+    autopilot's log, and ticks replay.
+    """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
     (engagement,) = plane.summary()["engagements"]
     assert engagement["stop"] is None, engagement["reason"]
     errors = plane.own_errors()
-    assert max(errors[name][0] / errors[name][1] for name in "qp") < 0.75  # an aircraft that does not follow has 1 or more
+    assert (
+        max(errors[name][0] / errors[name][1] for name in "qp") < 0.75
+    )  # an aircraft that does not follow has 1 or more
     plane.start("replay", str(plane.run)).succeed(60.0)
 
 
 class Trouble(NamedTuple):
-    """What fails, by parameters, a pattern of the reason, empty where the bridge flies on, and the time for it, s."""
+    """What fails, by parameters, a pattern of the reason, empty where the bridge flies on, and the
+    time for it, s.
+    """
 
     parameters: Sequence[tuple[str, float]]
     reason: str
@@ -61,7 +71,10 @@ class Trouble(NamedTuple):
 def stuck(surface: str, pulse: float) -> tuple[tuple[str, float], ...]:
     """A servo that stays at a pulse, us: its ends are 2 us apart."""
     number = SERVOS[surface]
-    return tuple((f"SERVO{number}_{end}", pulse + shift) for end, shift in (("MIN", -1), ("MAX", 1), ("TRIM", 0)))
+    return tuple(
+        (f"SERVO{number}_{end}", pulse + shift)
+        for end, shift in (("MIN", -1), ("MAX", 1), ("TRIM", 0))
+    )
 
 
 TROUBLE = {
@@ -77,8 +90,14 @@ TROUBLE = {
     "first accelerometer failed": Trouble((("SIM_ACC_FAIL_MSK", 1),), "", 15.0),
 }
 HEALTHY = {
-    **{f"SERVO{n}_{end}": pulse for n in SERVOS.values() for end, pulse in (("MIN", 1100), ("MAX", 1900), ("TRIM", 1500))},
-    **dict.fromkeys(("SIM_ENGINE_FAIL", "SIM_ARSPD_FAIL", "SIM_GYR_FAIL_MSK", "SIM_ACC_FAIL_MSK"), 0),
+    **{
+        f"SERVO{n}_{end}": pulse
+        for n in SERVOS.values()
+        for end, pulse in (("MIN", 1100), ("MAX", 1900), ("TRIM", 1500))
+    },
+    **dict.fromkeys(
+        ("SIM_ENGINE_FAIL", "SIM_ARSPD_FAIL", "SIM_GYR_FAIL_MSK", "SIM_ACC_FAIL_MSK"), 0
+    ),
     "SIM_GPS1_ENABLE": 1,
 }
 
@@ -87,7 +106,9 @@ HEALTHY = {
 def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
     plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """A surface that does not move, an engine or an airspeed sensor that fails end it; a spare sensor takes over."""
+    """A surface that does not move, an engine or an airspeed sensor that fails end it; a spare
+    sensor takes over.
+    """
     trouble = TROUBLE[name]
     with ExitStack() as afterwards, engaged(plane, 100.0) as flight:
         began = time.time()
@@ -103,7 +124,11 @@ def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
         flight.interrupt()
         flight.end()
     (engagement,) = read_run(plane.run).engagements or []
-    took = "flies on" if engagement.stop_ns is None else f"{engagement.stop_ns / 1e9 - began:.2f} s: {engagement.reason}"
+    took = (
+        "flies on"
+        if engagement.stop_ns is None
+        else f"{engagement.stop_ns / 1e9 - began:.2f} s: {engagement.reason}"
+    )
     record_testsuite_property(f"ArduPlane over MAVLink, {name}", took)
     if trouble.reason:
         assert re.search(trouble.reason, engagement.reason), took
@@ -113,7 +138,9 @@ def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
 
 
 def test_stuck_aileron_is_found_by_a_turn_that_guidance_commands(plane: ArduPlane) -> None:
-    """In calm air an aileron that sticks in trim moves nothing, and nothing tells it: u grows where a bank is commanded."""
+    """In calm air an aileron that sticks in trim moves nothing, and nothing tells it: u grows where
+    a bank is commanded.
+    """
     plane.level()
     scenario = plane.folder / "turn.yaml"
     program = plane.turns([10.0], plane.state()["alt"] - plane.home, 24.0)
@@ -167,7 +194,9 @@ def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: Ard
 
 
 def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPlane) -> None:
-    """No field tells the loss, and the override keeps the autopilot's own failsafe off: it acts after the release."""
+    """No field tells the loss, and the override keeps the autopilot's own failsafe off: it acts
+    after the release.
+    """
     bound = 20.0
     with engaged(plane, 60.0, ("max_engaged: 120.0", f"max_engaged: {bound}")) as flight:
         assert "the loss of the transmitter cannot be seen over this link" in flight.output
@@ -203,7 +232,9 @@ def failsafe(plane: ArduPlane) -> Iterator[None]:
     plane.say("param", "FS_GCS_ENABL", "0")
 
 
-def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(plane: ArduPlane) -> None:
+def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(
+    plane: ArduPlane,
+) -> None:
     plane.level()
     with plane.shared_link() as link:
         flight = plane.fly(SCENARIO.path, plane.shared_map(), 100.0, "--send")
@@ -226,9 +257,14 @@ def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(pl
 
 
 @pytest.mark.parametrize("repeats", [1, 20])
-def test_rates_that_a_ground_station_takes_while_engaged_are_requested_again_or_end_it(plane: ArduPlane, repeats: int) -> None:
+def test_rates_that_a_ground_station_takes_while_engaged_are_requested_again_or_end_it(
+    plane: ArduPlane, repeats: int
+) -> None:
     """Taken once, the rates come back and the flight goes on. Taken without end, they end it."""
-    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+    with (
+        plane.shared_link() as link,
+        plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight,
+    ):
         for _ in range(repeats):
             link("take")
             time.sleep(0.3)
@@ -240,14 +276,19 @@ def test_rates_that_a_ground_station_takes_while_engaged_are_requested_again_or_
         flight.end()
     (engagement,) = plane.summary()["engagements"]
     if repeats > 1:
-        assert re.search("ATTITUDE comes at .* Hz, requested are 40 Hz.* for 2 s", engagement["reason"])
+        assert re.search(
+            "ATTITUDE comes at .* Hz, requested are 40 Hz.* for 2 s", engagement["reason"]
+        )
     else:
         assert engagement["stop"] is None, engagement["reason"]
 
 
 def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: ArduPlane) -> None:
     """The release cannot arrive, and the autopilot stays in MANUAL."""
-    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+    with (
+        plane.shared_link() as link,
+        plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight,
+    ):
         plane.say("stick", "4", "1550")
         time.sleep(1.0)
         cut = time.time()
@@ -255,13 +296,22 @@ def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: A
         assert re.search(r"RELEASE: .* old \(mavlink/", flight.output)
         t, pulses = plane.log("RC_CHANNELS", "chan4_raw")
         acted = t[(t > cut) & (pulses[:, 0] == 1550.0)][0] - cut
-        assert OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE  # RC_CHANNELS comes each 0.1 s
+        assert (
+            OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE
+        )  # RC_CHANNELS comes each 0.1 s
         assert modes == {"MANUAL"}
 
 
-def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(plane: ArduPlane, failsafe: None) -> None:
-    """The overrides hide the silence from the autopilot, whose failsafe acts FS_LONG_TIMEOUT after the last of them."""
-    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(
+    plane: ArduPlane, failsafe: None
+) -> None:
+    """The overrides hide the silence from the autopilot, whose failsafe acts FS_LONG_TIMEOUT after
+    the last of them.
+    """
+    with (
+        plane.shared_link() as link,
+        plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight,
+    ):
         link("silence")
         flight.wait_for("is silent for 5 s", SILENT)
         plane.until(lambda state: state["mode"] == "LOITER", timeout=LOITERS)
@@ -271,8 +321,12 @@ def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(plan
         flight.end()
 
 
-@pytest.mark.parametrize(("how", "mode"), [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")])
-def test_mode_after_a_release_is_the_pilots_or_one_that_flies(plane: ArduPlane, how: str, mode: str) -> None:
+@pytest.mark.parametrize(
+    ("how", "mode"), [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")]
+)
+def test_mode_after_a_release_is_the_pilots_or_one_that_flies(
+    plane: ArduPlane, how: str, mode: str
+) -> None:
     with engaged(plane, 100.0) as flight:
         if how == "switch":
             plane.say("stick", "7", "1900")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client: into offboard, and back into a mode of PX4's own."""
+"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client: into offboard, and back
+into a mode of PX4's own.
+"""
 
 import time
 from collections.abc import Callable, Mapping
@@ -26,14 +28,18 @@ SHORT_LOSS = 0.3  # s: three heartbeats
 
 def engaged(px4: Px4, duration: float) -> AbstractContextManager[Process]:
     """A flight of the stack, engaged from Hold, straight ahead."""
-    return px4.engaged(SCENARIO.path, OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml")), duration)
+    return px4.engaged(
+        SCENARIO.path, OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml")), duration
+    )
 
 
 def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
-    """The part of y that goes along with y_m has half to one and a half of its size, thrust is off its limits, ticks replay.
+    """The part of y that goes along with y_m has half to one and a half of its size, thrust is off
+    its limits, ticks replay.
 
-    The noise of its gyro is larger than the commands: rms 50 mrad/s in q and 104 in p, in Hold too. The part is uncertain
-    by 0.1, and in a flight it was 1.04 in q, 0.93 in p, 0.83 in V, 0.25 s after y_m.
+    The noise of its gyro is larger than the commands: rms 50 mrad/s in q and 104 in p, in Hold too.
+    The part is uncertain by 0.1, and in a flight it was 1.04 in q, 0.93 in p, 0.83 in V, 0.25 s
+    after y_m.
     """
     with engaged(px4, SCENARIO.flight.duration) as flight:
         assert px4.state()["nav_state"] == OFFBOARD
@@ -51,7 +57,9 @@ def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
 
 
 class Event(NamedTuple):
-    """What ends an engagement, the reason in the summary, and the time until a mode of PX4's own flies, s."""
+    """What ends an engagement, the reason in the summary, and the time until a mode of PX4's own
+    flies, s.
+    """
 
     act: Callable[[Px4, Process], Callable[[], object] | None]
     reason: str
@@ -101,19 +109,27 @@ EVENTS = {
     "release": Event(release, "disengaged by request", OWN_LAW),
     "override by the stick": Event(override, "pilot override by pilot", OWN_LAW),
     "mode changed": Event(change_mode, "the mode is not offboard", OWN_LAW),
-    "controller killed": Event(kill("rise_di_controller.main"), "controller was killed", MAX_AGE + OWN_LAW),
+    "controller killed": Event(
+        kill("rise_di_controller.main"), "controller was killed", MAX_AGE + OWN_LAW
+    ),
     "bridge killed": Event(kill("autopilot_bridge.main"), "bridge was killed", LOSS),
-    "bridge killed, short timeout": Event(kill("autopilot_bridge.main"), "bridge was killed", LOSS, {LOSS: SHORT_LOSS}),
+    "bridge killed, short timeout": Event(
+        kill("autopilot_bridge.main"), "bridge was killed", LOSS, {LOSS: SHORT_LOSS}
+    ),
     "agent killed": Event(kill_agent, "s old", LOSS),
     "disarmed": Event(disarm, "the aircraft is not armed", OWN_LAW),
 }
 
 
 @pytest.mark.parametrize("name", EVENTS)
-def test_px4_flies_by_its_own_law_again(px4: Px4, name: str, record_testsuite_property: Callable[[str, object], None]) -> None:
-    """Within the time of the event PX4 leaves offboard or is disarmed, and the log says why the engagement ended.
+def test_px4_flies_by_its_own_law_again(
+    px4: Px4, name: str, record_testsuite_property: Callable[[str, object], None]
+) -> None:
+    """Within the time of the event PX4 leaves offboard or is disarmed, and the log says why the
+    engagement ended.
 
-    The time of a release and of an override begins with the bridge's release in the log: their commands take longer to start.
+    The time of a release and of an override begins with the bridge's release in the log: their
+    commands take longer to start.
     """
     event = EVENTS[name]
     with ExitStack() as afterwards, engaged(px4, 90.0) as flight:
@@ -126,7 +142,9 @@ def test_px4_flies_by_its_own_law_again(px4: Px4, name: str, record_testsuite_pr
             afterwards.callback(undo)
         px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
         changed = px4.mode_changed() + time.time() - time.monotonic()
-        if "killed" not in name or event.act is kill_agent:  # without one of its nodes the flight ends by itself
+        if (
+            "killed" not in name or event.act is kill_agent
+        ):  # without one of its nodes the flight ends by itself
             flight.wait_for("RELEASE").interrupt()
         flight.end()
         afterwards.close()
@@ -139,7 +157,9 @@ def test_px4_flies_by_its_own_law_again(px4: Px4, name: str, record_testsuite_pr
     assert event.reason in f"{one['reason']}; {summary['outcome']}"
 
 
-def test_lost_transmitter_releases_within_a_second(px4: Px4, record_testsuite_property: Callable[[str, object], None]) -> None:
+def test_lost_transmitter_releases_within_a_second(
+    px4: Px4, record_testsuite_property: Callable[[str, object], None]
+) -> None:
     """PX4 would fly on in offboard: COM_RCL_EXCEPT of the kit has the bit of offboard."""
     px4.say("param", "set", "COM_RC_IN_MODE", "1")
     stick = px4.tool("stick", "600", "600")
@@ -162,7 +182,9 @@ def test_lost_transmitter_releases_within_a_second(px4: Px4, record_testsuite_pr
 
 
 def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4 flies in Hold."""
+    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4
+    flies in Hold.
+    """
     with engaged(px4, 60.0) as flight:
         for process in burn(3.0):
             process.wait()
@@ -171,12 +193,17 @@ def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
         flight.interrupt()
         flight.end()
     (one,) = px4.summary()["engagements"]
-    assert one["reason"] in {"disengaged by request", "the mode is not offboard (nav_state is 4)"} or "s old" in one["reason"]
+    assert (
+        one["reason"] in {"disengaged by request", "the mode is not offboard (nav_state is 4)"}
+        or "s old" in one["reason"]
+    )
 
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(px4: Px4, what: str) -> None:
-    """One flight of the stack goes on. PX4's client connects again where it has noticed that the agent was away."""
+    """One flight of the stack goes on. PX4's client connects again where it has noticed that the
+    agent was away.
+    """
     with engaged(px4, 400.0) as flight:
         if what == "agent":
             again = px4.kill("MicroXRCEAgent")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PID control of each output, with a filtered derivative: an example of a control law in a package of its own."""
+"""PID control of each output, with a filtered derivative: an example of a control law in a package
+of its own.
+"""
 
 from typing import NamedTuple
 
@@ -44,7 +46,9 @@ class PidState(NamedTuple):
 
 
 def u_from_trim(state: PidState, params: PidParams) -> Array:
-    """Deviation of u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e + lead e_dot)."""
+    """Deviation of u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e + lead
+    e_dot).
+    """
     terms = state.e - state.e_0 + params.Lambda * state.integral_e + params.lead * state.e_dot
     return -params.input_scale * params.D * params.K * terms
 
@@ -62,7 +66,8 @@ def limited(
     """One tick inside the limits: u = u_trim + u_from_trim.
 
     e_dot      += (1 - exp(-dt / filter_time)) ((e - e_p) / dt - e_dot)
-    integral_e += dt (e + e_p) / 2, or less of it where u is saturated and would move further outwards (anti-windup)
+    integral_e += dt (e + e_p) / 2, or less of it where u is saturated and would move further
+    outwards (anti-windup)
     """
     e = measured.y - measured.y_m
     share = -array_namespace(e).expm1(-dt / params.filter_time)
@@ -70,8 +75,16 @@ def limited(
     after = PidState(state.e_0, e, e_dot, state.integral_e + dt * (e + state.e) / 2.0)
     u_free = measured.u_trim + u_from_trim(after, params)
     beyond = u_free - saturate(u_free, measured.u_before, dt, limits)
-    change = -params.input_scale * params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
-    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond))
+    change = (
+        -params.input_scale
+        * params.D
+        * params.K
+        * params.Lambda
+        * (after.integral_e - state.integral_e)
+    )
+    after = after._replace(
+        integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond)
+    )
     u_free = measured.u_trim + u_from_trim(after, params)
     return after, u_free, saturate(u_free, measured.u_before, dt, limits)
 
@@ -79,19 +92,25 @@ def limited(
 def retune(state: PidState, old: PidParams, new: PidParams) -> PidState:
     """The same u with new parameters: e_0 takes the difference (bumpless transfer)."""
     terms = -new.D * u_from_trim(state, old) / (new.input_scale * new.K)
-    return state._replace(e_0=state.e + new.Lambda * state.integral_e + new.lead * state.e_dot - terms)
+    return state._replace(
+        e_0=state.e + new.Lambda * state.integral_e + new.lead * state.e_dot - terms
+    )
 
 
 CONTROL_LAW = ControlLaw(PidState, engage, without_limits(limited), limited, retune)
 
 
 class PidConfig(ControllerConfig):
-    """The controller under PID control: the parameters of a scenario's section beside those of every law."""
+    """The controller under PID control: the parameters of a scenario's section beside those of
+    every law.
+    """
 
     K: Positives = Field(description="proportional gains in scaled inputs, 1/s")
     Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
     lead: NonNegatives = Field(description="derivative gains over proportional ones, s")
-    filter_time: Positives = Field(description="time constants of the filters of the derivatives, s")
+    filter_time: Positives = Field(
+        description="time constants of the filters of the derivatives, s"
+    )
 
     def check_law(self) -> None:
         """One value for each channel."""

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="aircraft_sim",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Simulated aircraft of the RISE-DI flight stack: x_dot = A x + f(x, t) + B u, y = C x, with gusts.",
+    description="Simulated aircraft of the RISE-DI flight stack: x_dot = A x + f(x, t) + B u, y "
+    "= C x, with gusts.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["aircraft_sim"],

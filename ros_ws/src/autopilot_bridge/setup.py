@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="autopilot_bridge",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Bridge to an autopilot, in place of the simulated aircraft: y and u through a channel map.",
+    description="Bridge to an autopilot, in place of the simulated aircraft: y and u through a "
+    "channel map.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["autopilot_bridge"],

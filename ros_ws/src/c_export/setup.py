@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="c_export",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="The RISE-DI controller as C99 code, library and FMU, with a proof that it equals the Python controller.",
+    description="The RISE-DI controller as C99 code, library and FMU, with a proof that it "
+    "equals the Python controller.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["c_export"],

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="control_laws",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Control laws other than RISE-DI, each a module of equations; the controller flies those of y alone.",
+    description="Control laws other than RISE-DI, each a module of equations; the controller "
+    "flies those of y alone.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["control_laws"],

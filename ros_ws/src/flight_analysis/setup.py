@@ -8,7 +8,8 @@ from setuptools import setup
 setup(
     name="flight_analysis",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Flights without ROS: scenarios, the closed loop in one process, metrics, the report page.",
+    description="Flights without ROS: scenarios, the closed loop in one process, metrics, the "
+    "report page.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=[

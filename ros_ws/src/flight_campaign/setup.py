@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="flight_campaign",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Monte Carlo campaigns over thousands of uncertain aircraft, tuning and comparison of control laws.",
+    description="Monte Carlo campaigns over thousands of uncertain aircraft, tuning and "
+    "comparison of control laws.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_campaign"],

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="flight_core",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators, scenario files, the tape.",
+    description="Basics of the RISE-DI flight stack without ROS: parameters, named vectors, "
+    "rates, integrators, scenario files, the tape.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_core"],

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="flight_guidance",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Guidance of the RISE-DI flight stack: attitude, altitude, course and routes outside the control law.",
+    description="Guidance of the RISE-DI flight stack: attitude, altitude, course and routes "
+    "outside the control law.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_guidance"],

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="flight_ros",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Shared ROS code of the RISE-DI flight stack: topics, parameters, messages as named vectors, ticker, base class of a node.",
+    description="Shared ROS code of the RISE-DI flight stack: topics, parameters, messages as "
+    "named vectors, ticker, base class of a node.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_ros"],

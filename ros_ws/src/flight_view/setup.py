@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="flight_view",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="The live page of the RISE-DI flight stack: charts, horizon and 3-D scene of a flight from its growing log.",
+    description="The live page of the RISE-DI flight stack: charts, horizon and 3-D scene of a "
+    "flight from its growing log.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_view"],

@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="reference_model",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Reference model of the RISE-DI flight stack: commands u_m(t) and x_m_dot = A_m x_m + B_m u_m, y_m = C x_m.",
+    description="Reference model of the RISE-DI flight stack: commands u_m(t) and x_m_dot = A_m "
+    "x_m + B_m u_m, y_m = C x_m.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["reference_model"],

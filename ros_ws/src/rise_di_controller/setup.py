@@ -7,7 +7,8 @@ from setuptools import setup
 setup(
     name="rise_di_controller",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="RISE dynamic inversion: a control law that uses the measured output only, its guard, and a ROS 2 node with a fixed rate.",
+    description="RISE dynamic inversion: a control law that uses the measured output only, its "
+    "guard, and a ROS 2 node with a fixed rate.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["rise_di_controller"],

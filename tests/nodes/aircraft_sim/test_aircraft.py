@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog and failsafe of the aircraft's node when u times out, its refusals, and when its flight begins."""
+"""The watchdog and failsafe of the aircraft's node when u times out, its refusals, and when its
+flight begins.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,14 +38,18 @@ class Flight:
 
     def ailerons(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The positions of the aileron from a sample on."""
-        return np.array([sample.channels["actuator.aileron"] for sample in self.world.vectors("/truth")[begin:]])
+        return np.array(
+            [sample.channels["actuator.aileron"] for sample in self.world.vectors("/truth")[begin:]]
+        )
 
 
 @contextmanager
 def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
     """An aircraft of a scenario with other parameters."""
     with world_of(
-        "--params-file", str(scenario.path), *parameters({f"aircraft.{name}": value for name, value in values.items()})
+        "--params-file",
+        str(scenario.path),
+        *parameters({f"aircraft.{name}": value for name, value in values.items()}),
     ) as world:
         yield Flight(world)
 
@@ -53,20 +59,40 @@ def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(osprey_gust: S
         flight.fly(0.01)
         last_ns, begin = flight.world.vectors("/u")[-1].stamp_ns, len(flight.world.sent["/truth"])
         flight.world.run(MAX_AGE + HOLD + RAMP + 0.1)
-        t = np.array([sample.stamp_ns - last_ns for sample in flight.world.vectors("/truth")[begin:]]) / NANOSECONDS
+        t = (
+            np.array(
+                [sample.stamp_ns - last_ns for sample in flight.world.vectors("/truth")[begin:]]
+            )
+            / NANOSECONDS
+        )
         expected = 0.01 * np.clip(1.0 - (t - MAX_AGE - HOLD) / RAMP, 0.0, 1.0)
-        assert flight.ailerons(begin) == pytest.approx(expected, abs=0.01 * 2 * TICK / RAMP)  # ticks are 2 ms
-        assert sum("[ERROR] failsafe: u from /first#1 timed out" in line for line in flight.node.log.lines) == 1
+        assert flight.ailerons(begin) == pytest.approx(
+            expected, abs=0.01 * 2 * TICK / RAMP
+        )  # ticks are 2 ms
+        assert (
+            sum(
+                "[ERROR] failsafe: u from /first#1 timed out" in line
+                for line in flight.node.log.lines
+            )
+            == 1
+        )
         flight.world.run(3.0)
-        assert any("waiting for /u: no sample of its publisher arrives" in line for line in flight.node.log.lines)
-        assert diagnostics(flight.world, "/aircraft")[0].startswith("failsafe: u from /first#1 timed out")
+        assert any(
+            "waiting for /u: no sample of its publisher arrives" in line
+            for line in flight.node.log.lines
+        )
+        assert diagnostics(flight.world, "/aircraft")[0].startswith(
+            "failsafe: u from /first#1 timed out"
+        )
         flight.fly(0.02, sender="/second#2")
         assert flight.ailerons()[-1] == 0.02
         assert any("receiving u from /second#2" in line for line in flight.node.log.lines)
 
 
 def test_u_older_than_age_limit_does_not_end_failsafe(osprey_gust: Scenario) -> None:
-    """As of a controller that was stopped while its middleware sent: longer than the age limit, newer than the last u."""
+    """As of a controller that was stopped while its middleware sent: longer than the age limit,
+    newer than the last u.
+    """
     with flying(osprey_gust, max_age=MAX_AGE, hold=0.0, ramp=0.0) as flight:
         flight.fly(0.01)
         flight.world.run(0.2)
@@ -102,4 +128,7 @@ def test_flight_begins_with_first_u_and_is_told(osprey_gust: Scenario) -> None:
         flight.world.publisher(JointState, "/u")
         flight.node.match()
         flight.fly(0.01)
-        assert [message.value for message in flight.world.messages("/node_state")] == ["matched", "flying"]
+        assert [message.value for message in flight.world.messages("/node_state")] == [
+            "matched",
+            "flying",
+        ]

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node: the unchanged controller flies a simulated autopilot through the map examples/maps/ardupilot_2024.yaml.
+"""The bridge node: the unchanged controller flies a simulated autopilot through the map
+examples/maps/ardupilot_2024.yaml.
 
-tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates and engagement agree with the map, not that
-the map agrees with ArduPilot.
+tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates and engagement
+agree with the map, not that the map agrees with ArduPilot.
 """
 
 import math
@@ -47,7 +48,10 @@ SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 RELEASE_AFTER = 3.0  # s, RC_OVERRIDE_TIME of ArduPilot
 FULL = math.radians(30.0)  # full deflection of a surface in the map
 MAX_AGE, RELEASE = 0.2, 0.5  # s, of u in the map, and of its release
-TICK, JOY = 0.005, 0.02  # s, between two ticks of the bridge, and between two messages to the autopilot
+TICK, JOY = (
+    0.005,
+    0.02,
+)  # s, between two ticks of the bridge, and between two messages to the autopilot
 QOS = {"reliability": "reliable", "durability": "volatile", "depth": 1}
 RATES = Vector3(x=0.3, y=-0.2, z=-0.1)
 AIRSPEED = Vector3Stamped(vector=Vector3(x=-18.0, y=18.0, z=-9.0))  # of length 27
@@ -73,10 +77,17 @@ class Setup:
         self.begin_ns = world.clock.now_ns
         self.autopilot = Autopilot(SCENARIO, RELEASE_AFTER, world, world.clock.monotonic)
         self.autopilot_runs = True
-        self.u: tuple[float, ...] | None = (0.0, 0.0, 0.0, 0.0)  # published each 5 ms; None: not published
+        self.u: tuple[float, ...] | None = (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )  # published each 5 ms; None: not published
         self.further: dict[str, Any] = {}  # messages that are published each 5 ms, by topic
         self.joys: list[Sent] = []
-        world.create_subscription(Joy, "/ap/joy", lambda joy: self.joys.append(Sent(self.t, list(joy.axes))), 1)
+        world.create_subscription(
+            Joy, "/ap/joy", lambda joy: self.joys.append(Sent(self.t, list(joy.axes))), 1
+        )
         self._number = 0
 
     @property
@@ -85,10 +96,14 @@ class Setup:
         return seconds(self.world.clock.now_ns - self.begin_ns)
 
     def start(self, **changes: Any) -> Any:
-        """Start the bridge with the map after some changes of it: of a key, or of the keys of a row."""
+        """Start the bridge with the map after some changes of it: of a key, or of the keys of a
+        row.
+        """
         content = yaml.safe_load(self.map.read_text(encoding="utf-8"))
         for key, value in changes.items():
-            content[key] = content[key] | value if isinstance(value, Mapping) and key in content else value
+            content[key] = (
+                content[key] | value if isinstance(value, Mapping) and key in content else value
+            )
         self.map.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         self.bridge = self.world.start(BridgeNode)
         return self.bridge
@@ -113,14 +128,20 @@ class Setup:
         before = len(self.bridge.log.lines)
 
         def logged() -> list[str]:
-            return [line for line in self.bridge.log.lines[before:] if all(part in line for part in parts)]
+            return [
+                line
+                for line in self.bridge.log.lines[before:]
+                if all(part in line for part in parts)
+            ]
 
         self.world.until(logged, f"the line {parts}", self.step)
         return self.t
 
     def engage(self, *, on: bool = True, blind: bool = False) -> str:
         """Call the service; the reason of a refusal, empty where there is none."""
-        name, request = ("engage_blind", Trigger.Request()) if blind else ("engage", SetBool.Request(data=on))
+        name, request = (
+            ("engage_blind", Trigger.Request()) if blind else ("engage", SetBool.Request(data=on))
+        )
         return str(self.world.call(f"/bridge/{name}", request).message)
 
     def engaged(self) -> None:
@@ -134,7 +155,9 @@ class Setup:
     def sent_since(self, t: float) -> tuple[list[float], list[float]]:
         """When u and when release values were sent after a time, s from it."""
         since = [sent for sent in self.joys if sent.t > t]
-        return [sent.t - t for sent in since if not sent.released], [sent.t - t for sent in since if sent.released]
+        return [sent.t - t for sent in since if not sent.released], [
+            sent.t - t for sent in since if sent.released
+        ]
 
 
 @contextmanager
@@ -142,7 +165,12 @@ def bridged(folder: Path, **values: object) -> Iterator[Setup]:
     """A setup with parameters of the bridge."""
     channel_map = folder / "ardupilot.yaml"
     channel_map.write_bytes(MAP_FILES["ardupilot_2024"].read_bytes())
-    given = parameters({f"bridge.{name}": value for name, value in {"map": channel_map, "dry_run": "false", **values}.items()})
+    given = parameters(
+        {
+            f"bridge.{name}": value
+            for name, value in {"map": channel_map, "dry_run": "false", **values}.items()
+        }
+    )
     with world_of("--params-file", str(SCENARIO), *given) as world:
         yield Setup(world, channel_map)
 
@@ -170,7 +198,9 @@ def flown(setup: Setup, duration: float) -> dict[str, float]:
     return dict(zip(OUTPUTS, np.std(y - y_m, axis=0) / np.std(y_m, axis=0), strict=True))
 
 
-def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channels(setup: Setup) -> None:
+def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channels(
+    setup: Setup,
+) -> None:
     world, setup.u = setup.world, None
     setup.start()
     controller = world.start(ControllerNode)
@@ -195,10 +225,14 @@ def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channe
     assert max(finite) <= released_at - killed
     assert released[-1] - released[0] == pytest.approx(RELEASE, abs=JOY + TICK)
     assert np.diff(released).max() <= JOY + TICK
-    assert any("-> INACTIVE" in line for line in restarted.log.lines)  # so that its integrals do not wind up
+    assert any(
+        "-> INACTIVE" in line for line in restarted.log.lines
+    )  # so that its integrals do not wind up
 
 
-def test_pilot_override_releases_at_once_and_blocks_an_engagement_while_it_is_active(setup: Setup) -> None:
+def test_pilot_override_releases_at_once_and_blocks_an_engagement_while_it_is_active(
+    setup: Setup,
+) -> None:
     setup.start()
     setup.engaged()
     pressed = setup.t
@@ -243,11 +277,15 @@ def test_request_and_end_of_bridge_release(setup: Setup) -> None:
 
 
 @pytest.mark.parametrize("step", [20.0, -20.0])  # s, beyond the limits either way
-def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(step: float, setup: Setup) -> None:
+def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
+    step: float, setup: Setup
+) -> None:
     setup.start()
     setup.engaged()
     setup.world.clock.step_ns = nanoseconds(step)
-    setup.world.send("/u", dict.fromkeys(INPUTS, 0.0), age=step)  # of a controller, whose time is not that of its system clock
+    setup.world.send(
+        "/u", dict.fromkeys(INPUTS, 0.0), age=step
+    )  # of a controller, whose time is not that of its system clock
     before = len(setup.world.sent["/y"])
     u, setup.u = setup.u, None
 
@@ -264,7 +302,9 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(step: fl
 
 
 @pytest.mark.parametrize("suspended", [False, True])
-def test_bridge_that_did_not_run_releases_and_can_be_engaged_again(suspended: bool, setup: Setup) -> None:
+def test_bridge_that_did_not_run_releases_and_can_be_engaged_again(
+    suspended: bool, setup: Setup
+) -> None:
     """SIGSTOP of its process, and a suspended host, whose monotonic clock stands still."""
     setup.start()
     setup.engaged()
@@ -283,7 +323,12 @@ def test_bridge_that_did_not_run_releases_and_can_be_engaged_again(suspended: bo
 @pytest.mark.parametrize(
     ("topic", "kind", "count", "sentence"),
     [
-        ("/ap/airspeed", Vector3Stamped, 2, "/ap/airspeed has 2 publishers, expected the autopilot alone"),
+        (
+            "/ap/airspeed",
+            Vector3Stamped,
+            2,
+            "/ap/airspeed has 2 publishers, expected the autopilot alone",
+        ),
         ("/ap/joy", Joy, 1, "/ap/joy has 1 publishers beside this bridge, expected none"),
     ],
 )
@@ -294,7 +339,9 @@ def test_second_publisher_of_autopilot_releases_and_blocks(
     setup.engaged()
     second = setup.world.publisher(kind, topic, 5)
     begin = setup.t
-    assert setup.until_logged(f"ENGAGED -> RELEASE: {sentence}") - begin <= 1.1  # the graph is checked once a second
+    assert (
+        setup.until_logged(f"ENGAGED -> RELEASE: {sentence}") - begin <= 1.1
+    )  # the graph is checked once a second
     setup.run(1.0)
     assert setup.engage() == sentence
     second.leave()
@@ -306,9 +353,17 @@ CONDITION = {"type": "std_msgs/msg/UInt8", "field": "data", "source": "a test"}
 
 
 def test_engagement_waits_for_awaited_condition_and_can_be_withdrawn(setup: Setup) -> None:
-    guided = CONDITION | {"topic": "/ap/mode", "one_of": [15], "sentence": "the mode is not guided", "max_age": 1e3}
+    guided = CONDITION | {
+        "topic": "/ap/mode",
+        "one_of": [15],
+        "sentence": "the mode is not guided",
+        "max_age": 1e3,
+    }
     request = {"topic": "/ap/request", "type": "std_msgs/msg/UInt8", "rate": 5.0, "stamped": False}
-    requests = {"enter": request | {"when": "engaging"}, "leave": request | {"when": "release"}}  # as with the map of PX4
+    requests = {
+        "enter": request | {"when": "engaging"},
+        "leave": request | {"when": "release"},
+    }  # as with the map of PX4
     setup.start(
         conditions={"guided": guided | {"awaited": True}},
         engage_timeout=1e3,
@@ -320,9 +375,14 @@ def test_engagement_waits_for_awaited_condition_and_can_be_withdrawn(setup: Setu
     assert setup.engage() == ""
     setup.run(1.0)
     assert setup.world.messages("/bridge/engagement")[-1].key == "ENGAGING"
-    assert "the mode is not guided (data is 10)" in setup.world.messages("/bridge/engagement")[-1].value
+    assert (
+        "the mode is not guided (data is 10)"
+        in setup.world.messages("/bridge/engagement")[-1].value
+    )
     assert setup.engage(on=False) == ""
-    assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in setup.bridge.log.lines)
+    assert any(
+        "ENGAGING -> RELEASE: disengaged by request" in line for line in setup.bridge.log.lines
+    )
     setup.run(1.0)
     assert setup.engage() == ""
     setup.further["/ap/mode"] = UInt8(data=15)
@@ -331,13 +391,25 @@ def test_engagement_waits_for_awaited_condition_and_can_be_withdrawn(setup: Setu
 
 @pytest.mark.parametrize(
     ("lost", "reason", "within"),
-    [(0, "the transmitter is lost (data is 0)", 2 * TICK), (None, "transmitter: data is 0.8", 0.8 + 2 * TICK)],
+    [
+        (0, "the transmitter is lost (data is 0)", 2 * TICK),
+        (None, "transmitter: data is 0.8", 0.8 + 2 * TICK),
+    ],
     ids=("says so", "falls silent"),
 )
-def test_lost_transmitter_releases_within_a_second(lost: int | None, reason: str, within: float, setup: Setup) -> None:
-    transmitter = CONDITION | {"topic": "/ap/transmitter", "one_of": [1], "sentence": "the transmitter is lost", "max_age": 0.8}
+def test_lost_transmitter_releases_within_a_second(
+    lost: int | None, reason: str, within: float, setup: Setup
+) -> None:
+    transmitter = CONDITION | {
+        "topic": "/ap/transmitter",
+        "one_of": [1],
+        "sentence": "the transmitter is lost",
+        "max_age": 0.8,
+    }
     setup.start(
-        conditions={"transmitter": transmitter | {"transmitter": True}}, max_engaged=None, topics={"/ap/transmitter": QOS}
+        conditions={"transmitter": transmitter | {"transmitter": True}},
+        max_engaged=None,
+        topics={"/ap/transmitter": QOS},
     )
     setup.further["/ap/transmitter"] = UInt8(data=1)
     setup.engaged()
@@ -354,11 +426,16 @@ def test_lost_transmitter_releases_within_a_second(lost: int | None, reason: str
 def test_map_without_a_bound_engages_blind_alone_and_says_what_still_releases(setup: Setup) -> None:
     setup.start(max_engaged=None)
     setup.run(0.3)
-    assert setup.engage().startswith("the loss of the transmitter cannot be seen over this link: set max_engaged")
+    assert setup.engage().startswith(
+        "the loss of the transmitter cannot be seen over this link: set max_engaged"
+    )
     assert setup.engage(blind=True) == ""
     lacks = setup.world.messages("/bridge/engagement")[-1].value
     assert "a pilot override has no effect" in lacks
-    assert "the loss of the transmitter cannot be seen over this link; released by the override by gamepad" in lacks
+    assert (
+        "the loss of the transmitter cannot be seen over this link; released by the override by "
+        "gamepad" in lacks
+    )
 
 
 def test_max_engaged_is_announced_and_then_releases(setup: Setup) -> None:
@@ -371,8 +448,12 @@ def test_max_engaged_is_announced_and_then_releases(setup: Setup) -> None:
     assert setup.t - begin == pytest.approx(11.0, abs=JOY + TICK)
 
 
-def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(setup: Setup) -> None:
-    """The publisher of u stays alive and u returns: the age of u counts, not the presence of a publisher."""
+def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(
+    setup: Setup,
+) -> None:
+    """The publisher of u stays alive and u returns: the age of u counts, not the presence of a
+    publisher.
+    """
     neutral = 0.4  # s
     setup.start(silence={"neutral": neutral})
     commanded = 0.02  # rad of elevator, within a tenth of its limit, as engagement requires
@@ -396,22 +477,31 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_tim
     assert not setup.joys  # u is fresh again; the bridge does not re-engage by itself
 
 
-def test_messages_of_autopilot_become_y_to_the_last_bit_and_dry_run_publishes_what_it_would_send(tmp_path: Path) -> None:
+def test_messages_of_autopilot_become_y_to_the_last_bit_and_dry_run_publishes_what_it_would_send(
+    tmp_path: Path,
+) -> None:
     with bridged(tmp_path, dry_run="true") as setup:
         setup.start()
         setup.u = (0.1, 0.1, 9.0, -0.1)
         setup.run(1.0)
         would = setup.world.vectors("/bridge/would_send")[-1].channels
         assert list(would) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
-        assert [*would.values()] == pytest.approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)  # aileron at its limit
+        assert [*would.values()] == pytest.approx(
+            [0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5
+        )  # aileron at its limit
         twists = setup.world.messages("/ap/twist/filtered")
-        rates = {(-twist.twist.angular.y, twist.twist.angular.x, -twist.twist.angular.z) for twist in twists}
+        rates = {
+            (-twist.twist.angular.y, twist.twist.angular.x, -twist.twist.angular.z)
+            for twist in twists
+        }
         received = [y.channels for y in setup.world.vectors("/y")]
         assert len(received) > 40
         assert all(tuple(y) == OUTPUTS for y in received)
         assert {(y["q"], y["p"], y["r"]) for y in received} <= rates
         assert max(abs(y["V"]) for y in received) < 0.2  # m/s from trim: noise of 0.03 m/s
-        assert setup.engage().startswith("dry_run is true: nothing is sent; u.elevator is 0.1 from trim")
+        assert setup.engage().startswith(
+            "dry_run is true: nothing is sent; u.elevator is 0.1 from trim"
+        )
         setup.run(0.3)
         assert not setup.joys
 
@@ -422,25 +512,38 @@ def test_topic_whose_publisher_has_left_named_as_that_of_a_client(setup: Setup) 
     setup.autopilot_runs = False
     for publisher in (setup.autopilot._twist, setup.autopilot._airspeed):
         publisher.leave()
-    setup.until_logged("waiting for /ap/twist/filtered: no publisher any more")  # as of a client that left its agent
+    setup.until_logged(
+        "waiting for /ap/twist/filtered: no publisher any more"
+    )  # as of a client that left its agent
 
 
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
-        (lambda _: ChangeState.Response(success=False), "the controller refused to activate, or was active already"),
+        (
+            lambda _: ChangeState.Response(success=False),
+            "the controller refused to activate, or was active already",
+        ),
         (lambda _: None, "timed out waiting for the controller to activate"),
     ],
     ids=("refuses", "silent"),
 )
-def test_controller_that_does_not_activate_ends_engagement(answer: Callable[[Any], Any], reason: str, setup: Setup) -> None:
+def test_controller_that_does_not_activate_ends_engagement(
+    answer: Callable[[Any], Any], reason: str, setup: Setup
+) -> None:
     state = GetState.Response(current_state=State(id=State.PRIMARY_STATE_INACTIVE))
-    setup.world.answers = {"/controller/get_state": lambda _: state, "/controller/change_state": answer}
+    setup.world.answers = {
+        "/controller/get_state": lambda _: state,
+        "/controller/change_state": answer,
+    }
     setup.start()
     setup.run(0.3)
     begin = setup.t
     assert setup.engage() == ""
-    assert setup.until_logged("ENGAGED -> RELEASE: ", reason) - begin <= seconds(ACTIVATION_TIMEOUT_NS) + 2 * TICK
+    assert (
+        setup.until_logged("ENGAGED -> RELEASE: ", reason) - begin
+        <= seconds(ACTIVATION_TIMEOUT_NS) + 2 * TICK
+    )
 
 
 def test_controller_is_active_only_while_engaged(setup: Setup) -> None:
@@ -472,20 +575,26 @@ def test_bridge_without_topics_of_autopilot_ends_with_the_cause_of_each(tmp_path
         sentence = str(ended.value)
         assert sentence.startswith("no y after 3 s: ")
         assert (
-            "/ap/twist/filtered: no publisher. The autopilot's agent needs the same DDS profile, FASTRTPS_DEFAULT_" in sentence
+            "/ap/twist/filtered: no publisher. The autopilot's agent needs the same DDS "
+            "profile, FASTRTPS_DEFAULT_" in sentence
         )
         expected = "geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
         assert f"/ap/airspeed: /peer publishes {expected}" in sentence
 
 
 def test_topic_of_another_version_is_error_that_names_both_types(setup: Setup) -> None:
-    setup.world.publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
+    setup.world.publisher(
+        TwistStamped, "/ap/airspeed", 10
+    )  # as an AP_DDS would whose type has changed
     setup.start()
     setup.world.subscribe(Imu, "/ap/joy", 10, "/peer", raw=True)
     setup.run(2.0)
     expected = "geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
     assert f"[ERROR] /ap/airspeed: /peer publishes {expected}" in setup.bridge.log.lines
-    assert "[ERROR] /ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy" in setup.bridge.log.lines
+    assert (
+        "[ERROR] /ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy"
+        in setup.bridge.log.lines
+    )
 
 
 def test_message_that_is_none_of_its_type_refused_and_counted(setup: Setup) -> None:
@@ -497,10 +606,14 @@ def test_message_that_is_none_of_its_type_refused_and_counted(setup: Setup) -> N
 
 
 def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
-    """The messages are of a publisher in the frames of REP 103; SciPy gives orientation and velocity in the body axes."""
+    """The messages are of a publisher in the frames of REP 103; SciPy gives orientation and
+    velocity in the body axes.
+    """
     phi, theta, psi = 0.3, -0.2, 2.0
     enu_of_ned, flu_of_frd = [[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.diag([1, -1, -1])
-    turn = Rotation.from_matrix(enu_of_ned @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix() @ flu_of_frd)
+    turn = Rotation.from_matrix(
+        enu_of_ned @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix() @ flu_of_frd
+    )
     imu, odometry = Imu(angular_velocity=RATES), Odometry(child_frame_id="plane/base_link")
     for message, values in (
         (odometry.pose.pose.position, (30.0, 40.0, 20.0)),
@@ -519,17 +632,31 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
 
         world.run(0.5, publish)
         y, pose = world.last("/uav1/y"), world.last("/uav1/pose")
-    assert y == pytest.approx({"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1})  # V is captured at an engagement
-    expected = {"phi": phi, "theta": theta, "psi": psi, "north": 40.0, "east": 30.0, "altitude": 20.0}
+    assert y == pytest.approx(
+        {"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1}
+    )  # V is captured at an engagement
+    expected = {
+        "phi": phi,
+        "theta": theta,
+        "psi": psi,
+        "north": 40.0,
+        "east": 30.0,
+        "altitude": 20.0,
+    }
     assert pose == pytest.approx(expected | {"v_north": 4.0, "v_east": 3.0, "climb": 2.0}, abs=1e-6)
 
 
 def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Path) -> None:
     absent = tmp_path / "absent.yaml"
-    absent.write_text((LIBRARY / "px4.yaml").read_text(encoding="utf-8").replace("px4_msgs/", "absent_msgs/"), encoding="utf-8")
+    absent.write_text(
+        (LIBRARY / "px4.yaml").read_text(encoding="utf-8").replace("px4_msgs/", "absent_msgs/"),
+        encoding="utf-8",
+    )
     with world_of("-p", f"map:={absent}") as world, pytest.raises(ParameterError) as refused:
         world.make(BridgeNode)
-    assert "absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in str(refused.value)
+    assert "absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in str(
+        refused.value
+    )
     assert "make messages PACKAGE=absent_msgs SOURCE=FOLDER" in str(refused.value)
 
 
@@ -540,9 +667,19 @@ def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Pat
         "sign": sign * content["inputs"]["elevator"].get("sign", 1)
     }
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    check = CliRunner().invoke(app, ["check", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)])
+    check = CliRunner().invoke(
+        app, ["check", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)]
+    )
     assert (check.exit_code == 0) is (sign > 0), check.output
-    words = ("fly", str(SCENARIO), "--bridge", str(tmp_path / "map.yaml"), "--send", "--set", f"runs={tmp_path / 'runs'}")
+    words = (
+        "fly",
+        str(SCENARIO),
+        "--bridge",
+        str(tmp_path / "map.yaml"),
+        "--send",
+        "--set",
+        f"runs={tmp_path / 'runs'}",
+    )
     if sign < 0:
         refused = CliRunner().invoke(app, words)
         assert "D of q and elevator is -1, the controller has +1" in str(refused.exception)
@@ -558,18 +695,26 @@ def serialised(message: Any) -> Any:
 @pytest.mark.parametrize(
     ("name", "message", "expected"),
     [
-        ("ardupilot_2024", TwistStamped(twist=Twist(angular=RATES)), {"q": 0.2, "p": 0.3, "r": 0.1}),
+        (
+            "ardupilot_2024",
+            TwistStamped(twist=Twist(angular=RATES)),
+            {"q": 0.2, "p": 0.3, "r": 0.1},
+        ),
         ("ardupilot_2024", AIRSPEED, {"V": 2.0}),
         ("odometry", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
     ],
     ids=("twist", "airspeed", "imu"),
 )
-def test_outputs_are_read_from_real_messages(name: str, message: Any, expected: dict[str, float]) -> None:
+def test_outputs_are_read_from_real_messages(
+    name: str, message: Any, expected: dict[str, float]
+) -> None:
     message = serialised(message)
     for channel, value in expected.items():
         row = named_map(name).outputs[channel]
         assert message_type(row.type) is type(message)
-        assert to_channel(read_raw(message, row.field, row.function), row.line) == pytest.approx(value)
+        assert to_channel(read_raw(message, row.field, row.function), row.line) == pytest.approx(
+            value
+        )
 
 
 def test_a_real_pressure_gives_the_speed() -> None:
@@ -584,4 +729,6 @@ def test_inputs_are_written_into_a_real_joy() -> None:
         set_field(message, path, value)
     for row, u in zip(channel_map.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
         set_field(message, row.field, to_raw(row.trim + u, row.line))
-    assert list(serialised(message).axes) == pytest.approx([-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5)  # RC1 to 4
+    assert list(serialised(message).axes) == pytest.approx(
+        [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5
+    )  # RC1 to 4

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map of PX4 with the real message package, where it is installed.
 
-None of them is on PyPI; `make messages` builds each from its sources (docs/autopilots-reference.md). Without them
-tests/pure/autopilot_bridge/test_channel_map.py tests each row with the published fields.
+None of them is on PyPI; `make messages` builds each from its sources
+(docs/autopilots-reference.md). Without them tests/pure/autopilot_bridge/test_channel_map.py tests
+each row with the published fields.
 """
 
 from importlib import import_module
@@ -19,7 +20,14 @@ from tests.nodes.world import INPUTS, World, world_of
 from tests.published_messages import PACKAGES, PUBLISHED, kind
 from tests.pure.autopilot_bridge.test_channel_map import AIRSPEED, MAPS, MOTION, RATES, SENT
 
-from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.channel_map import (
+    get_field,
+    message_type,
+    read_raw,
+    set_field,
+    to_channel,
+    to_raw,
+)
 from autopilot_bridge.node import BridgeNode
 from autopilot_bridge.params import ChannelMap
 
@@ -35,11 +43,18 @@ def needs(*packages: str) -> None:
     """Skip where a message package is not installed."""
     for package in packages:
         if find_spec(package) is None:
-            pytest.skip(f"no {package}: make messages PACKAGE={package} SOURCE=FOLDER, the sources of {PACKAGES[package]}")
+            pytest.skip(
+                f"no {package}: make messages PACKAGE={package} SOURCE=FOLDER, the sources of "
+                f"{PACKAGES[package]}"
+            )
 
 
 def needs_packages_of(channel_map: ChannelMap) -> None:
-    needs(*sorted({kind_.split("/")[0] for _, _, kind_ in channel_map.used_topics()} & PACKAGES.keys()))
+    needs(
+        *sorted(
+            {kind_.split("/")[0] for _, _, kind_ in channel_map.used_topics()} & PACKAGES.keys()
+        )
+    )
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -74,7 +89,9 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str) -> None:
         message = fill(message_type(row.type)(), AIRSPEED[name] if channel == "V" else RATES[name])
         message = deserialize_message(serialize_message(message), type(message))
         value = to_channel(read_raw(message, row.field, row.function), row.line)
-        assert value == pytest.approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32
+        assert value == pytest.approx(
+            2.0 if channel == "V" else MOTION[channel], abs=1e-6
+        )  # float32
 
 
 @pytest.mark.parametrize("name", ROS_MAPS)
@@ -91,7 +108,9 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
 
 
 class Px4:
-    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes: a command changes the mode."""
+    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes: a
+    command changes the mode.
+    """
 
     HOLD, OFFBOARD, ARMED = 4, 14, 2
     MODES = ((6.0, 0.0, OFFBOARD), (4.0, 3.0, HOLD))  # main mode and submode of DO_SET_MODE
@@ -100,7 +119,10 @@ class Px4:
         types = import_module("px4_msgs.msg")
         self._world = world
         # nose up and 2 m/s fast
-        odometry, airspeed = fill(types.VehicleOdometry(), RATES["px4"]), fill(types.AirspeedValidated(), AIRSPEED["px4"])
+        odometry, airspeed = (
+            fill(types.VehicleOdometry(), RATES["px4"]),
+            fill(types.AirspeedValidated(), AIRSPEED["px4"]),
+        )
         self._status = types.VehicleStatus(arming_state=self.ARMED, nav_state=self.HOLD)
         self._publishers = [
             (world.create_publisher(type(message), f"/fmu/out/{topic}", 5), message)
@@ -112,13 +134,20 @@ class Px4:
             )
         ]
         self.received: dict[str, list[Any]] = {}
-        for topic in ("offboard_control_mode", "vehicle_torque_setpoint", "vehicle_thrust_setpoint", "vehicle_command"):
+        for topic in (
+            "offboard_control_mode",
+            "vehicle_torque_setpoint",
+            "vehicle_thrust_setpoint",
+            "vehicle_command",
+        ):
             name = topic.title().replace("_", "")
             received = self.received[name] = []
             world.create_subscription(getattr(types, name), f"/fmu/in/{topic}", received.append, 5)
 
     def publish(self) -> None:
-        """Publish y, the mode, and u: elevator 0.02 rad. Offboard is entered with a heartbeat alone."""
+        """Publish y, the mode, and u: elevator 0.02 rad. Offboard is entered with a heartbeat
+        alone.
+        """
         commands = [
             (command.param2, command.param3)
             for command in self.received["VehicleCommand"][-1:]
@@ -138,20 +167,30 @@ class Px4:
 
 
 def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
-    """Heartbeats from the request on, setpoints in offboard; a release ends both and requests Hold."""
+    """Heartbeats from the request on, setpoints in offboard; a release ends both and requests
+    Hold.
+    """
     needs("px4_msgs")
     with world_of("-p", "map:=px4", "-p", "dry_run:=false") as world:
         world.start(BridgeNode)
         px4 = Px4(world)
         world.run(1.0, px4.publish)
-        assert world.last("/y") == pytest.approx({**MOTION, "V": 0.0}, abs=1e-6)  # V is captured: 0 until the engagement
-        assert not any(px4.received.values())  # a heartbeat before the request would keep PX4 in offboard
+        assert world.last("/y") == pytest.approx(
+            {**MOTION, "V": 0.0}, abs=1e-6
+        )  # V is captured: 0 until the engagement
+        assert not any(
+            px4.received.values()
+        )  # a heartbeat before the request would keep PX4 in offboard
         assert world.call("/bridge/engage", SetBool.Request(data=True)).success
         world.run(1.0, px4.publish)
         assert px4.mode == Px4.OFFBOARD
         assert px4.received["OffboardControlMode"][-1].thrust_and_torque
-        assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
-        assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
+        assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx(
+            [0.0, 0.02 / 0.523599, 0.0], abs=1e-6
+        )
+        assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx(
+            [0.5, 0.0, 0.0], abs=1e-6
+        )
         assert world.call("/bridge/engage", SetBool.Request(data=False)).success
         world.run(1.0, px4.publish)
         assert px4.mode == Px4.HOLD

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node under another law: a controller that it cannot fly, and new gains of a law of another package."""
+"""The controller's node under another law: a controller that it cannot fly, and new gains of a law
+of another package.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -27,18 +29,31 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        ("pid", "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, pi, rise_di"),
-        ("lqi", "found 'lqi', which needs the full state, expected a law of y and y_m: the topics have no more"),
+        (
+            "pid",
+            "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, pi, rise_di",
+        ),
+        (
+            "lqi",
+            (
+                "found 'lqi', which needs the full state, expected a law of y and y_m: the topics "
+                "have no more"
+            ),
+        ),
     ],
 )
-def test_law_that_controller_cannot_fly_is_one_sentence(law: str, sentence: str, tmp_path: Path) -> None:
+def test_law_that_controller_cannot_fly_is_one_sentence(
+    law: str, sentence: str, tmp_path: Path
+) -> None:
     file = scenario_file(tmp_path / "other.yaml", SECTIONS["pid"] | {"law": law})
     with world_of("--params-file", str(file)) as world, pytest.raises(ParameterError) as refused:
         world.make(ControllerNode)
     assert str(refused.value) == f"controller.law: {sentence}"
 
 
-def test_node_names_law_of_another_package_and_takes_new_gains_of_it_in_flight(tmp_path: Path) -> None:
+def test_node_names_law_of_another_package_and_takes_new_gains_of_it_in_flight(
+    tmp_path: Path,
+) -> None:
     file = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     with example_installed(tmp_path), world_of("--params-file", str(file)) as world:
         flight = Flight(world).engage()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A lockstep flight of the nodes is equal to the byte to the loop in one process, under each law and with guidance."""
+"""A lockstep flight of the nodes is equal to the byte to the loop in one process, under each law
+and with guidance.
+"""
 
 import json
 from collections.abc import Iterator
@@ -33,15 +35,25 @@ from flight_ros.topics import LIVELINESS
 from reference_model.node import ReferenceModelNode
 from rise_di_controller.node import ControllerNode
 
-PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}
+PULSES = {
+    "q": {"start": [0.2], "stop": [1.0], "value": [0.1]},
+    "p": {"start": [0.4], "stop": [1.4], "value": [0.4]},
+}
 
 
 @contextmanager
 def lockstep(scenario: Scenario, folder: Path) -> Iterator[tuple[World, list[FlightNode[Any]]]]:
     """The nodes of a flight in lockstep, without a recorder."""
     values = parameter_overrides(ONE_PROCESS, scenario, folder, 0.0, lockstep=True)
-    words = (word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
-    kinds = (ReferenceModelNode, *((GuidanceNode,) if scenario.guidance else ()), ControllerNode, AircraftNode)
+    words = (
+        word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}")
+    )
+    kinds = (
+        ReferenceModelNode,
+        *((GuidanceNode,) if scenario.guidance else ()),
+        ControllerNode,
+        AircraftNode,
+    )
     with world_of("--params-file", str(scenario.path), *words) as world:
         yield world, [world.make(kind) for kind in kinds]
 
@@ -56,18 +68,24 @@ def flown(scenario: Scenario, folder: Path) -> World:
 
 
 def require_equal(world: World, scenario: Scenario) -> None:
-    """Assert that each sample of the loop in one process was published, to the byte, and no other one."""
+    """Assert that each sample of the loop in one process was published, to the byte, and no other
+    one.
+    """
     tape = simulate(scenario)
     assert {"y", "y_m", "u", "internals", "truth"} <= tape.signals.keys()
     for name, signal in tape.signals.items():
         sent = [sample for sample in world.vectors(f"/{name}") if sample.channels]
         assert [sample.stamp_ns for sample in sent] == signal.stamp_ns.tolist(), name
-        values = np.array([[sample.channels[channel] for channel in signal.names] for sample in sent])
+        values = np.array(
+            [[sample.channels[channel] for channel in signal.names] for sample in sent]
+        )
         assert values.tobytes() == signal.values.tobytes(), name
 
 
 def varied(folder: Path, name: str, **sections: Any) -> Scenario:
-    """A second of a scenario with commands, disturbances and lost samples, and with changes to its sections."""
+    """A second of a scenario with commands, disturbances and lost samples, and with changes to its
+    sections.
+    """
     changes = {"flight": {"duration": 1.0}, "aircraft": ROUGH, **sections}
     return load_scenario(scenario_file(folder / "varied.yaml", find_scenario(name).path, **changes))
 
@@ -82,7 +100,10 @@ def test_scenario_flies_in_lockstep_as_in_one_process(name: str, tmp_path: Path)
 def test_other_law_flies_in_lockstep_as_in_one_process(law: str, tmp_path: Path) -> None:
     with example_installed(tmp_path) if law == "pid" else nullcontext():
         file = scenario_file(
-            tmp_path / "law.yaml", find_scenario("osprey_servo").path, aircraft=ROUGH, flight={"duration": 2.0}
+            tmp_path / "law.yaml",
+            find_scenario("osprey_servo").path,
+            aircraft=ROUGH,
+            flight={"duration": 2.0},
         )
         tree = yaml.safe_load(file.read_text(encoding="utf-8"))
         tree["/**/controller"]["ros__parameters"] = SECTIONS[law]
@@ -92,7 +113,9 @@ def test_other_law_flies_in_lockstep_as_in_one_process(law: str, tmp_path: Path)
         require_equal(flown(scenario, tmp_path), scenario)
 
 
-def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_a_link(tmp_path: Path) -> None:
+def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_a_link(
+    tmp_path: Path,
+) -> None:
     lost_link = {"home": {"link_timeout": 1.0}, "origin": [47.38, 8.54, 400.0]}
     scenario = varied(tmp_path, "osprey_route", guidance=lost_link, flight={"duration": 2.0})
     world = flown(scenario, tmp_path)
@@ -103,25 +126,35 @@ def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_
     assert len(world.sent["/odometry"]) == 20  # 2 s at 10 Hz
 
 
-def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
     with lockstep(osprey_gust, tmp_path) as (world, nodes):
         for sender in ("/controller", "/second"):  # for the first y and the next
-            world.publisher(JointState, "/u").publish(Encoder(INPUTS, sender).encode(0, np.zeros(4)))
+            world.publisher(JointState, "/u").publish(
+                Encoder(INPUTS, sender).encode(0, np.zeros(4))
+            )
         aircraft = nodes[-1]
         advance_ns = world.clock.monotonic_ns()
         while aircraft.advance():
             pass
         assert aircraft.awaited_topic() == "/u"
         reason = "conflicting publisher /second ignored: already receiving from /controller"
-        with pytest.raises(FlightEnded, match=f"^timed out waiting for /u: a sample was refused: {reason}$"):
+        with pytest.raises(
+            FlightEnded, match=f"^timed out waiting for /u: a sample was refused: {reason}$"
+        ):
             require_input([aircraft], advance_ns, True)
         require_input([aircraft], advance_ns + 1, True)  # one that was refused before is no cause
         with pytest.raises(FlightEnded, match="timed out waiting for /u: no message in 30 s"):
             require_input([aircraft], advance_ns + 1, False)
 
 
-def test_node_names_and_passes_on_the_role_that_a_peer_reports(osprey_gust: Scenario, tmp_path: Path) -> None:
-    """A reference model reports the loss of the controller; a report of the node itself, and of no role, has no effect."""
+def test_node_names_and_passes_on_the_role_that_a_peer_reports(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """A reference model reports the loss of the controller; a report of the node itself, and of no
+    role, has no effect.
+    """
     with lockstep(osprey_gust, tmp_path) as (world, nodes):
         aircraft = nodes[-1]
         peer = world.publisher(String, "/alive/reference_model", LIVELINESS)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight, each a program of the test: what ended a flight is named, and a log has time to be closed."""
+"""The processes of a flight, each a program of the test: what ended a flight is named, and a log
+has time to be closed.
+"""
 
 import time
 from pathlib import Path
@@ -16,7 +18,9 @@ from flight_bringup.graph import NodeSpec
 from flight_bringup.processes import FlightProcesses, NotReadyError
 from flight_core.parameters import ParameterError
 
-SILENT_MONITOR: Any = SimpleNamespace(is_ready=lambda *_: False, is_matched=lambda *_: False)  # in place of a FlightMonitor
+SILENT_MONITOR: Any = SimpleNamespace(
+    is_ready=lambda *_: False, is_matched=lambda *_: False
+)  # in place of a FlightMonitor
 
 
 @pytest.fixture
@@ -35,19 +39,28 @@ def start_stage(scenario: Scenario, run: Path) -> None:
         pass
 
 
-def test_log_line_does_not_start_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_log_line_does_not_start_flight(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     code = "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n"
     only_stage.write_text(code, encoding="utf-8")
-    with pytest.raises(ParameterError, match="timed out waiting for controller: not ready after 3 s; see the logs in "):
+    with pytest.raises(
+        ParameterError,
+        match="timed out waiting for controller: not ready after 3 s; see the logs in ",
+    ):
         start_stage(osprey_gust, tmp_path / "run")
-    assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
+    assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_process_ending_while_others_wait_named_at_once(
     only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "READY_TIMEOUT", HANG)
-    only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8")
+    only_stage.write_text(
+        "import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8"
+    )
     begin = time.monotonic()
     with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
         start_stage(osprey_gust, tmp_path / "run")
@@ -78,10 +91,19 @@ def test_end_before_ready_is_bad_input_only_by_its_status(
     assert isinstance(caught.value, NotReadyError) is flew_never
 
 
-def test_process_that_ends_named_with_fatal_line_not_last_one(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
-    lines = "[FATAL] [1.0] [controller]: lost contact with aircraft", "[INFO] [1.1] [controller]: 3 messages in run"
-    only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"):
+def test_process_that_ends_named_with_fatal_line_not_last_one(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    lines = (
+        "[FATAL] [1.0] [controller]: lost contact with aircraft",
+        "[INFO] [1.1] [controller]: 3 messages in run",
+    )
+    only_stage.write_text(
+        f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8"
+    )
+    with pytest.raises(
+        ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"
+    ):
         start_stage(osprey_gust, tmp_path / "run")
 
 
@@ -92,7 +114,9 @@ def test_flight_without_matched_nodes_never_begins(
     given: list[float] = []
     state = {"controller": {"ready"}, "aircraft": {"ready", "matched"}, "recorder": set[str]()}
     monitor = SimpleNamespace(
-        is_ready=lambda name, _: "ready" in state[name], is_matched=lambda name, _: "matched" in state[name], start=given.append
+        is_ready=lambda name, _: "ready" in state[name],
+        is_matched=lambda name, _: "matched" in state[name],
+        start=given.append,
     )
     flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)  # type: ignore[arg-type]
     popen = SimpleNamespace(pid=1, poll=lambda: None)
@@ -105,14 +129,19 @@ def test_flight_without_matched_nodes_never_begins(
     assert given == [flight.start_time] == [pytest.approx(time.time() + 0.5, abs=0.4)]
 
 
-LOSES_CONTACT = "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"
+LOSES_CONTACT = (
+    "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"
+)
 
 
 @pytest.mark.parametrize(
     ("end", "cause"),
     [
         ("import os\nos.kill(os.getpid(), 9)\n", "aircraft was killed by SIGKILL"),
-        ("import sys\nprint('[FATAL] [1.0] [aircraft]: diverged')\nsys.exit(3)\n", "aircraft ended with status 3: diverged"),
+        (
+            "import sys\nprint('[FATAL] [1.0] [aircraft]: diverged')\nsys.exit(3)\n",
+            "aircraft ended with status 3: diverged",
+        ),
     ],
     ids=("killed", "diverged"),
 )
@@ -122,9 +151,13 @@ def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
     only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
     (tmp_path / "cause").mkdir()
     (tmp_path / "cause" / "main.py").write_text(end, encoding="utf-8")
-    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=True, one_process=False)
+    flight = FlightProcesses(
+        osprey_gust, tmp_path, SILENT_MONITOR, lockstep=True, one_process=False
+    )
     for node in (NodeSpec("fake", "recorder"), NodeSpec("cause", "aircraft")):
-        flight.processes.append(processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / f"{node.executable}.log"))
+        flight.processes.append(
+            processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / f"{node.executable}.log")
+        )
     for process in flight.processes:
         process.popen.wait()
     assert flight.ended_early() == cause
@@ -145,13 +178,19 @@ except KeyboardInterrupt:
 
 @pytest.mark.parametrize("executable", ["recorder", "one_process"])
 def test_process_that_closes_log_has_time_for_it(
-    executable: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    executable: str,
+    only_stage: Path,
+    osprey_gust: Scenario,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     only_stage.write_text(CLOSES_SLOWLY, encoding="utf-8")
     node = NodeSpec("fake", executable)
     monkeypatch.setattr(processes, executable.upper(), node)
     monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.1)  # of the other nodes
-    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=False, one_process=False)
+    flight = FlightProcesses(
+        osprey_gust, tmp_path, SILENT_MONITOR, lockstep=False, one_process=False
+    )
     process = processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / "node.log")
     flight.processes.append(process)
     until(lambda: "up" in process.lines, "the process is up")

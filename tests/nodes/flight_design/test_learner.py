@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node and the controller beside a learner: proposals of others, their storms, and the record of a flight."""
+"""The learner's node and the controller beside a learner: proposals of others, their storms, and
+the record of a flight.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -33,11 +35,20 @@ class Proposer:
         self.change = designed(start, find_scenario("osprey_observer").rise_di())
         self._publisher = flight.world.publisher(PROPOSAL.type, "/proposal")
 
-    def propose(self, sender: str = "learner#1", change: Mapping[str, object] = MappingProxyType({})) -> None:
+    def propose(
+        self, sender: str = "learner#1", change: Mapping[str, object] = MappingProxyType({})
+    ) -> None:
         """Publish a proposal whose window ended a tick or more ago."""
-        values = {"start": self.start.digest(), "flown": self.start.digest(), **self.change, **change}
+        values = {
+            "start": self.start.digest(),
+            "flown": self.start.digest(),
+            **self.change,
+            **change,
+        }
         stamp_ns = self.flight.world.clock.time_ns() - nanoseconds(0.05)
-        self._publisher.publish(reports.encode(Report(stamp_ns, sender, "model", values), "proposal"))
+        self._publisher.publish(
+            reports.encode(Report(stamp_ns, sender, "model", values), "proposal")
+        )
 
     def answer(self, propose: Callable[[], None]) -> Report:
         """What the controller says next."""
@@ -51,7 +62,9 @@ class Proposer:
 @pytest.fixture
 def proposer(tmp_path: Path) -> Iterator[Proposer]:
     shipped = find_scenario("osprey_learn")
-    model = shipped.rise_di().model_dump()["feedforward"] | {"gravity": None}  # a parameter that only the proposal has
+    model = shipped.rise_di().model_dump()["feedforward"] | {
+        "gravity": None
+    }  # a parameter that only the proposal has
     varied = written(shipped.vary(controller={"feedforward": model}), tmp_path / "learn.yaml")
     with world_of("--params-file", str(varied.path)) as world:
         flight = Flight(world)
@@ -59,7 +72,9 @@ def proposer(tmp_path: Path) -> Iterator[Proposer]:
         yield Proposer(flight.engage(), varied.rise_di())
 
 
-def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_model(proposer: Proposer) -> None:
+def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_model(
+    proposer: Proposer,
+) -> None:
     flight = proposer.flight
     flipped = [-value for value in proposer.change["observer.F"]]
     lie = proposer.answer(lambda: proposer.propose(change={"observer.F": flipped}))
@@ -73,7 +88,9 @@ def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_mod
     flight.run(0.1)
     assert flight.values("observer.part") == [0.6]  # its bound
     flown = dict(zip(flight.at().tolist(), flight.column("parameters").tolist(), strict=True))
-    assert flown[flies.stamp_ns] == proposer.start.digest()  # u of a tick does not wait for its certificate
+    assert (
+        flown[flies.stamp_ns] == proposer.start.digest()
+    )  # u of a tick does not wait for its certificate
     assert flight.column("parameters")[-1] != proposer.start.digest()
 
 
@@ -86,7 +103,9 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
         proposer.propose(change={"start": 1})
 
     refused = "found a proposal for the parameters 1"
-    assert refused in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence  # the publisher that is locked
+    assert (
+        refused in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence
+    )  # the publisher that is locked
     proposer.propose(change={"flown": None})
     for _ in range(20):
         proposer.propose(change={"start": 1})
@@ -103,14 +122,21 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
 
 
 def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
-    """The times of the identifications count from the next engagement, and the record before is forgotten."""
+    """The times of the identifications count from the next engagement, and the record before is
+    forgotten.
+    """
     chosen = written(
-        find_scenario("osprey_learn").vary(controller={"learn": {"updates": [3.0], "latency": 0.5}}), tmp_path / "learn.yaml"
+        find_scenario("osprey_learn").vary(
+            controller={"learn": {"updates": [3.0], "latency": 0.5}}
+        ),
+        tmp_path / "learn.yaml",
     )
     controller = chosen.rise_di()
     names = ("mode", "age", "parameters", *(f"y.{name}" for name in controller.outputs))
     names += tuple(f"u.{name}" for name in controller.inputs)
-    encoder = Encoder((*names, *(f"given_up.{name}" for name in controller.outputs)), "/controller#1")
+    encoder = Encoder(
+        (*names, *(f"given_up.{name}" for name in controller.outputs)), "/controller#1"
+    )
     with world_of("-p", f"scenario_file:={chosen.path}", "-p", "lockstep:=true") as world:
         learner = world.make(LearnerNode)
         publisher = world.publisher(JointState, "/internals")
@@ -123,7 +149,11 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
             (8, Mode.ENGAGED),
         ):
             zeros = np.zeros(2 * len(controller.outputs) + len(controller.inputs))
-            publisher.publish(encoder.encode(nanoseconds(t), np.array([float(mode), 0.0, float(controller.digest()), *zeros])))
+            publisher.publish(
+                encoder.encode(
+                    nanoseconds(t), np.array([float(mode), 0.0, float(controller.digest()), *zeros])
+                )
+            )
             learner.advance()
         learner.close()  # completes the search
         said = [reports.decode(raw).sentence for _, raw in world.sent["/proposal"]]
@@ -131,6 +161,12 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
 
 
 def test_learner_refuses_a_scenario_that_does_not_learn() -> None:
-    file, refusal = find_scenario("osprey_servo").path, r"learner\.scenario_file: found a scenario without controller\.learn"
-    with world_of("-p", f"scenario_file:={file}") as world, pytest.raises(ParameterError, match=refusal):
+    file, refusal = (
+        find_scenario("osprey_servo").path,
+        r"learner\.scenario_file: found a scenario without controller\.learn",
+    )
+    with (
+        world_of("-p", f"scenario_file:={file}") as world,
+        pytest.raises(ParameterError, match=refusal),
+    ):
         world.make(LearnerNode)

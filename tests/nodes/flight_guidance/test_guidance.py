@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guidance node: targets, routes, services, learned authority, and what it does without its inputs."""
+"""The guidance node: targets, routes, services, learned authority, and what it does without its
+inputs.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -46,7 +48,9 @@ class Flight:
         if self.has_pose:
             pose = dict.fromkeys(POSE, 0.0) | LEVEL
             # a pose that stands still is refused
-            self.world.send("/pose", pose | {"v_east": float(self._rng.normal(0.0, 0.01))}, "/aircraft#1")
+            self.world.send(
+                "/pose", pose | {"v_east": float(self._rng.normal(0.0, 0.01))}, "/aircraft#1"
+            )
 
     def run(self, duration: float = 0.1, each: Callable[[], object] = lambda: None) -> None:
         """Run for a duration, s, with what the test sends."""
@@ -120,17 +124,25 @@ def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:
     flight.target(heading=1.0, altitude=60.0)
     selected = [flight.last(name) for name in ("target.altitude", "mode.lateral", "mode.vertical")]
     assert selected == [60.0, Lateral.HEADING, Vertical.ALTITUDE]
-    for reason, values in {"bounds": {"phi": 2.0}, "name": {"bank": 0.1}, "finite": {"heading": math.nan}}.items():
+    for reason, values in {
+        "bounds": {"phi": 2.0},
+        "name": {"bank": 0.1},
+        "finite": {"heading": math.nan},
+    }.items():
         flight.target(**values)
         assert flight.refused(f"target: {reason}") == 1
-    flight.world.send("/target", {"heading": 0.5}, "/operator#1", age=MAX_AGE + 0.05)  # of before a stop of guidance
+    flight.world.send(
+        "/target", {"heading": 0.5}, "/operator#1", age=MAX_AGE + 0.05
+    )  # of before a stop of guidance
     flight.run()
     assert flight.refused("target: old") == 1
     assert flight.last("target.heading") == 1.0
 
 
 def test_target_without_channels_keeps_link_and_silence_leads_home(tmp_path: Path) -> None:
-    with world_of("--params-file", str(calm(tmp_path / "calm.yaml", home={"link_timeout": 1.0}))) as world:
+    with world_of(
+        "--params-file", str(calm(tmp_path / "calm.yaml", home={"link_timeout": 1.0}))
+    ) as world:
         flight = Flight(world)
         flight.run(0.5)
         assert flight.last("age.link") > 0.3
@@ -160,14 +172,18 @@ def test_modes_of_second_controller_refused(flight: Flight) -> None:
     assert flight.last("target.heading") == 1.0  # that of an INACTIVE controller is forgotten
 
 
-def test_controller_that_was_inactive_holds_what_is_measured_and_one_in_failsafe_goes_on(flight: Flight) -> None:
+def test_controller_that_was_inactive_holds_what_is_measured_and_one_in_failsafe_goes_on(
+    flight: Flight,
+) -> None:
     for mode, kept in ((ControllerMode.HOLD, True), (ControllerMode.INACTIVE, False)):
         flight.target(heading=1.0)
         flight.mode = mode
         flight.run(0.1)
         silent = len(flight.world.sent["/u_m"])
         flight.run(0.5)
-        assert len(flight.world.sent["/u_m"]) == silent  # no command to a controller that does not fly
+        assert (
+            len(flight.world.sent["/u_m"]) == silent
+        )  # no command to a controller that does not fly
         flight.mode = ControllerMode.ENGAGED
         flight.run()
         assert (flight.last("target.heading") == 1.0) is kept
@@ -192,7 +208,10 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
     flight.run()
     assert flight.last("mode.lateral") == Lateral.HEADING
     assert flight.call(Trigger, "skip") == (False, "no route with a further leg is flown")
-    assert flight.call(Trigger, "resume") == (False, "found no route to resume, or the route is flown")
+    assert flight.call(Trigger, "resume") == (
+        False,
+        "found no route to resume, or the route is flown",
+    )
     assert flight.call(SetBool, "engage", data=False) == (True, "")
     flight.run()
     assert flight.logged("ENGAGED -> OFF")
@@ -200,7 +219,10 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
     flight.mode = ControllerMode.INACTIVE
     flight.run()
     assert len(flight.world.sent["/u_m"]) == silent
-    assert flight.call(SetBool, "engage", data=True) == (False, "the controller is INACTIVE, expected ENGAGED")
+    assert flight.call(SetBool, "engage", data=True) == (
+        False,
+        "the controller is INACTIVE, expected ENGAGED",
+    )
     flight.mode = ControllerMode.ENGAGED
     flight.run()
     assert flight.call(SetBool, "engage", data=True) == (True, "")
@@ -231,7 +253,9 @@ TWO = ((0.0, 0.0, 50.0), (0.0, 900.0, 55.0))
     ],
     ids=("frame", "one waypoint", "too long"),
 )
-def test_route_that_cannot_be_flown_refused(message: PathMessage, sentence: str, flight: Flight) -> None:
+def test_route_that_cannot_be_flown_refused(
+    message: PathMessage, sentence: str, flight: Flight
+) -> None:
     flight.world.publish("/route", message)
     flight.run()
     assert flight.logged("/route: sample refused: ", sentence)
@@ -242,10 +266,13 @@ def test_route_flown_when_it_arrives(flight: Flight) -> None:
     flight.world.publish("/route", route("map", *TWO))
     flight.run()
     assert flight.last("mode.lateral") == Lateral.ROUTE
-    # the last line is a tangent to the last orbit, of the least radius at 25 m/s, 3 m/s of wind and 0.8 of a bank of 30 deg
+    # the last line is a tangent to the last orbit, of the least radius at 25 m/s, 3 m/s of wind and
+    # 0.8 of a bank of 30 deg
     radius = math.ceil((25.0 + 3.0) ** 2 / (9.80665 * math.tan(0.8 * math.radians(30.0))))
     assert flight.last("to_go") == pytest.approx(math.sqrt(900.0**2 - radius**2))
-    assert flight.last("target.altitude") == pytest.approx(50.0, abs=0.1)  # at the begin of the slope
+    assert flight.last("target.altitude") == pytest.approx(
+        50.0, abs=0.1
+    )  # at the begin of the slope
     assert flight.call(Trigger, "hold") == (True, "")
     flight.run()
     assert flight.call(Trigger, "resume") == (True, "")
@@ -270,7 +297,10 @@ def test_stale_pose_levels_wings_and_guidance_engages_again(flight: Flight) -> N
 def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
     """What follows from other sections of a scenario is in the parameters of a run alone."""
     file, refusal = find_scenario("osprey_route").path, r"`parameters.yaml` of a run has them"
-    with world_of("--params-file", str(file)) as world, pytest.raises(ParameterError, match=refusal):
+    with (
+        world_of("--params-file", str(file)) as world,
+        pytest.raises(ParameterError, match=refusal),
+    ):
         world.make(GuidanceNode)
     with_all_sections = tmp_path / "parameters.yaml"
     with_all_sections.write_text(scenario_yaml(find_scenario("osprey_route")), encoding="utf-8")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: its topics and their qualities, lost messages, silences, a full disk, and the end of the log."""
+"""The recorder's node: its topics and their qualities, lost messages, silences, a full disk, and
+the end of the log.
+"""
 
 import re
 import shutil
@@ -12,7 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import State
-from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
 from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, world_of
@@ -29,7 +37,9 @@ from flight_recorder.node import RecorderNode
 from flight_ros.messages import Encoder, stamp_of
 from flight_ros.topics import PUBLISH, publisher_qos
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 LOOP = ("y", "y_m", "u")
 
@@ -82,7 +92,10 @@ def test_log_has_each_message_and_the_outcome_that_the_flight_left(recorder: Rec
     recorder.run(1.0, *LOOP, "truth")
     (recorder.folder / "outcome").write_text("interrupted", encoding="utf-8")
     log = recorder.end()
-    sent = {topic: [raw for _, raw in recorder.world.sent[topic]] for topic in ("/y", "/y_m", "/u", "/truth")}
+    sent = {
+        topic: [raw for _, raw in recorder.world.sent[topic]]
+        for topic in ("/y", "/y_m", "/u", "/truth")
+    }
     stored: dict[str, list[bytes]] = {topic: [] for topic in sent}
     for topic, _, data in messages(recorder.folder):
         if topic in stored:
@@ -91,11 +104,16 @@ def test_log_has_each_message_and_the_outcome_that_the_flight_left(recorder: Rec
     assert (log.tape.outcome, log.tape.notes) == ("interrupted", ())
 
 
-def test_further_topics_recorded_from_their_first_publisher_on_with_its_qos(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_further_topics_recorded_from_their_first_publisher_on_with_its_qos(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
     topics = "[/latched, relative/pressure, /late, /never]"
     with recording(osprey_gust, tmp_path / "run", topics=topics) as recorder:
         recorder.run(3.5)
-        assert recorder.logged("no publisher of /latched, /relative/pressure, /late, /never; recording starts with the first")
+        assert recorder.logged(
+            "no publisher of /latched, /relative/pressure, /late, /never; recording starts with "
+            "the first"
+        )
         assert recorder.figures()["missing /never"] == "no publisher"
         for topic, kind, qos in (
             ("/latched", String, LATCHED),
@@ -104,7 +122,9 @@ def test_further_topics_recorded_from_their_first_publisher_on_with_its_qos(ospr
         ):
             publisher = recorder.world.publisher(kind, topic, qos)
             recorder.run(0.2)
-            (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == topic)
+            (subscription,) = (
+                each for each in recorder.world.subscriptions if each.topic_name == topic
+            )
             requested = subscription.endpoint.qos_profile
             assert requested.reliability == qos.reliability
             assert (requested.durability == DurabilityPolicy.TRANSIENT_LOCAL) is (qos is LATCHED)
@@ -123,7 +143,9 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recording) -> None:
     recorder.run(0.3)
     weak = recorder.world.publisher(JointState, "/u_m", BEST_EFFORT)
     recorder.run(0.3)
-    assert recorder.logged("/u_m: now recorded as best_effort and volatile: its publishers offer no more")
+    assert recorder.logged(
+        "/u_m: now recorded as best_effort and volatile: its publishers offer no more"
+    )
     (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == "/u_m")
     assert subscription.endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     weak.publish(Encoder(OUTPUTS, "/weak#2").encode(2, np.zeros(4)))
@@ -133,7 +155,9 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recording) -> None:
     assert [b"strong" in text for text in texts] == [True, False]
 
 
-@pytest.mark.parametrize("qos", [QoSProfile(depth=10), BEST_EFFORT], ids=["reliable", "best_effort"])
+@pytest.mark.parametrize(
+    "qos", [QoSProfile(depth=10), BEST_EFFORT], ids=["reliable", "best_effort"]
+)
 @pytest.mark.parametrize("topic", ["y", "y_m", "u", "truth", "internals", "pose"])
 def test_topic_of_any_publisher_is_recorded_with_the_quality_that_it_offers(
     topic: str, qos: QoSProfile, recorder: Recording
@@ -141,7 +165,9 @@ def test_topic_of_any_publisher_is_recorded_with_the_quality_that_it_offers(
     """A subscription that asks for more than a publisher offers receives nothing from it."""
     plain = recorder.world.publisher(JointState, f"/{topic}", qos)
     recorder.run(1.5)
-    (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == f"/{topic}")
+    (subscription,) = (
+        each for each in recorder.world.subscriptions if each.topic_name == f"/{topic}"
+    )
     requested = subscription.endpoint.qos_profile
     assert qos_check_compatible(qos, requested)[0] != QoSCompatibility.ERROR
     assert requested.reliability == qos.reliability
@@ -152,7 +178,9 @@ def test_topic_of_any_publisher_is_recorded_with_the_quality_that_it_offers(
     assert count_messages(recorder.folder)[f"/{topic}"] == 1
 
 
-def test_weaker_publisher_beside_that_of_stack_is_named_and_costs_the_log_nothing(recorder: Recording) -> None:
+def test_weaker_publisher_beside_that_of_stack_is_named_and_costs_the_log_nothing(
+    recorder: Recording,
+) -> None:
     recorder.run(0.5, *LOOP)
     recorder.world.publisher(JointState, "/y", BEST_EFFORT, "/second")
     recorder.run(1.5, *LOOP)
@@ -168,16 +196,30 @@ def test_flight_of_which_part_is_recorded_is_no_silent_failure(recorder: Recordi
     assert not recorder.logged("waiting for /y:")
 
 
-def test_log_of_remapped_topics_names_them_as_the_stack_does(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_log_of_remapped_topics_names_them_as_the_stack_does(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
     """The topics of the file keep the names by which they were sent."""
     names = {"y": "/sensors/y", "u": "/act/command", "y_m": "/uav1/ref/y_m"}
     remaps = [word for name, topic in names.items() for word in ("-r", f"{name}:={topic}")]
-    arguments = ("--params-file", str(osprey_gust.path), "-r", "__ns:=/uav1", "-p", f"directory:={tmp_path / 'run'}")
+    arguments = (
+        "--params-file",
+        str(osprey_gust.path),
+        "-r",
+        "__ns:=/uav1",
+        "-p",
+        f"directory:={tmp_path / 'run'}",
+    )
     with world_of(*arguments, *remaps) as world:
         recorder = Recording(world, tmp_path / "run")
-        recorder.run(1.0, *(topic.removeprefix("/") for topic in names.values()), "uav1/truth", "elsewhere")
+        recorder.run(
+            1.0, *(topic.removeprefix("/") for topic in names.values()), "uav1/truth", "elsewhere"
+        )
         recorder.world.end(recorder.node)
-    assert {topic for topic, count in count_messages(tmp_path / "run").items() if count} >= {*names.values(), "/uav1/truth"}
+    assert {topic for topic, count in count_messages(tmp_path / "run").items() if count} >= {
+        *names.values(),
+        "/uav1/truth",
+    }
     for folder in (tmp_path / "run", tmp_path / "repaired"):
         log = read_run(folder)
         assert log.namespace == "/uav1"
@@ -201,7 +243,9 @@ def test_log_reaches_as_far_as_oldest_of_y_y_m_and_u(recorder: Recording) -> Non
     recorder.world.run(0.5, send)
     spans = [stamp_of(raw) for _, raw in recorder.world.sent["/recorded"]]
     assert spans
-    assert all(any(sample.stamp_ns == span for sample in recorder.world.vectors("/u")) for span in spans)
+    assert all(
+        any(sample.stamp_ns == span for sample in recorder.world.vectors("/u")) for span in spans
+    )
 
 
 def test_flight_that_falls_silent_named_each_time(recorder: Recording) -> None:
@@ -225,7 +269,10 @@ def test_topic_that_stops_while_others_go_on_named_and_noted(recorder: Recording
     recorder.run(2.0, "y", "y_m")
     notes = recorder.end().tape.notes
     assert "/y: the recorder received nothing for 2.5 s" in notes
-    assert any(re.fullmatch(r"/truth: the recorder received nothing for [\d.]+ s, to the end", note) for note in notes)
+    assert any(
+        re.fullmatch(r"/truth: the recorder received nothing for [\d.]+ s, to the end", note)
+        for note in notes
+    )
 
 
 def test_topic_without_its_publisher_is_no_silence(recorder: Recording) -> None:
@@ -236,7 +283,10 @@ def test_topic_without_its_publisher_is_no_silence(recorder: Recording) -> None:
 
 
 def test_lost_messages_are_counted_and_reported(recorder: Recording) -> None:
-    publisher, encoder = recorder.world.publisher(JointState, "/truth"), Encoder(OUTPUTS, "/aircraft#1")
+    publisher, encoder = (
+        recorder.world.publisher(JointState, "/truth"),
+        Encoder(OUTPUTS, "/aircraft#1"),
+    )
 
     def send(count: int) -> None:
         for k in range(count):
@@ -286,13 +336,20 @@ def test_type_that_is_not_installed_or_another_one_named(
         recorder.world.graph[recorder.world.graph.index(publisher.endpoint)] = renamed
         recorder.world.publisher(String, "/u_m", LATCHED)
         recorder.run(1.5)
-        assert recorder.logged("/strange is not recorded: its type nowhere_msgs/msg/Thing is not installed")
-        assert recorder.logged("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
+        assert recorder.logged(
+            "/strange is not recorded: its type nowhere_msgs/msg/Thing is not installed"
+        )
+        assert recorder.logged(
+            "/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState"
+        )
 
 
 def test_an_invalid_topic_name_is_rejected(osprey_gust: Scenario, tmp_path: Path) -> None:
     refusal = "recorder.topics: found 'a topic', expected the name of a topic"
-    with pytest.raises(ParameterError, match=refusal), recording(osprey_gust, tmp_path / "run", topics="[a topic]"):
+    with (
+        pytest.raises(ParameterError, match=refusal),
+        recording(osprey_gust, tmp_path / "run", topics="[a topic]"),
+    ):
         pass
     assert not (tmp_path / "run").exists()
 
@@ -308,7 +365,10 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize(
     ("least", "reason"),
-    [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
+    [
+        ("0.0", "no space left for "),
+        ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB"),
+    ],
 )
 def test_full_disk_ends_recording_with_one_error_and_not_flight(
     least: str, reason: str, osprey_gust: Scenario, disk: Path
@@ -325,7 +385,9 @@ def test_full_disk_ends_recording_with_one_error_and_not_flight(
                 values = np.random.default_rng(number).normal(size=len(names))  # not compressible
                 publisher.publish(encoder.encode(number * NANOSECONDS // 1000, values))
 
-        recorder.world.until(lambda: recorder.logged("recording ended"), "the end of the recording", send)
+        recorder.world.until(
+            lambda: recorder.logged("recording ended"), "the end of the recording", send
+        )
         recorder.world.run(1.1, send)
         sentence, figures = diagnostics(recorder.world, "/recorder")
         assert re.match(f"recording ended: {reason}", sentence)
@@ -333,8 +395,14 @@ def test_full_disk_ends_recording_with_one_error_and_not_flight(
         assert stamp_of(recorder.world.sent["/recorded"][-1][1]) == number * NANOSECONDS // 1000
         log = recorder.end()
         assert len(recorder.logged("[ERROR]")) == 1
-        counts = {f"messages {topic}": str(count) for topic, count in count_messages(disk / "run").items()}
-        assert counts == {key: value for key, value in figures.items() if key.startswith("messages ") and value != "0"}
+        counts = {
+            f"messages {topic}": str(count) for topic, count in count_messages(disk / "run").items()
+        }
+        assert counts == {
+            key: value
+            for key, value in figures.items()
+            if key.startswith("messages ") and value != "0"
+        }
         assert log.tape.notes == ()
 
 
@@ -344,6 +412,8 @@ def test_too_little_space_at_start_rejected(osprey_gust: Scenario, disk: Path) -
         pass
 
 
-@pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
+@pytest.mark.parametrize(
+    ("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)]
+)
 def test_publisher_keeps_history_of_two_seconds_for_recorder(rate: float, depth: int) -> None:
     assert publisher_qos(period_ns(rate, "rate")).depth == depth

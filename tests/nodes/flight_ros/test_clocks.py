@@ -10,8 +10,12 @@ from flight_core.rates import nanoseconds
 from flight_ros.clocks import AHEAD, HOST, Peers
 
 
-def exchanged(offset: float, there: float, back: float, jitter: float, hosts: tuple[float, float] = (0.0, 0.0)) -> Peers:
-    """What a knows of b after six exchanges; the clock of b is ahead by the offset, s, and messages take there and back, s."""
+def exchanged(
+    offset: float, there: float, back: float, jitter: float, hosts: tuple[float, float] = (0.0, 0.0)
+) -> Peers:
+    """What a knows of b after six exchanges; the clock of b is ahead by the offset, s, and messages
+    take there and back, s.
+    """
     a, b, rng = Peers("/a", hosts[0]), Peers("/b", hosts[1]), random.Random(1)  # noqa: S311 - jitter
     b.ahead = offset
     for k in range(6):
@@ -31,7 +35,9 @@ def test_offset_and_delay_estimated_both_ways(offset: float) -> None:
 
 
 def test_error_of_offset_is_half_of_difference_of_delays() -> None:
-    assert exchanged(0.1, 0.002, 0.012, 0.0).clocks()["/b"].offset == pytest.approx(0.1 - 0.005, abs=1e-6)
+    assert exchanged(0.1, 0.002, 0.012, 0.0).clocks()["/b"].offset == pytest.approx(
+        0.1 - 0.005, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.15])

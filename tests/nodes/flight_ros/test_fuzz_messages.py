@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the decoders: any payload is decoded or rejected with a reason, and the next valid message is decoded."""
+"""Fuzzing of the decoders: any payload is decoded or rejected with a reason, and the next valid
+message is decoded.
+"""
 
 from typing import Any
 
@@ -30,7 +32,12 @@ def payloads(draw: st.DrawFn) -> bytes:
     values = draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
     stamp = draw(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
     data = bytearray(
-        vector(stamp, names, values, draw(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=4)))
+        vector(
+            stamp,
+            names,
+            values,
+            draw(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=4)),
+        )
     )
     for _ in range(draw(st.integers(0, 3))):
         place = draw(st.integers(0, len(data)))
@@ -40,13 +47,17 @@ def payloads(draw: st.DrawFn) -> bytes:
             case "change":
                 data[place : place + 1] = draw(st.binary(min_size=1, max_size=1))
             case "length":
-                data[place : place + 4] = draw(st.sampled_from([0, 1, 255, 2**31, 2**32 - 1])).to_bytes(4, "little")
+                data[place : place + 4] = draw(
+                    st.sampled_from([0, 1, 255, 2**31, 2**32 - 1])
+                ).to_bytes(4, "little")
             case "more":
                 data += draw(st.binary(max_size=9))
     return bytes(data)
 
 
-CORPUS = [path.read_bytes() for path in sorted((REPOSITORY / "tests" / "corpus" / "message").iterdir())]
+CORPUS = [
+    path.read_bytes() for path in sorted((REPOSITORY / "tests" / "corpus" / "message").iterdir())
+]
 
 
 def decode_or_reject(decoder: Decoder, raw: bytes) -> None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as bytes: against the independent serialisation of rosbags, and against the middleware."""
+"""Named vectors as bytes: against the independent serialisation of rosbags, and against the
+middleware.
+"""
 
 import numpy as np
 import pytest
@@ -14,9 +16,21 @@ from tests.joint_states import vector
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros import rclpy_private
-from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, sender_of, stamp_of, to_message
+from flight_ros.messages import (
+    NO_CHANNELS,
+    Decoder,
+    Encoder,
+    instant,
+    sender_of,
+    stamp_of,
+    to_message,
+)
 
-NAMES = st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12), max_size=6, unique=True)
+NAMES = st.lists(
+    st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12),
+    max_size=6,
+    unique=True,
+)
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 
 
@@ -26,7 +40,12 @@ def decoded(decoder: Decoder, raw: bytes) -> StampedVector:
     return sample
 
 
-@given(NAMES, st.data(), STAMPS, st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20))
+@given(
+    NAMES,
+    st.data(),
+    STAMPS,
+    st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20),
+)
 def test_sample_encoded_as_independent_library_encodes_it(
     names: list[str], data: st.DataObject, stamp_ns: int, frame_id: str
 ) -> None:
@@ -42,13 +61,19 @@ def test_bytes_that_are_no_message_raise_error_that_nodes_catch() -> None:
 
 
 def test_the_middleware_reads_what_was_encoded() -> None:
-    message = deserialize_message(Encoder(("q", "V"), "aircraft").encode(1_500_000_000, np.array([1.5, -2.0])), JointState)
+    message = deserialize_message(
+        Encoder(("q", "V"), "aircraft").encode(1_500_000_000, np.array([1.5, -2.0])), JointState
+    )
     assert message == to_message(1_500_000_000, ("q", "V"), np.array([1.5, -2.0]), "aircraft")
     assert deserialize_message(instant(2_000_000_001), Clock).clock.nanosec == 1
     assert stamp_of(instant(2_000_000_001)) == 2_000_000_001
 
 
-@given(st.permutations(["q", "V", "p", "r"]), st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4), STAMPS)
+@given(
+    st.permutations(["q", "V", "p", "r"]),
+    st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4),
+    STAMPS,
+)
 def test_wanted_channels_decoded_by_name_with_and_without_known_layout(
     names: list[str], values: list[float], stamp_ns: int
 ) -> None:
@@ -62,7 +87,10 @@ def test_wanted_channels_decoded_by_name_with_and_without_known_layout(
 def test_decoder_follows_change_of_channel_names_or_publisher() -> None:
     decoder = Decoder(("q",))
     for names, frame_id in ((("q", "V"), "a"), (("V", "q"), "a"), (("q",), "b"), (("q", "V"), "a")):
-        sample = decoded(decoder, Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names])))
+        sample = decoded(
+            decoder,
+            Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names])),
+        )
         assert (sample.value.tolist(), sample.sender) == ([1.0], frame_id)
 
 

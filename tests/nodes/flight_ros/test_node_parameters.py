@@ -30,7 +30,9 @@ NODES: Mapping[str, type[FlightNode[Any]]] = {
 def test_node_without_parameters_names_a_missing_one(name: str) -> None:
     with world_of() as world, pytest.raises(ParameterError) as refused:
         world.make(NODES[name])
-    assert str(refused.value).startswith(f"{name}: found no parameters, expected a section for /{name} in a file")
+    assert str(refused.value).startswith(
+        f"{name}: found no parameters, expected a section for /{name} in a file"
+    )
     assert "missing, expected" in str(refused.value)
 
 
@@ -39,10 +41,19 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
     [
         (["-p", "k_g:=-1.0"], "controller.k_g: found -1.0, expected greater than 0"),
         (["-p", "max_agee:=1.0"], "controller.max_agee: unknown key, expected max_age perhaps"),
-        (["-p", "beta:=[1.0,2.0]"], "controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
+        (
+            ["-p", "beta:=[1.0,2.0]"],
+            "controller.beta: found 2 values, expected 4, one for each of q, p, r, V",
+        ),
         (["-p", "D:=[1,1,1,0]"], "controller.D[3]: found 0, expected 1 or -1"),
-        (["-r", "__node:=rise"], "rise: found no parameters, expected a section for /rise in a file of --params-file"),
-        (["-p", "rate:=0100"], "rate: found '0100' in line 1, expected a number without a 0 before it"),
+        (
+            ["-r", "__node:=rise"],
+            "rise: found no parameters, expected a section for /rise in a file of --params-file",
+        ),
+        (
+            ["-p", "rate:=0100"],
+            "rate: found '0100' in line 1, expected a number without a 0 before it",
+        ),
     ],
 )
 def test_an_invalid_parameter_is_one_sentence(
@@ -58,12 +69,19 @@ def test_an_invalid_parameter_is_one_sentence(
 
 @pytest.mark.parametrize("name", ["aircraft", "reference_model"])
 @pytest.mark.parametrize(("ago", "refused"), [(11.0, True), (9.0, False)])
-def test_start_time_long_ago_is_refused(name: str, ago: float, refused: bool, osprey_gust: Scenario) -> None:
+def test_start_time_long_ago_is_refused(
+    name: str, ago: float, refused: bool, osprey_gust: Scenario
+) -> None:
     """A late node catches up with its missed ticks, but not with those of more than 10 s."""
     now = 1000.0 + EPOCH_NS / NANOSECONDS
-    with world_of("--params-file", str(osprey_gust.path), "-p", f"start_time:={now - ago}") as world:
+    with world_of(
+        "--params-file", str(osprey_gust.path), "-p", f"start_time:={now - ago}"
+    ) as world:
         if refused:
-            with pytest.raises(ParameterError, match=rf"{name}\.start_time: found an instant 11 s ago, expected a future one"):
+            with pytest.raises(
+                ParameterError,
+                match=rf"{name}\.start_time: found an instant 11 s ago, expected a future one",
+            ):
                 world.start(NODES[name])
         else:
             world.start(NODES[name])

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver looks at size and publisher before it decodes, and refuses, counts and logs what does not fit."""
+"""A receiver looks at size and publisher before it decodes, and refuses, counts and logs what does
+not fit.
+"""
 
 from typing import Any
 
@@ -49,7 +51,9 @@ class Topic(PolledSubscription):
 class Setup:
     """A receiver with what it decoded and took."""
 
-    def __init__(self, *, locked: bool = True, max_age: int | None = None, max_size: int | None = None) -> None:
+    def __init__(
+        self, *, locked: bool = True, max_age: int | None = None, max_size: int | None = None
+    ) -> None:
         self.topic = Topic()
         self.refusals = Refusals(self.topic)
         self.decoded: list[bytes] = []
@@ -58,7 +62,13 @@ class Setup:
         lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER)) if locked else None
         max_age_ns = None if max_age is None else lambda: max_age
         self.receiver = Receiver(
-            self.topic, self.refusals, self.decode, self.take, lock=lock, max_age_ns=max_age_ns, max_size=max_size
+            self.topic,
+            self.refusals,
+            self.decode,
+            self.take,
+            lock=lock,
+            max_age_ns=max_age_ns,
+            max_size=max_size,
         )
 
     def decode(self, raw: bytes) -> StampedVector | None:
@@ -78,7 +88,9 @@ class Setup:
         return self.receiver.poll(now_ns, limit)
 
 
-def message(sender: str = "/aircraft#1", stamp_ns: int = 0, q: float = 0.5, names: tuple[str, ...] = NAMES) -> bytes:
+def message(
+    sender: str = "/aircraft#1", stamp_ns: int = 0, q: float = 0.5, names: tuple[str, ...] = NAMES
+) -> bytes:
     return Encoder(names, sender).encode(stamp_ns, np.array([q, *np.zeros(len(names) - 1)]))
 
 
@@ -92,7 +104,9 @@ def test_valid_sample_is_taken() -> None:
     setup = Setup()
     empty = Encoder((), "/aircraft#1").encode(0, np.zeros(0))
     assert setup.poll(message(), empty) == [True, True]
-    assert [(sample.sender, sample.value.tolist()) for sample in setup.taken] == [("/aircraft#1", [0.5, 0.0])]
+    assert [(sample.sender, sample.value.tolist()) for sample in setup.taken] == [
+        ("/aircraft#1", [0.5, 0.0])
+    ]
     assert not setup.refusals.counts
 
 
@@ -118,11 +132,19 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
 
 
 def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
-    """The longer, the dearer: 16 kB cost 22 times a right message. A publisher that timed out may have other channels."""
+    """The longer, the dearer: 16 kB cost 22 times a right message. A publisher that timed out may
+    have other channels.
+    """
     setup = Setup()
     right, longer = message(), message(names=(*NAMES, "alpha"))
     too_long = longer + bytes(len(longer) + 1)
-    assert setup.poll(right, longer, right, too_long, of_size(MAX_SIZE)) == [True, True, True, False, False]
+    assert setup.poll(right, longer, right, too_long, of_size(MAX_SIZE)) == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
     assert len(setup.decoded) == 3
     assert setup.refusals.counts == {"y: size": 2}
     assert setup.topic.lines[0][1].endswith(f"bytes, expected at most {2 * len(longer)}")
@@ -133,7 +155,9 @@ def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
 
 
 def test_report_may_be_much_longer_than_the_one_before() -> None:
-    """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout later."""
+    """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout
+    later.
+    """
     right, long = message(), message(names=(*NAMES, *(f"c{k}" for k in range(800))))
     setup = Setup(max_size=len(long))
     assert setup.poll(right, long, long + bytes(1)) == [True, True, False]
@@ -146,7 +170,9 @@ def test_size_limit_is_inclusive() -> None:
 
 
 @pytest.mark.parametrize("decoder", [Decoder(NAMES), NamedDecoder()])
-def test_no_client_decodes_long_message(decoder: Decoder | NamedDecoder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_client_decodes_long_message(
+    decoder: Decoder | NamedDecoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A command that waits for a topic has no receiver."""
     monkeypatch.setattr(messages, "deserialize_message", None)
     with pytest.raises(ChannelError, match="a message of 1200000 bytes"):
@@ -159,7 +185,12 @@ def big_endian(sender: str) -> bytes:
     return bytes(STORE.serialize_cdr(made, JOINT_STATE, little_endian=False))
 
 
-FOREIGN = [message("/foreign"), of_size(MAX_SIZE, "/foreign"), message("/foreign", names=("a",)), big_endian("/foreign")]
+FOREIGN = [
+    message("/foreign"),
+    of_size(MAX_SIZE, "/foreign"),
+    message("/foreign", names=("a",)),
+    big_endian("/foreign"),
+]
 
 
 @pytest.mark.parametrize("raw", FOREIGN)
@@ -172,7 +203,9 @@ def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
     assert setup.topic.lines == [("error", f"/y: sample refused: {sentence}")]
     assert setup.refusals.last["/y"][1] == sentence
     assert [setup.refusals.conflict(), setup.refusals.conflict()] == [f"/y: {sentence}", ""]
-    assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [True]  # the first one has timed out
+    assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [
+        True
+    ]  # the first one has timed out
 
 
 def test_big_endian_publisher_is_taken() -> None:
@@ -180,7 +213,9 @@ def test_big_endian_publisher_is_taken() -> None:
     assert setup.poll(big_endian("/aircraft#1"), message()) == [True, True]
 
 
-@pytest.mark.parametrize("encapsulation", [b"\x00\x02", b"\x00\x03", b"\x00\x07", b"\x00\x0b", b"\xff\xff"])
+@pytest.mark.parametrize(
+    "encapsulation", [b"\x00\x02", b"\x00\x03", b"\x00\x07", b"\x00\x0b", b"\xff\xff"]
+)
 def test_message_of_another_encoding_is_not_decoded(encapsulation: bytes) -> None:
     """PL_CDR and XCDR2, whose publisher has another place."""
     setup = Setup()
@@ -211,7 +246,9 @@ def test_invalid_message_does_not_lock(raw: bytes, reason: str) -> None:
     assert setup.poll(message("/second")) == [True]
 
 
-@pytest.mark.parametrize(("stamp_ns", "reason"), [(-101, "old"), (101, "future"), (-100, ""), (100, "")])
+@pytest.mark.parametrize(
+    ("stamp_ns", "reason"), [(-101, "old"), (101, "future"), (-100, ""), (100, "")]
+)
 def test_stamps_are_limited_both_ways(stamp_ns: int, reason: str) -> None:
     setup = Setup(max_age=MAX_AGE)
     assert setup.poll(message(stamp_ns=stamp_ns)) == [not reason]

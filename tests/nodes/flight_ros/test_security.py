@@ -31,7 +31,10 @@ def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
 ) -> None:
     monkeypatch.setattr(psutil, "Process", process)
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOOPBACK_PROFILE))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local,
+    ):
         opened.bind(("0.0.0.0", 0))  # noqa: S104 - on purpose, for nothing to read
         local.bind(("127.0.0.1", 0))
         found = open_to_network()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes by the /clock of a simulator, at any speed: the same flight, a pause, a restart, and the log."""
+"""Nodes by the /clock of a simulator, at any speed: the same flight, a pause, a restart, and the
+log.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,22 +58,30 @@ class Simulation:
 @contextmanager
 def simulation(scenario: Scenario, *arguments: str, speed: float = 1.0) -> Iterator[Simulation]:
     """A world by /clock."""
-    with world_of("--params-file", str(scenario.path), "-p", "use_sim_time:=true", *arguments) as world:
+    with world_of(
+        "--params-file", str(scenario.path), "-p", "use_sim_time:=true", *arguments
+    ) as world:
         yield Simulation(world, speed)
 
 
 def flown(scenario: Scenario, speed: float) -> tuple[list[bytes], float]:
-    """What the controller sent in 2.5 s of simulated time, and how long that took on the host, s."""
+    """What the controller sent in 2.5 s of simulated time, and how long that took on the host,
+    s.
+    """
     with simulation(scenario, speed=speed) as simulator:
         simulator.start(AircraftNode, ReferenceModelNode, ControllerNode)
         begin = simulator.world.clock.monotonic()
         simulator.run(2.5)
         assert simulator.world.last("/internals")["mode"] == Mode.ENGAGED
-        return [raw for _, raw in simulator.world.sent["/internals"]], simulator.world.clock.monotonic() - begin
+        return [
+            raw for _, raw in simulator.world.sent["/internals"]
+        ], simulator.world.clock.monotonic() - begin
 
 
 def test_same_ticks_at_any_speed(osprey_gust: Scenario) -> None:
-    (usual, _), (slow, slow_time), (fast, fast_time) = (flown(osprey_gust, speed) for speed in (1.0, 0.3, 3.0))
+    (usual, _), (slow, slow_time), (fast, fast_time) = (
+        flown(osprey_gust, speed) for speed in (1.0, 0.3, 3.0)
+    )
     assert len(usual) > 200
     assert slow == usual == fast
     assert slow_time == pytest.approx(2.5 / 0.3, rel=0.01)
@@ -86,7 +96,12 @@ def test_pause_of_clock_is_a_pause(osprey_gust: Scenario) -> None:
         simulator.world.run(5.0)  # 50 times the age limits, on the host
         assert {topic: len(simulator.world.sent[topic]) for topic in before} == before
         simulator.run(1.0)
-        assert not [line for node in (aircraft, controller) for line in node.log.lines if "HOLD" in line or "failsafe" in line]
+        assert not [
+            line
+            for node in (aircraft, controller)
+            for line in node.log.lines
+            if "HOLD" in line or "failsafe" in line
+        ]
         assert simulator.world.last("/internals")["mode"] == Mode.ENGAGED
         instants = [stamp_ns(message) for message in simulator.world.messages("/u")]
         assert np.diff(instants).max() == 10_000_000
@@ -100,7 +115,10 @@ def test_jump_of_clock_ends_the_simulation(jump: float, osprey_gust: Scenario) -
         controller.require_flight()
         simulator.now_ns += round(jump * NANOSECONDS)
         simulator.run(0.002)
-        with pytest.raises(ClockRestarted, match=rf"/clock jumped by \{jump + 0.002:+.3f} s: another simulation begins"):
+        with pytest.raises(
+            ClockRestarted,
+            match=rf"/clock jumped by \{jump + 0.002:+.3f} s: another simulation begins",
+        ):
             controller.require_flight()
 
 
@@ -111,7 +129,9 @@ def test_missing_clock_is_named_after_seconds(osprey_gust: Scenario) -> None:
         for _ in range(50):
             controller.warn_without_time()
             simulator.world.clock.sleep(0.1)
-        assert [line for line in controller.log.lines if "clock" in line] == ["[WARNING] waiting for /clock: no publisher"]
+        assert [line for line in controller.log.lines if "clock" in line] == [
+            "[WARNING] waiting for /clock: no publisher"
+        ]
 
 
 def test_malformed_clock_is_ignored(osprey_gust: Scenario) -> None:
@@ -122,7 +142,9 @@ def test_malformed_clock_is_ignored(osprey_gust: Scenario) -> None:
 
 
 def test_recorder_stamps_by_clock(osprey_gust: Scenario, tmp_path: Path) -> None:
-    with simulation(osprey_gust, "-p", f"recorder:directory:={tmp_path / 'run'}", speed=3.0) as simulator:
+    with simulation(
+        osprey_gust, "-p", f"recorder:directory:={tmp_path / 'run'}", speed=3.0
+    ) as simulator:
         nodes = simulator.start(AircraftNode, ReferenceModelNode, ControllerNode, RecorderNode)
         simulator.run(2.0)
         simulator.world.run(5.0)  # a pause
@@ -133,8 +155,14 @@ def test_recorder_stamps_by_clock(osprey_gust: Scenario, tmp_path: Path) -> None
         assert again.log.lines[0].endswith("run-2/run-2_0.mcap")
         assert (tmp_path / "run" / "run_0.mcap").exists()
     run = read_run(tmp_path / "run")
-    assert any(note.startswith("flown by the simulated time of /clock, at ") for note in run.tape.notes)
-    logged = [(time_ns, stamp_of(data)) for topic, time_ns, data in messages(tmp_path / "run") if topic == "/u"]
+    assert any(
+        note.startswith("flown by the simulated time of /clock, at ") for note in run.tape.notes
+    )
+    logged = [
+        (time_ns, stamp_of(data))
+        for topic, time_ns, data in messages(tmp_path / "run")
+        if topic == "/u"
+    ]
     assert len(logged) > 200
     assert all(0 <= time_ns - stamp <= 2 * STEP_NS for time_ns, stamp in logged)
 
@@ -142,6 +170,11 @@ def test_recorder_stamps_by_clock(osprey_gust: Scenario, tmp_path: Path) -> None
 def test_clock_of_a_running_node_is_fixed(osprey_gust: Scenario) -> None:
     with simulation(osprey_gust) as simulator:
         (controller,) = simulator.start(ControllerNode)
-        results = controller.set_parameters([Parameter("use_sim_time", value=value) for value in (True, False)])
+        results = controller.set_parameters(
+            [Parameter("use_sim_time", value=value) for value in (True, False)]
+        )
         assert [result.successful for result in results] == [True, False]
-        assert "use_sim_time: found False, expected no change: a node chooses its clock when it starts" in results[1].reason
+        assert (
+            "use_sim_time: found False, expected no change: a node chooses its clock when it starts"
+            in results[1].reason
+        )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each input of each node refuses a stamp that is behind or ahead of the clock by more than the age limit of the input."""
+"""Each input of each node refuses a stamp that is behind or ahead of the clock by more than the age
+limit of the input.
+"""
 
 import json
 from collections.abc import Mapping
@@ -16,7 +18,14 @@ from aircraft_sim.node import AircraftNode
 from autopilot_bridge.node import BridgeNode
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_bringup.graph import AIRCRAFT, CONTROLLER, GUIDANCE, REFERENCE_MODEL, NodeSpec, parameter_overrides
+from flight_bringup.graph import (
+    AIRCRAFT,
+    CONTROLLER,
+    GUIDANCE,
+    REFERENCE_MODEL,
+    NodeSpec,
+    parameter_overrides,
+)
 from flight_core.channels import POSE
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_guidance.node import GuidanceNode
@@ -35,7 +44,10 @@ NODES: Mapping[NodeSpec, type[FlightNode[Any]]] = {
     GUIDANCE: GuidanceNode,
 }
 NOW_NS = 1000 * NANOSECONDS
-CONTROLLER_AGE, GUIDANCE_AGE = SCENARIO.controller.max_age, SCENARIO.guidance.max_age if SCENARIO.guidance else 0.0
+CONTROLLER_AGE, GUIDANCE_AGE = (
+    SCENARIO.controller.max_age,
+    SCENARIO.guidance.max_age if SCENARIO.guidance else 0.0,
+)
 DELAY = 0.05  # s, of the sensors of the aircraft
 U_M_AGE, U_AGE = SCENARIO.reference_model.live.max_age, SCENARIO.aircraft.max_age + DELAY
 LIMITS = {
@@ -45,7 +57,10 @@ LIMITS = {
     "guidance": dict.fromkeys(("y", "pose", "target", "internals", "authority"), GUIDANCE_AGE),
 }
 """Age limits, s, by node and topic."""
-LOCKSTEP_UNBOUNDED = {"target", "authority"}  # an operator has the system clock; the last `authority` before a step is awaited
+LOCKSTEP_UNBOUNDED = {
+    "target",
+    "authority",
+}  # an operator has the system clock; the last `authority` before a step is awaited
 WITHOUT_STAMP = {"clock", "recorded", "route"}  # the flight time, the end of the log, a plan
 NAMES = {
     "y": SCENARIO.controller.outputs,
@@ -60,13 +75,22 @@ NAMES = {
 
 
 def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
-    """Assert that each receiver takes the stamps within the limit of the topic alone, behind and ahead of the clock."""
+    """Assert that each receiver takes the stamps within the limit of the topic alone, behind and
+    ahead of the clock.
+    """
     receivers = {receiver.subscription.topic.name: receiver for receiver in made.receivers}
     for topic, limit in limits.items():
         encoder = Encoder(NAMES[topic], "/publisher")
-        for k, offset in enumerate((-10.0, -1.01 * limit, -0.99 * limit, 0.0, 0.99 * limit, 1.01 * limit, 10.0)):
-            message = encoder.encode(NOW_NS + nanoseconds(offset), np.full(len(NAMES[topic]), 0.01 * k))
-            assert receivers[topic].take_message(message, NOW_NS) is (abs(offset) <= limit), (topic, offset)
+        for k, offset in enumerate(
+            (-10.0, -1.01 * limit, -0.99 * limit, 0.0, 0.99 * limit, 1.01 * limit, 10.0)
+        ):
+            message = encoder.encode(
+                NOW_NS + nanoseconds(offset), np.full(len(NAMES[topic]), 0.01 * k)
+            )
+            assert receivers[topic].take_message(message, NOW_NS) is (abs(offset) <= limit), (
+                topic,
+                offset,
+            )
         assert made.refusals.counts == {f"{topic}: old": 2, f"{topic}: future": 2}
         made.refusals.counts.clear()
 
@@ -76,7 +100,9 @@ def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
 def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_path: Path) -> None:
     overrides = parameter_overrides(spec, SCENARIO, tmp_path, 0.0, lockstep=lockstep)
     overrides = {**overrides, "sensors.delay": DELAY} if spec is AIRCRAFT else overrides
-    parameters = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
+    parameters = (
+        word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")
+    )
     with world_of("--params-file", str(SCENARIO.path), *parameters) as world:
         made = world.make(NODES[spec])
         topics = {subscription.topic.name for subscription in made.polled_subscriptions}
@@ -88,10 +114,14 @@ def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_pat
 
 
 def test_u_of_the_bridge_is_bounded_both_ways() -> None:
-    """The topics of the autopilot have the same test in tests/pure/autopilot_bridge/test_bridge.py."""
+    """The topics of the autopilot have the same test in
+    tests/pure/autopilot_bridge/test_bridge.py.
+    """
     channel_map = load_map(str(MAP))
     limit = channel_map.silence.max_age + max(row.max_age for row in channel_map.outputs.values())
     with world_of("-p", f"map:={MAP}") as world:
         made = world.make(BridgeNode)
         require_bounds(made, {"u": limit})
-        assert {subscription.topic.name for subscription in made.polled_subscriptions} - {"u"} <= channel_map.topics.keys()
+        assert {subscription.topic.name for subscription in made.polled_subscriptions} - {
+            "u"
+        } <= channel_map.topics.keys()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A test in real time that fails beside a pause of the host is run again; one that fails without a pause fails."""
+"""A test in real time that fails beside a pause of the host is run again; one that fails without a
+pause fails.
+"""
 
 import subprocess
 import sys
@@ -40,19 +42,30 @@ def test_bears_more(): assert False
 
 
 def printed(folder: Path, pause: float) -> str:
-    """What pytest prints of tests that pass at an attempt, and of one that bears a longer pause and fails."""
+    """What pytest prints of tests that pass at an attempt, and of one that bears a longer pause and
+    fails.
+    """
     (folder / "test_it.py").write_text(TESTS, encoding="utf-8")
-    (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n", encoding="utf-8")
+    (folder / "pytest.ini").write_text(
+        "[pytest]\nmarkers =\n  longest_pause(s): a test\n", encoding="utf-8"
+    )
     program = PLUGIN.format(pause=pause, folder=str(folder))
     options = {"cwd": folder, "env": {"PYTHONPATH": str(REPOSITORY)}}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, **options
+    )  # type: ignore[call-overload]
     return str(done.stdout) + str(done.stderr)
 
 
 def test_failure_beside_a_pause_is_run_again_at_most_twice(tmp_path: Path) -> None:
     shown = printed(tmp_path, pause=0.3)
-    assert "2 failed, 3 passed, 1 skipped" in shown  # the one that bears more, and the one that fails alike three times
-    sentence = "test_it.py::test_passes_at[{}]: the host paused for 0.30 s, the test bears 0.1 s, in attempt"
+    assert (
+        "2 failed, 3 passed, 1 skipped" in shown
+    )  # the one that bears more, and the one that fails alike three times
+    sentence = (
+        "test_it.py::test_passes_at[{}]: the host paused for 0.30 s, the test bears 0.1 "
+        "s, in attempt"
+    )
     assert [shown.count(sentence.format(attempt)) for attempt in (1, 2, 3, 4)] == [0, 1, 2, 3]
     assert shown.count("inconclusive: the host paused for 0.30 s") == 1
 
@@ -68,7 +81,9 @@ def test_until_returns_what_it_waited_for() -> None:
     assert until(lambda: looks[2:], "three looks", lambda: looks.append(len(looks))) == [2]
 
 
-def test_wait_without_its_condition_fails_with_output_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wait_without_its_condition_fails_with_output_of_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     node = SimpleNamespace(arguments=("a.main",), output="waiting for /u")
     monkeypatch.setattr(waiting, "running", [node])
     with pytest.raises(AssertionError, match=r"not within 0 s: a u\na.main:\nwaiting for /u"):
@@ -77,7 +92,9 @@ def test_wait_without_its_condition_fails_with_output_of_processes(monkeypatch: 
 
 def test_wait_is_longer_by_the_delays_of_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     looks: list[int] = []
-    monkeypatch.setattr(waiting, "HOST", SimpleNamespace(since=lambda t: 1000.0 if len(looks) < 3 else 0.0))
+    monkeypatch.setattr(
+        waiting, "HOST", SimpleNamespace(since=lambda t: 1000.0 if len(looks) < 3 else 0.0)
+    )
     with pytest.raises(AssertionError):
         until(lambda: False, "nothing", lambda: looks.append(1), timeout=0.0)
     assert len(looks) == 3
@@ -85,8 +102,13 @@ def test_wait_is_longer_by_the_delays_of_the_host(monkeypatch: pytest.MonkeyPatc
 
 def test_process_under_test_ends_with_process_that_runs_tests() -> None:
     long = "Process('timeit', '-n', '1', 'import time; time.sleep(600)', cwd=Path())"
-    program = f"from pathlib import Path; from tests.ros.conftest import Process; print({long}.popen.pid, flush=True)"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True) as tests:
+    program = (
+        "from pathlib import Path; from tests.ros.conftest import Process; "
+        f"print({long}.popen.pid, flush=True)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True
+    ) as tests:
         assert tests.stdout is not None
         process = psutil.Process(int(tests.stdout.readline()))
         until(lambda: "timeit" in process.cmdline()[:3], "the program: until then it is setpriv")

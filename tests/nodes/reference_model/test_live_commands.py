@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m of the reference model's node: one publisher, the ending when it falls silent, and lockstep."""
+"""Live commands u_m of the reference model's node: one publisher, the ending when it falls silent,
+and lockstep.
+"""
 
 from pathlib import Path
 
@@ -26,7 +28,11 @@ def osprey(tmp_path: Path) -> Path:
     """The osprey with Euler's kinematics in calm air, whose reference levels the wings."""
     varied = find_scenario("osprey_servo").vary(
         aircraft={"kinematics": "euler", "gusts": {}},
-        reference_model={"live": {"speed": 25.0, "bounds": {"p": 1.0}}, "pulses": {}, "coordinated_turn": None},
+        reference_model={
+            "live": {"speed": 25.0, "bounds": {"p": 1.0}},
+            "pulses": {},
+            "coordinated_turn": None,
+        },
     )
     path = tmp_path / "live.yaml"
     path.write_text(scenario_yaml(varied), encoding="utf-8")
@@ -37,7 +43,9 @@ def command(p: float) -> dict[str, float]:
     return dict.fromkeys(NAMES, 0.0) | {"p": p}
 
 
-def test_second_publisher_and_command_beyond_bound_refused_and_silence_ends_in_zero_commands(osprey: Path) -> None:
+def test_second_publisher_and_command_beyond_bound_refused_and_silence_ends_in_zero_commands(
+    osprey: Path,
+) -> None:
     with world_of("--params-file", str(osprey)) as world:
         node = world.start(ReferenceModelNode)
         world.run(0.5, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
@@ -55,7 +63,10 @@ def test_second_publisher_and_command_beyond_bound_refused_and_silence_ends_in_z
         assert any("conflicting publisher /other#2 ignored" in line for line in node.log.lines)
         assert min(y_m.channels["p"] for y_m in world.vectors("/y_m")) >= 0.0  # no roll to the left
         world.run(10.0)
-        assert "[ERROR] /u_m timed out: wings are levelled, then all commands are zero" in node.log.lines
+        assert (
+            "[ERROR] /u_m timed out: wings are levelled, then all commands are zero"
+            in node.log.lines
+        )
         assert diagnostics(world, "/reference_model")[0] == "ending"
         assert max(abs(value) for value in world.last("/y_m").values()) < 1e-3
 
@@ -65,9 +76,13 @@ def test_in_lockstep_reference_waits_for_u_m_and_repeats_bytes_of_one_process(os
     expected = [reference.sample(0)]
     for number in range(1, 31):  # 500 Hz; u_m at 50 Hz: at every tenth instant
         if (number - 1) % 10 == 0:
-            reference.take((number - 1) * 2 * MS, np.array([0.0, 0.0, 0.02 * number, 0.0]), np.zeros(2))
+            reference.take(
+                (number - 1) * 2 * MS, np.array([0.0, 0.0, 0.02 * number, 0.0]), np.zeros(2)
+            )
         expected.append(reference.sample(number))
-    with world_of("--params-file", str(osprey), "-p", "lockstep:=true", "-p", "u_m_rate:=50.0") as world:
+    with world_of(
+        "--params-file", str(osprey), "-p", "lockstep:=true", "-p", "u_m_rate:=50.0"
+    ) as world:
         node = world.make(ReferenceModelNode)
         clock, u_m = world.publisher(Clock, "/clock"), world.publisher(JointState, "/u_m")
         for number in range(31):
@@ -83,4 +98,7 @@ def test_in_lockstep_reference_waits_for_u_m_and_repeats_bytes_of_one_process(os
             pass
         received = world.vectors("/y_m")
     assert [sample.stamp_ns for sample in received] == [number * 2 * MS for number in range(31)]
-    assert np.array([[*sample.channels.values()] for sample in received]).tobytes() == np.array(expected).tobytes()
+    assert (
+        np.array([[*sample.channels.values()] for sample in received]).tobytes()
+        == np.array(expected).tobytes()
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node: bumpless engagement, failsafe for stale inputs, malformed samples, parameters, lifecycle, overruns."""
+"""The controller's node: bumpless engagement, failsafe for stale inputs, malformed samples,
+parameters, lifecycle, overruns.
+"""
 
 import math
 import re
@@ -60,16 +62,22 @@ class Flight:
 
     def column(self, name: str, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
         """A channel of `internals` from a tick on."""
-        return np.array([sample.channels[name] for sample in self.world.vectors("/internals")[begin:]])
+        return np.array(
+            [sample.channels[name] for sample in self.world.vectors("/internals")[begin:]]
+        )
 
     def at(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
         """The instants of the ticks, ns of the system clock."""
         samples = self.world.vectors("/internals")[begin:]
-        return np.array([sample.stamp_ns + nanoseconds(sample.channels["age"]) for sample in samples])
+        return np.array(
+            [sample.stamp_ns + nanoseconds(sample.channels["age"]) for sample in samples]
+        )
 
     def u(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The published inputs, shape (N, m)."""
-        return np.array([[*sample.channels.values()] for sample in self.world.vectors("/u")[begin:]])
+        return np.array(
+            [[*sample.channels.values()] for sample in self.world.vectors("/u")[begin:]]
+        )
 
     def call(self, kind: Any, name: str, **fields: Any) -> Any:
         """The response of a service of the controller."""
@@ -77,17 +85,26 @@ class Flight:
 
     def set(self, **values: object) -> tuple[bool, str]:
         """Set parameters at once: whether, and why not."""
-        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        result = self.call(SetParametersAtomically, "set_parameters_atomically", parameters=messages).result
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        result = self.call(
+            SetParametersAtomically, "set_parameters_atomically", parameters=messages
+        ).result
         return result.successful, result.reason
 
     def values(self, *names: str) -> list[float]:
         """Parameters of the type double."""
-        return [value.double_value for value in self.call(GetParameters, "get_parameters", names=list(names)).values]
+        return [
+            value.double_value
+            for value in self.call(GetParameters, "get_parameters", names=list(names)).values
+        ]
 
     def transition(self, number: int) -> bool:
         """Request a transition; whether it succeeded."""
-        return bool(self.call(ChangeState, "change_state", transition=Transition(id=number)).success)
+        return bool(
+            self.call(ChangeState, "change_state", transition=Transition(id=number)).success
+        )
 
     @property
     def state(self) -> int:
@@ -128,17 +145,23 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenari
         flight.run(0.1)
         mode, at, u = flight.column("mode", begin), flight.at(begin), flight.u(begin)
         failsafe = int(np.flatnonzero(mode == Mode.HOLD)[0])
-        assert 0 < at[failsafe] - last - nanoseconds(MAX_AGE) <= nanoseconds(PERIOD)  # the first tick at which y is stale
+        assert (
+            0 < at[failsafe] - last - nanoseconds(MAX_AGE) <= nanoseconds(PERIOD)
+        )  # the first tick at which y is stale
         during = slice(failsafe, resumed - begin)
         scale = np.clip(1.0 - ((at[during] - at[failsafe]) / NANOSECONDS - hold) / ramp, 0.0, 1.0)
-        assert mode[during].tolist() == np.select([scale == 1.0, scale > 0.0], [Mode.HOLD, Mode.RAMP], Mode.TRIM).tolist()
+        assert (
+            mode[during].tolist()
+            == np.select([scale == 1.0, scale > 0.0], [Mode.HOLD, Mode.RAMP], Mode.TRIM).tolist()
+        )
         u_held = u[failsafe - 1]
         assert np.abs(u_held).min() > 0.0
         assert np.abs(u[during] - np.outer(scale, u_held)).max() <= EXACT
         assert (u[during][scale == 1.0] == u_held).all()
         assert (u[during][scale == 0.0] == 0.0).all()
 
-        # bumpless transfer: re-engaged at the present u, then steps no larger than those of the law at a constant e
+        # bumpless transfer: re-engaged at the present u, then steps no larger than those of the law
+        # at a constant e
         law = osprey_gust.controller.law_params()
         again = resumed - begin + int(np.flatnonzero(mode[resumed - begin :] == Mode.ENGAGED)[0])
         dt = flight.column("dt", begin)
@@ -146,7 +169,11 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenari
         assert (u[again] == u[again - 1]).all()
         moved = np.abs(np.diff(u[again:], axis=0))
         assert (moved > 0.0).all()
-        assert (moved <= np.outer(dt[again + 1 :], law.input_scale * (law.K * law.Lambda * y + law.beta)) + EXACT).all()
+        assert (
+            moved
+            <= np.outer(dt[again + 1 :], law.input_scale * (law.K * law.Lambda * y + law.beta))
+            + EXACT
+        ).all()
 
 
 def test_stopped_controller_re_engages_from_trim(osprey_gust: Scenario) -> None:
@@ -161,12 +188,16 @@ def test_stopped_controller_re_engages_from_trim(osprey_gust: Scenario) -> None:
         assert any("overrun of 0.6" in line for line in flight.node.log.lines)
 
 
-def test_tick_that_is_stopped_half_way_publishes_no_old_u(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tick_that_is_stopped_half_way_publishes_no_old_u(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The aircraft has started its failsafe: u would jump."""
     flight.engage()
     ages: list[float] = []
     clock = flight.world.clock
-    flight.world.create_subscription(JointState, "/u", lambda u: ages.append((clock.time_ns() - stamp_ns(u)) / NANOSECONDS), 1)
+    flight.world.create_subscription(
+        JointState, "/u", lambda u: ages.append((clock.time_ns() - stamp_ns(u)) / NANOSECONDS), 1
+    )
     (y,) = (each for each in flight.world.subscriptions if each.topic_name == "/y")
     take = y.take_message
 
@@ -186,7 +217,9 @@ def test_overrun_of_controller_does_not_free_publisher_lock(osprey_gust: Scenari
         flight.engage()
         with flight.world.stopped(flight.node):
             flight.run(0.6, silent=True)  # beyond age limit, hold and ramp
-        flight.world.send("/y", dict.fromkeys(OUTPUTS, 1.0), "/foreign")  # the first sample that the controller takes
+        flight.world.send(
+            "/y", dict.fromkeys(OUTPUTS, 1.0), "/foreign"
+        )  # the first sample that the controller takes
         flight.run(0.1)
         assert flight.node.refusals.counts["y: sender"] == 1
         assert set(flight.column("y.q")) == {0.01}
@@ -202,9 +235,15 @@ def test_another_publisher_takes_over_once_u_is_at_trim(osprey_gust: Scenario) -
             for topic in ("/y_m", "/y"):
                 flight.world.send(topic, dict.fromkeys(OUTPUTS, 0.5), "/another")
 
-        flight.world.until(lambda: flight.world.last("/internals")["y.q"] == 0.5, "the y of another publisher", send)
+        flight.world.until(
+            lambda: flight.world.last("/internals")["y.q"] == 0.5,
+            "the y of another publisher",
+            send,
+        )
         taken_ns = flight.at()[-1]
-        assert 0 < taken_ns - last_ns - nanoseconds(MAX_AGE + hold + ramp) <= nanoseconds(2 * PERIOD)
+        assert (
+            0 < taken_ns - last_ns - nanoseconds(MAX_AGE + hold + ramp) <= nanoseconds(2 * PERIOD)
+        )
 
 
 HOUR_AHEAD = 3600.0
@@ -215,7 +254,11 @@ HOUR_AHEAD = 3600.0
     [
         (to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "/peer#1"), None, "y: finite"),
         (to_message(0, ("q", "V", "p", "x"), np.zeros(4), "/peer#1"), None, "y: name"),
-        (JointState(header=Header(frame_id="/peer#1"), name=list(OUTPUTS), position=[1.0]), None, "y: length"),
+        (
+            JointState(header=Header(frame_id="/peer#1"), name=list(OUTPUTS), position=[1.0]),
+            None,
+            "y: length",
+        ),
         (None, MAX_AGE + 2 * PERIOD, "y: old"),
         (None, -HOUR_AHEAD, "y: future"),
     ],
@@ -262,9 +305,15 @@ def test_gains_change_in_flight_bumpless(osprey_gust: Scenario) -> None:
         assert "[INFO] k_g: 1.0 -> 3.0" in flight.node.log.lines
         flight.run(0.1)
         assert len(set(flight.column("parameters", since))) == 2  # those before and after
-        # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would move it by more than 2 e.
-        laws = [scenario.controller.law_params() for scenario in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
-        rate = np.max([law.input_scale * (law.K * law.Lambda * flight.y + law.beta) for law in laws], axis=0)
+        # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would
+        # move it by more than 2 e.
+        laws = [
+            scenario.controller.law_params()
+            for scenario in (osprey_gust, osprey_gust.vary(controller=CHANGED))
+        ]
+        rate = np.max(
+            [law.input_scale * (law.K * law.Lambda * flight.y + law.beta) for law in laws], axis=0
+        )
         moved = np.abs(np.diff(flight.u(since), axis=0))
         assert (moved <= np.outer(flight.column("dt", since)[1:], rate) + EXACT).all()
 
@@ -283,16 +332,27 @@ def test_saturation_limits_can_be_added_in_flight(flight: Flight) -> None:
     ("changes", "sentence"),
     [
         ({"k_g": -1.0}, "controller.k_g: found -1.0, expected greater than 0"),
-        ({"beta": [1.0, math.nan, 1.0, 1.0]}, "controller.beta[1]: found nan, expected a finite number"),
-        ({"beta": [1.0, 2.0]}, "controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
+        (
+            {"beta": [1.0, math.nan, 1.0, 1.0]},
+            "controller.beta[1]: found nan, expected a finite number",
+        ),
+        (
+            {"beta": [1.0, 2.0]},
+            "controller.beta: found 2 values, expected 4, one for each of q, p, r, V",
+        ),
         ({"k_g": 2.0, "sign": "smooth"}, "controller.sign: found 'smooth', expected"),
         ({"rate": 200.0}, "read-only"),
         ({"D": [-1, 1, 1, 1]}, "read-only"),
         ({"k_gg": 1.0}, "undeclared parameter"),
-        ({"use_sim_time": True}, "controller.use_sim_time: found True, expected no change: a node chooses its clock"),
+        (
+            {"use_sim_time": True},
+            "controller.use_sim_time: found True, expected no change: a node chooses its clock",
+        ),
     ],
 )
-def test_invalid_change_rejected_with_reason_and_has_no_effect(changes: dict[str, Any], sentence: str, flight: Flight) -> None:
+def test_invalid_change_rejected_with_reason_and_has_no_effect(
+    changes: dict[str, Any], sentence: str, flight: Flight
+) -> None:
     flight.engage()
     successful, reason = flight.set(**changes)
     assert not successful
@@ -305,10 +365,15 @@ def test_invalid_change_rejected_with_reason_and_has_no_effect(changes: dict[str
 
 def test_parameters_of_several_nodes_set_none(flight: Flight) -> None:
     """`ros2 param load` joins the sections of a file: max_age may then be that of the aircraft."""
-    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in (("max_age", 0.7), ("step", 0.002))]
+    messages = [
+        Parameter(name, value=value).to_parameter_msg()
+        for name, value in (("max_age", 0.7), ("step", 0.002))
+    ]
     results = flight.call(SetParameters, "set_parameters", parameters=messages).results
     assert [result.successful for result in results] == [False, False]
-    assert results[0].reason == "found step, expected parameters of /controller alone; nothing is set"
+    assert (
+        results[0].reason == "found step, expected parameters of /controller alone; nothing is set"
+    )
     assert flight.values("max_age") == [0.1]
 
 
@@ -326,8 +391,12 @@ def test_waits_for_configure_and_activate_without_autostart(osprey_gust: Scenari
         assert flight.mode == Mode.INACTIVE
 
 
-def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activated_nothing(osprey_gust: Scenario) -> None:
-    """A bridge engages with a fresh u. Beside another controller the u of a standby would be a conflict."""
+def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activated_nothing(
+    osprey_gust: Scenario,
+) -> None:
+    """A bridge engages with a fresh u. Beside another controller the u of a standby would be a
+    conflict.
+    """
     with flying(osprey_gust, autostart="false") as flight:
         assert flight.transition(Transition.TRANSITION_CONFIGURE)
         flight.run(0.3)
@@ -341,7 +410,9 @@ def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activa
         assert not flight.world.sent["/internals"]
 
 
-def test_controller_that_starts_inactive_publishes_trim_until_activated(osprey_gust: Scenario) -> None:
+def test_controller_that_starts_inactive_publishes_trim_until_activated(
+    osprey_gust: Scenario,
+) -> None:
     with flying(osprey_gust, start_active="false") as flight:
         flight.run(0.3)
         assert flight.state == State.PRIMARY_STATE_INACTIVE
@@ -362,7 +433,9 @@ def test_invalid_transition_refused_and_node_goes_on(flight: Flight) -> None:
 
 
 def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
-    """Deadlines are absolute: after an overrun a tick is late, and the ones that it skipped are counted."""
+    """Deadlines are absolute: after an overrun a tick is late, and the ones that it skipped are
+    counted.
+    """
     flight.engage()
     flight.run(2.0, silent=True)  # in the failsafe each tick publishes internals
     begin, before = len(flight.world.sent["/internals"]) - 1, missed(flight)
@@ -402,7 +475,9 @@ def test_clock_of_ticks_outlives_step_of_system_clock_and_step_is_told(flight: F
             flight.world.send("/y", dict.fromkeys(OUTPUTS, 0.01), age=age)
 
         flight.world.run(1.5, send)
-        assert any(f"[ERROR] the system clock was {sentence}" in line for line in flight.node.log.lines)
+        assert any(
+            f"[ERROR] the system clock was {sentence}" in line for line in flight.node.log.lines
+        )
     assert set(flight.column("mode")) == {Mode.ENGAGED}
 
 
@@ -410,12 +485,20 @@ def test_clock_of_ticks_outlives_step_of_system_clock_and_step_is_told(flight: F
     ("begin", "cause"),
     [
         (None, "no publisher"),
-        (lambda flight: flight.world.publisher(JointState, "/y"), "no sample of its publisher arrives"),
-        (lambda flight: flight.world.publisher(String, "/y"), "/peer publishes std_msgs/msg/String, expected sensor_msgs"),
+        (
+            lambda flight: flight.world.publisher(JointState, "/y"),
+            "no sample of its publisher arrives",
+        ),
+        (
+            lambda flight: flight.world.publisher(String, "/y"),
+            "/peer publishes std_msgs/msg/String, expected sensor_msgs",
+        ),
         (lambda flight: flight.world.send("/y", {"q": 0.0}), "samples refused, the last"),
     ],
 )
-def test_waiting_for_y_is_told_with_its_cause(begin: Callable[[Flight], object] | None, cause: str, flight: Flight) -> None:
+def test_waiting_for_y_is_told_with_its_cause(
+    begin: Callable[[Flight], object] | None, cause: str, flight: Flight
+) -> None:
     def meanwhile() -> None:
         if begin is not None and "refused" in cause:
             begin(flight)
@@ -423,15 +506,23 @@ def test_waiting_for_y_is_told_with_its_cause(begin: Callable[[Flight], object] 
     if begin is not None and "refused" not in cause:
         begin(flight)
     flight.world.run(3.5, meanwhile)
-    waits = [line for line in flight.node.log.lines if line.startswith("[WARNING] waiting for /y: ")]
+    waits = [
+        line for line in flight.node.log.lines if line.startswith("[WARNING] waiting for /y: ")
+    ]
     assert len(waits) == 1
     assert cause in waits[0]
     flight.world.run(2.0, meanwhile)
-    assert sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2  # every 2 s
+    assert (
+        sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2
+    )  # every 2 s
 
 
-@pytest.mark.parametrize(("rate", "named"), [(9.0, True), (20.0, True), (50.0, False), (200.0, False)])
-def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(rate: float, named: bool, flight: Flight) -> None:
+@pytest.mark.parametrize(
+    ("rate", "named"), [(9.0, True), (20.0, True), (50.0, False), (200.0, False)]
+)
+def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(
+    rate: float, named: bool, flight: Flight
+) -> None:
     """At 9 Hz the law engages and holds in turns; at 20 Hz after two late samples."""
     next_ns = 0
 
@@ -449,18 +540,27 @@ def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(rate: float, 
     told = [line for line in flight.node.log.lines if "fit into max_age" in line]
     assert len(told) == named
     if named:
-        seen = re.search(r"/y: ([\d.]+) samples a second, of which [\d.]+ fit into max_age = 0.1 s: send 30 ", told[0])
+        seen = re.search(
+            r"/y: ([\d.]+) samples a second, of which [\d.]+ fit into max_age = 0.1 s: send 30 ",
+            told[0],
+        )
         assert seen
         assert float(seen[1]) == pytest.approx(rate, rel=0.1)
 
 
 def test_long_max_age_is_named_at_start_and_in_flight(osprey_gust: Scenario) -> None:
     with flying(osprey_gust, max_age=2.0) as flight:
-        told = [line for line in flight.node.log.lines if "[WARNING] max_age = 2 s: the failsafe begins 2 s after" in line]
+        told = [
+            line
+            for line in flight.node.log.lines
+            if "[WARNING] max_age = 2 s: the failsafe begins 2 s after" in line
+        ]
         assert len(told) == 1
         for max_age in (0.1, 9.0):
             assert flight.set(max_age=max_age) == (True, "")
-        assert [line for line in flight.node.log.lines if "failsafe begins 9 s after the last y" in line]
+        assert [
+            line for line in flight.node.log.lines if "failsafe begins 9 s after the last y" in line
+        ]
         assert not [line for line in flight.node.log.lines if "failsafe begins 0.1 s" in line]
 
 
@@ -472,6 +572,8 @@ def test_sample_without_stamp_is_no_old_one(flight: Flight) -> None:
 
 
 def test_node_waits_for_the_next_whole_period(flight: Flight) -> None:
-    """1 ms after whole periods of the system clock, where the y and y_m of the instant have arrived."""
+    """1 ms after whole periods of the system clock, where the y and y_m of the instant have
+    arrived.
+    """
     flight.engage()
     assert set(flight.at() % (10 * MS)) == {MS}

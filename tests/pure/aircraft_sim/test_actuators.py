@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators and their faults against closed forms, and flights with dead zones, lags, rate and position saturation."""
+"""Actuators and their faults against closed forms, and flights with dead zones, lags, rate and
+position saturation.
+"""
 
 import math
 
@@ -37,11 +39,15 @@ SIX = Actuators(  # ideal, lag, rate limit, lag and rate limit, end stops, all
 )
 
 
-def actuator(lag: float = 0.0, lower: float = -math.inf, upper: float = math.inf, rate: float = math.inf) -> Actuators:
+def actuator(
+    lag: float = 0.0, lower: float = -math.inf, upper: float = math.inf, rate: float = math.inf
+) -> Actuators:
     return Actuators(*(np.array([value]) for value in (lag, lower, upper, rate)))
 
 
-def positions(commands: list[float], dt: float, params: Actuators, start: float = 0.0) -> list[float]:
+def positions(
+    commands: list[float], dt: float, params: Actuators, start: float = 0.0
+) -> list[float]:
     position, history = np.array([start]), []
     for command in commands:
         position = step(position, np.array([command]), np.array(dt), params)
@@ -54,7 +60,9 @@ def osprey(step_ms: float = 2.0, **actuators: list[float]) -> PlantParams:
 
 
 @given(position=st.floats(-1e3, 1e3), command=st.floats(-1e3, 1e3), dt=st.floats(1e-4, 0.1))
-def test_ideal_actuator_passes_command_on_to_last_bit(position: float, command: float, dt: float) -> None:
+def test_ideal_actuator_passes_command_on_to_last_bit(
+    position: float, command: float, dt: float
+) -> None:
     assert positions([command], dt, actuator(), start=position) == [command]
 
 
@@ -62,45 +70,67 @@ def test_ideal_actuator_passes_command_on_to_last_bit(position: float, command: 
 def test_step_response_is_exact_first_order_response_for_any_dt(dt: float) -> None:
     # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding
     history = positions([0.3] * 20, dt, actuator(lag=0.02))
-    assert history == pytest.approx([0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13)
+    assert history == pytest.approx(
+        [0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13
+    )
 
 
 def test_rate_limit_gives_straight_ramp_that_ends_on_command() -> None:
     # 2 /s over 0.1 s: 0.2 a step, the last one only as far as the command
-    assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15)
-    assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15)
+    assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx(
+        [0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15
+    )
+    assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx(
+        [-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15
+    )
 
 
 def test_position_saturation_does_not_wind_up() -> None:
     # The position leaves the stop at once: the position, not the command, is the state.
-    assert positions([9.0, 9.0, -0.1, -9.0], 0.1, actuator(lower=-0.3, upper=0.5)) == [0.5, 0.5, -0.1, -0.3]
+    assert positions([9.0, 9.0, -0.1, -9.0], 0.1, actuator(lower=-0.3, upper=0.5)) == [
+        0.5,
+        0.5,
+        -0.1,
+        -0.3,
+    ]
 
 
 def test_lag_comes_before_rate_limit_and_end_stop_last() -> None:
-    # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2, the stop 0.05.
+    # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2,
+    # the stop 0.05.
     moved = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
     assert moved == pytest.approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
     # Close to the command the lag is slower than the rate limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
-    assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)), abs=1e-15)
+    assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(
+        0.1 * (1.0 - math.exp(-1.0)), abs=1e-15
+    )
 
 
 def test_dead_zone_gives_zero_inside_and_excess_outside() -> None:
     # input = c - clip(c, -w, w), w = 0.1
     params = Actuators(dead_zone=np.array([0.1]))
     commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
-    assert positions(commands, 0.01, params) == pytest.approx([0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16)
+    assert positions(commands, 0.01, params) == pytest.approx(
+        [0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16
+    )
 
 
 @given(command=st.floats(-1.0, 1.0), further=st.floats(0.0, 1e-3), width=st.floats(0.0, 0.5))
-def test_dead_zone_has_no_jump_and_never_reverses_command(command: float, further: float, width: float) -> None:
-    first, second = positions([command, command + further], 0.01, Actuators(dead_zone=np.array([width])))
+def test_dead_zone_has_no_jump_and_never_reverses_command(
+    command: float, further: float, width: float
+) -> None:
+    first, second = positions(
+        [command, command + further], 0.01, Actuators(dead_zone=np.array([width]))
+    )
     assert -1e-15 <= second - first <= further + 1e-15
     assert first * command >= 0.0
     assert abs(first) <= abs(command)
 
 
 def position_history(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
-    """Positions of the four actuators 10 ms after each of the given instants, with one command for all four."""
+    """Positions of the four actuators 10 ms after each of the given instants, with one command for
+    all four.
+    """
     params = osprey(10.0, **actuators)
     state, history = plant.initial_state(params), []
     for t in times_ms:
@@ -122,10 +152,17 @@ def test_stuck_surface_stays_where_it_is_from_instant_on() -> None:
 
 def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
     never = math.inf
-    lost = position_history(range(0, 80, 10), 0.2, lost_at=[0.05, never, never, 0.06], stuck_at=[never, never, 0.03, 0.03])
+    lost = position_history(
+        range(0, 80, 10),
+        0.2,
+        lost_at=[0.05, never, never, 0.06],
+        stuck_at=[never, never, 0.03, 0.03],
+    )
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
     assert lost[:, 3].tolist() == [0.2] * 6 + [0.0] * 2
-    assert lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8  # one healthy, one stuck where it was commanded
+    assert (
+        lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8
+    )  # one healthy, one stuck where it was commanded
 
 
 def test_fault_within_step_acts_from_next_step_on() -> None:
@@ -135,10 +172,17 @@ def test_fault_within_step_acts_from_next_step_on() -> None:
 
 
 def test_lost_aileron_acts_like_zero_column_of_b() -> None:
-    params, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
+    params, u = (
+        osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]),
+        np.array([0.01, 0.1, -0.02, 0.03]),
+    )
     without = osprey()
-    without = without._replace(aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0]))
-    actual, expected = (advance(0, plant.initial_state(each), u, 500 * MS, each).x for each in (params, without))
+    without = without._replace(
+        aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0])
+    )
+    actual, expected = (
+        advance(0, plant.initial_state(each), u, 500 * MS, each).x for each in (params, without)
+    )
     assert (actual == expected).all()
 
 
@@ -152,7 +196,8 @@ def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float
 
 
 def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
-    # From 50 ms on at 0.2 (1 - exp(-2.5)) with a lag of 0.2 s; the thrust, which has 1 s, stays as it is.
+    # From 50 ms on at 0.2 (1 - exp(-2.5)) with a lag of 0.2 s; the thrust, which has 1 s, stays as
+    # it is.
     lag, at = [0.02, 1.0, 0.02, 0.02], [0.05, 0.05, math.inf, math.inf]
     slow = position_history(range(0, 100, 10), 0.2, lag=lag, slow_at=at)
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
@@ -162,7 +207,8 @@ def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
 
 
 def test_loose_surface_follows_play_operator() -> None:
-    # Half-width 0.1: the position stays while the command is within 0.1 of it, and trails it by 0.1 otherwise.
+    # Half-width 0.1: the position stays while the command is within 0.1 of it, and trails it by 0.1
+    # otherwise.
     params, position = Actuators(loose_at=np.array([1.0]), loose_play=np.array([0.1])), np.zeros(1)
     history = []
     for t, command in ((0.0, 0.05), (1.0, 0.1), (1.0, 0.3), (1.0, 0.15), (1.0, 0.05), (1.0, -0.2)):
@@ -177,16 +223,30 @@ def test_drift_ends_as_the_drifted_aircraft() -> None:
     airframe = ice.drifted_airframe()
     expected = (airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_gusts())
     for matrix, first, last in zip(
-        ("A", "B", "gust_direction"), (before.A, before.B, before.gust_direction), expected, strict=True
+        ("A", "B", "gust_direction"),
+        (before.A, before.B, before.gust_direction),
+        expected,
+        strict=True,
     ):
         assert getattr(after, matrix) == pytest.approx(last)
-        assert getattr(plant.aircraft_at(2000 * MS, ice.plant()), matrix) == pytest.approx((first + last) / 2.0)
+        assert getattr(plant.aircraft_at(2000 * MS, ice.plant()), matrix) == pytest.approx(
+            (first + last) / 2.0
+        )
         assert (getattr(plant.aircraft_at(1000 * MS, ice.plant()), matrix) == first).all()
-    assert not np.allclose(after.gust_direction, before.gust_direction)  # wind acts by the aircraft's own A
+    assert not np.allclose(
+        after.gust_direction, before.gust_direction
+    )  # wind acts by the aircraft's own A
 
 
-@given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 1), st.floats(0.01, 100), st.floats(0.01, 1))
-def test_rate_and_stops_hold_for_any_command(commands: list[float], lag: float, rate: float, stop: float) -> None:
+@given(
+    st.lists(st.floats(-10, 10), min_size=1, max_size=30),
+    st.floats(0, 1),
+    st.floats(0.01, 100),
+    st.floats(0.01, 1),
+)
+def test_rate_and_stops_hold_for_any_command(
+    commands: list[float], lag: float, rate: float, stop: float
+) -> None:
     history = np.array([0.0, *positions(commands, 0.01, actuator(lag, -stop, stop, rate))])
     assert np.abs(history).max() <= stop
     assert np.abs(np.diff(history)).max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-15
@@ -204,31 +264,48 @@ def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
 
 @pytest.mark.parametrize("every", [1, 2])
 def test_late_command_acts_as_that_command_given_later(every: int) -> None:
-    """To the last bit, also where every second sample is left out: u is then held over two periods."""
+    """To the last bit, also where every second sample is left out: u is then held over two
+    periods.
+    """
     scenario, periods = find_scenario("osprey_servo"), 3
     late = {"actuators": scenario.aircraft.actuators.model_dump() | {"delay": 0.006}}
-    delayed, at_once = Simulator(scenario.vary(aircraft=late).aircraft), Simulator(scenario.aircraft)
-    held = np.repeat(0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0)  # over the periods 0 and 1, 2 and 3, ...
+    delayed, at_once = (
+        Simulator(scenario.vary(aircraft=late).aircraft),
+        Simulator(scenario.aircraft),
+    )
+    held = np.repeat(
+        0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0
+    )  # over the periods 0 and 1, 2 and 3, ...
     shifted = np.vstack([np.zeros((periods, 4)), held])
     y = {k: at_once.sample(k, shifted[k - 1])[0].value for k in range(1, 41)}
     for k in range(every, 41, every):
         np.testing.assert_array_equal(delayed.sample(k, held[k - 1])[0].value, y[k])
 
 
-# Mean positions, against the continuous actuator p_dot = clip((input - p) / lag, -rate, rate) between its end stops.
+# Mean positions, against the continuous actuator p_dot = clip((input - p) / lag, -rate, rate)
+# between its end stops.
 
 
-def continuous(commands: list[float], tick: float, lag: float, rate: float, stop: float) -> FloatArray:
-    """Integral of the position of the continuous actuator at the ends of the ticks, by SciPy's integrator."""
+def continuous(
+    commands: list[float], tick: float, lag: float, rate: float, stop: float
+) -> FloatArray:
+    """Integral of the position of the continuous actuator at the ends of the ticks, by SciPy's
+    integrator.
+    """
 
     def rates(_: float, state: FloatArray, command: float) -> list[float]:
         p_dot = min(max((command - state[0]) / lag, -rate), rate)
-        return [0.0 if p_dot * state[0] > 0.0 and abs(state[0]) >= stop else p_dot, min(max(state[0], -stop), stop)]
+        return [
+            0.0 if p_dot * state[0] > 0.0 and abs(state[0]) >= stop else p_dot,
+            min(max(state[0], -stop), stop),
+        ]
 
     state, history = np.zeros(2), []
     for command in commands:
         # The largest step bounds the overshoot of a stop: rate or command / lag times 1e-4 s.
-        found = solve_ivp(rates, (0.0, tick), state, args=(command,), max_step=1e-4, rtol=1e-8, atol=1e-11)
+        found = solve_ivp(
+            rates, (0.0, tick), state, args=(command,), max_step=1e-4, rtol=1e-8, atol=1e-11
+        )
         state = np.array([min(max(found.y[0, -1], -stop), stop), found.y[1, -1]])
         history.append(state[1])
     return np.array(history)
@@ -249,20 +326,28 @@ COMMANDS = (0.2 * np.random.default_rng(1).normal(size=30)).tolist()
 
 
 @pytest.mark.parametrize(
-    ("rate", "stop"), [(2.0, math.inf), (math.inf, 0.1), (2.0, 0.1)], ids=["rate limit", "end stops", "both"]
+    ("rate", "stop"),
+    [(2.0, math.inf), (math.inf, 0.1), (2.0, 0.1)],
+    ids=["rate limit", "end stops", "both"],
 )
 def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: float) -> None:
     exact = continuous(COMMANDS, 0.05, 0.02, rate, stop)
     params = actuator(0.02, -stop, stop, rate)
     errors = [np.abs(travelled(COMMANDS, 0.05, dt, params) - exact).max() for dt in (0.01, 0.00125)]
-    # An eighth of dt: a 64th of the error at second order, an eighth at first. The instants at which limits begin and cease to
-    # act fall anywhere in their steps, so that each halving alone scatters.
+    # An eighth of dt: a 64th of the error at second order, an eighth at first. The instants at
+    # which limits begin and cease to act fall anywhere in their steps, so that each halving alone
+    # scatters.
     assert errors[1] < errors[0] / 16.0
-    assert errors[1] < 5e-6  # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
+    assert (
+        errors[1] < 5e-6
+    )  # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
 
 
 def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
-    position, command = np.linspace(-0.04, 0.04, 12).reshape(6, 2), np.linspace(0.3, -0.3, 12).reshape(6, 2)
+    position, command = (
+        np.linspace(-0.04, 0.04, 12).reshape(6, 2),
+        np.linspace(0.3, -0.3, 12).reshape(6, 2),
+    )
     columns = Actuators(*(None if value is None else value[:, None] for value in SIX))
     with enable_x64():
         together = move(0.0, jnp.asarray(position), jnp.asarray(command), 0.01, columns)
@@ -280,10 +365,17 @@ def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
         x, position = state[:8], state[8:]
         return np.concatenate([x_dot(t, x, position, params.aircraft), (u - position) / lag])
 
-    exact = solve_ivp(rates, (0.0, 0.1), np.zeros(12), method="DOP853", rtol=1e-12, atol=1e-14).y[:8, -1]
-    runs = [advance(0, plant.initial_state(osprey()), u, 100 * MS, osprey(ms, lag=lag.tolist())).x for ms in (5.0, 2.5)]
+    exact = solve_ivp(rates, (0.0, 0.1), np.zeros(12), method="DOP853", rtol=1e-12, atol=1e-14).y[
+        :8, -1
+    ]
+    runs = [
+        advance(0, plant.initial_state(osprey()), u, 100 * MS, osprey(ms, lag=lag.tolist())).x
+        for ms in (5.0, 2.5)
+    ]
     errors = [np.abs(x - exact).max() for x in runs]
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)  # half the step, a quarter of the error
+    assert errors[0] / errors[1] == pytest.approx(
+        4.0, rel=0.1
+    )  # half the step, a quarter of the error
 
 
 # Flights through servos: scenario osprey_servo without its noise, with the gains of the prototype.
@@ -301,14 +393,16 @@ def gusty(servo: Scenario) -> Tape:
 
 
 def test_error_through_servos_with_margins(servo: Scenario) -> None:
-    # The shipped gains have 45 deg or more. Noise apart, the error of V is that of a loop twice as fast; r pays 10 %.
+    # The shipped gains have 45 deg or more. Noise apart, the error of V is that of a loop twice as
+    # fast; r pays 10 %.
     shipped = rms(simulate(servo.vary(controller=find_scenario("osprey_servo").controller)))
     assert (shipped <= np.array([1.01, 0.75, 1.01, 1.1]) * [7.6, 0.088, 9.9, 6.4]).all()
 
 
 def test_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario, gusty: Tape) -> None:
     rest = gusty.time("u") > 55.0  # gusts and commands end before 50 s
-    # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
+    # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral
+    # mode is left.
     slew = np.abs(np.diff(gusty["u"].values[rest], axis=0)).mean(axis=0) / 0.01
     beta = np.array(servo.rise_di().beta) * np.array(servo.controller.input_scale)
     assert (slew < 0.01 * beta).all()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft against exact solutions, independent integrators and its own definition."""
+"""The simulated aircraft against exact solutions, independent integrators and its own
+definition.
+"""
 
 import math
 from functools import partial
@@ -28,7 +30,9 @@ def osprey(**gusts: dict[str, float]) -> Aircraft:
     return aircraft_parameters(gusts=gusts).plant().aircraft
 
 
-def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
+def final_state(
+    x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft
+) -> FloatArray:
     """State x after `duration_ns` with u held and ideal actuators."""
     params = aircraft_parameters().plant()._replace(aircraft=aircraft, step_ns=step_ns)
     return np.asarray(advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params).x)
@@ -36,7 +40,8 @@ def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, ai
 
 @pytest.mark.equation(1)
 def test_without_f_plant_follows_matrix_exponential() -> None:
-    # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles up to 13 rad/s leaves
+    # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles
+    # up to 13 rad/s leaves
     # (0.026)^5 / 120 a step, about 1e-9 over a second.
     aircraft = osprey()
     aircraft = aircraft._replace(gravity=np.zeros_like(aircraft.gravity))
@@ -50,7 +55,10 @@ def test_halving_step_divides_integration_error_by_sixteen() -> None:
     aircraft = osprey()
     x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
     finest = final_state(x_0, u, NANOSECONDS, MS // 4, aircraft)
-    errors = [np.abs(final_state(x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
+    errors = [
+        np.abs(final_state(x_0, u, NANOSECONDS, step, aircraft) - finest).max()
+        for step in (20 * MS, 10 * MS)
+    ]
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
 
 
@@ -58,7 +66,13 @@ def test_plant_agrees_with_adaptive_integrator_through_gust() -> None:
     aircraft = osprey(vertical={"start": 0.2, "speed": 10.12, "length": 15.24})
     u = np.array([0.01, 0.0, 0.02, 0.0])
     reference = solve_ivp(
-        lambda t, x: dynamics.x_dot(t, x, u, aircraft), (0.0, 2.0), np.zeros(8), "DOP853", rtol=1e-11, atol=1e-12, max_step=0.01
+        lambda t, x: dynamics.x_dot(t, x, u, aircraft),
+        (0.0, 2.0),
+        np.zeros(8),
+        "DOP853",
+        rtol=1e-11,
+        atol=1e-12,
+        max_step=0.01,
     )
     end = final_state(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
     # The gust's second derivative jumps at its ends: Runge-Kutta loses an order there.
@@ -67,7 +81,9 @@ def test_plant_agrees_with_adaptive_integrator_through_gust() -> None:
 
 @pytest.mark.equation("Assumption 2")
 @given(speed=st.floats(-20, 20), length=st.floats(1, 100), t=st.floats(0, 100))
-def test_gust_stays_between_zero_and_speed_with_bounded_derivative(speed: float, length: float, t: float) -> None:
+def test_gust_stays_between_zero_and_speed_with_bounded_derivative(
+    speed: float, length: float, t: float
+) -> None:
     gusts = Gusts(np.array([10.0]), np.array([speed]), np.array([length]))
     w = [float(one_minus_cosine(t + dt, gusts, np.array(25.0))[0]) for dt in (0.0, 1e-4)]
     assert min(0.0, speed) - 1e-12 <= w[0] <= max(0.0, speed) + 1e-12
@@ -87,7 +103,9 @@ def test_gravity_and_lateral_coupling_enter_as_published() -> None:
     x[3], x[7] = 0.1, -0.2  # theta, phi
     f = dynamics.f(0.0, x, osprey())
     # V_dot gets -9.81 sin(theta), beta_dot +0.39 sin(phi): MacKunis et al. 2010
-    assert f == pytest.approx([-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15)
+    assert f == pytest.approx(
+        [-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15
+    )
 
 
 def test_inputs_of_airframe_converted_to_si_once() -> None:
@@ -99,14 +117,20 @@ def test_inputs_of_airframe_converted_to_si_once() -> None:
 
 
 def test_truth_holds_state_disturbance_and_actuators() -> None:
-    parameters = aircraft_parameters(gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}})
+    parameters = aircraft_parameters(
+        gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}}
+    )
     names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
     now = dynamics.at_times(np.array([0.4]), parameters.plant().aircraft)
-    true = dict(zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True))
+    true = dict(
+        zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True)
+    )
     assert true["x.phi"] == 0.07
     assert true["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
-    assert true["gust.lateral"] == true["gust.longitudinal"] == 0.0  # every axis of the airframe's gusts
+    assert (
+        true["gust.lateral"] == true["gust.longitudinal"] == 0.0
+    )  # every axis of the airframe's gusts
     assert true["actuator.thrust"] == 0.2
     assert true["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
 
@@ -118,15 +142,23 @@ EVERYTHING = {
         "longitudinal": {"start": 0.0, "speed": 3.0, "length": 9.0},
     },
     "turbulence": {"altitude": 50.0, "wind": 15.4},
-    "bias": {"q": {"start": 0.01, "value": 0.5, "rise": 0.02}, "V": {"start": 0.0, "value": -1.0, "rise": 0.0}},
+    "bias": {
+        "q": {"start": 0.01, "value": 0.5, "rise": 0.02},
+        "V": {"start": 0.0, "value": -1.0, "rise": 0.0},
+    },
     "sines": {"r": {"amplitude": 0.3, "frequency": 20.0, "phase": 1.0}},
     "inertial_coupling": 1.0,
-    "actuators": {"lag": [0.02, 0.1, 0.02, 0.02], "dead_zone": [0.001] * 4, "stuck_at": [math.inf, math.inf, 0.3, math.inf]},
+    "actuators": {
+        "lag": [0.02, 0.1, 0.02, 0.02],
+        "dead_zone": [0.001] * 4,
+        "stuck_at": [math.inf, math.inf, 0.3, math.inf],
+    },
 }
 
 
 def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() -> None:
-    # x_dot is the definition; advance computes f_time at all instants together. Measured difference 1e-16 over 20 steps.
+    # x_dot is the definition; advance computes f_time at all instants together. Measured difference
+    # 1e-16 over 20 steps.
     params = aircraft_parameters(rate=25.0, **EVERYTHING).plant()
     filters = params.turbulence
     assert filters is not None
@@ -148,9 +180,15 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
 
 def test_equation_1_is_sum_of_parts() -> None:
     aircraft = aircraft_parameters(rate=25.0, **EVERYTHING).load()[1]
-    x, u, turbulent = np.linspace(-0.3, 0.3, 8), np.array([0.01, 0.1, 0.02, 0.03]), np.array([0.5, -1.0, 2.0])
+    x, u, turbulent = (
+        np.linspace(-0.3, 0.3, 8),
+        np.array([0.01, 0.1, 0.02, 0.03]),
+        np.array([0.5, -1.0, 2.0]),
+    )
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
-    assert x_dot == pytest.approx(aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14)
+    assert x_dot == pytest.approx(
+        aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14
+    )
     difference = dynamics.f(0.3, x, aircraft, turbulent) - dynamics.f(0.3, x, aircraft)
     assert difference == pytest.approx(aircraft.gust_direction @ turbulent, abs=1e-14)
 
@@ -166,5 +204,8 @@ def test_f_of_states_in_columns_is_f_of_each_state() -> None:
 
 
 def test_step_that_does_not_divide_time_refused() -> None:
-    with pytest.raises(ParameterError, match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)"):
+    with pytest.raises(
+        ParameterError,
+        match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)",
+    ):
         final_state(np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The airframe library against published modes, and Remark 1 ("D = I for every model tried") as a table."""
+"""The airframe library against published modes, and Remark 1 ("D = I for every model tried") as a
+table.
+"""
 
 import math
 from collections.abc import Mapping
@@ -22,14 +24,20 @@ from flight_design.gains.airframe_properties import (
 from rise_di_controller.decomposition import coupling
 
 ALL = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-SPLIT = {"osprey_twin": "osprey", "osprey_vtail": "osprey", "x8_elevons": ""}  # more inputs than outputs, and what was split
+SPLIT = {
+    "osprey_twin": "osprey",
+    "osprey_vtail": "osprey",
+    "x8_elevons": "",
+}  # more inputs than outputs, and what was split
 NAMES = tuple(name for name in ALL if name not in SPLIT)
 
 
 class Published(NamedTuple):
     """Properties by the signs and in the units of the source."""
 
-    D: tuple[float, ...]  # a positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r)
+    D: tuple[
+        float, ...
+    ]  # a positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r)
     coupling: float
 
 
@@ -49,7 +57,12 @@ PUBLISHED_POLES: Mapping[str, tuple[complex, ...]] = {
     # MATLAB Control System Toolbox, "Yaw Damper Design for a 747 Jet Aircraft"
     "b747_lateral": (-0.5627, -0.0329 - 0.9467j, -0.0329 + 0.9467j, -0.0073),
     # S. Boyd, EE263, short period and phugoid
-    "b747_longitudinal": (-0.3750 - 0.8818j, -0.3750 + 0.8818j, -0.0005 - 0.0674j, -0.0005 + 0.0674j),
+    "b747_longitudinal": (
+        -0.3750 - 0.8818j,
+        -0.3750 + 0.8818j,
+        -0.0005 - 0.0674j,
+        -0.0005 + 0.0674j,
+    ),
     # Stevens & Lewis, Example 5.3-1: roll, Dutch roll, spiral
     "f16_lateral": (-3.6152, -0.4224 - 3.0634j, -0.4224 + 3.0634j, -0.0163),
     # Nelson, second edition, chapter 5: roll, Dutch roll, spiral
@@ -80,7 +93,8 @@ def test_every_airframe_states_source_and_signs(airframe: Airframe) -> None:
 
 @pytest.mark.parametrize("name", PUBLISHED_POLES)
 def test_poles_are_the_published_ones(name: str) -> None:
-    # Sources print poles to two to four digits, matrices to two or three. Tolerance: 2 % of the pole, or the last digit.
+    # Sources print poles to two to four digits, matrices to two or three. Tolerance: 2 % of the
+    # pole, or the last digit.
     expected = np.sort_complex(np.array(PUBLISHED_POLES[name], dtype=np.complex128))
     found = np.sort_complex(airframe_facts(load_airframe(name)).poles)
     assert np.all(np.abs(found - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
@@ -106,16 +120,24 @@ def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> No
     assert found == pytest.approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
 
 
-@pytest.mark.parametrize(("name", "published", "si"), [("f16_longitudinal", 0.989, 0.302), ("b747_longitudinal", 0.607, 0.282)])
+@pytest.mark.parametrize(
+    ("name", "published", "si"),
+    [("f16_longitudinal", 0.989, 0.302), ("b747_longitudinal", 0.607, 0.282)],
+)
 def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: float) -> None:
     # F-16: U_12 = 0.1737 / 0.17555 (ft/s) / (rad/s), times 0.3048 in SI.
     airframe = load_airframe(name)
-    assert coupling(airframe.matrix_c() @ np.array(airframe.B)) == pytest.approx(published, abs=1e-3)
+    assert coupling(airframe.matrix_c() @ np.array(airframe.B)) == pytest.approx(
+        published, abs=1e-3
+    )
     assert airframe_facts(airframe).coupling == pytest.approx(si, abs=1e-3)
 
 
-def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bounds(airframe: Airframe) -> None:
-    # theta (longitudinal) and phi (lateral) integrate the rates. Each gives a zero at the origin: never strictly stable.
+def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bounds(
+    airframe: Airframe,
+) -> None:
+    # theta (longitudinal) and phi (lateral) integrate the rates. Each gives a zero at the origin:
+    # never strictly stable.
     facts = airframe_facts(airframe)
     angles = [state for state in airframe.states if state in ("theta", "phi")]
     assert facts.controllable
@@ -135,16 +157,26 @@ def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse
 
 
 def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
-    """Elevator, thrust, aileron and rudder of the twin and of the V-tail, from the geometry alone."""
-    whole, twin, tail = (load_airframe(name).matrix_b() for name in ("osprey", "osprey_twin", "osprey_vtail"))
-    both = np.array([twin[:, 0] + twin[:, 1], twin[:, 5] + twin[:, 6], twin[:, 2] + twin[:, 3], twin[:, 4]]).T
+    """Elevator, thrust, aileron and rudder of the twin and of the V-tail, from the geometry
+    alone.
+    """
+    whole, twin, tail = (
+        load_airframe(name).matrix_b() for name in ("osprey", "osprey_twin", "osprey_vtail")
+    )
+    both = np.array(
+        [twin[:, 0] + twin[:, 1], twin[:, 5] + twin[:, 6], twin[:, 2] + twin[:, 3], twin[:, 4]]
+    ).T
     np.testing.assert_allclose(both, whole, atol=1e-12)
-    both = np.array([tail[:, 0] + tail[:, 1], tail[:, 4], tail[:, 2] + tail[:, 3], tail[:, 0] - tail[:, 1]]).T
+    both = np.array(
+        [tail[:, 0] + tail[:, 1], tail[:, 4], tail[:, 2] + tail[:, 3], tail[:, 0] - tail[:, 1]]
+    ).T
     np.testing.assert_allclose(both, whole, atol=1e-12)
 
 
 def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
-    """Z_alpha, M_alpha and M_q by hand from the coefficients of Gryte et al. 2018 at 18 m/s: see the source in the file."""
+    """Z_alpha, M_alpha and M_q by hand from the coefficients of Gryte et al. 2018 at 18 m/s: see
+    the source in the file.
+    """
     q_S = 0.5 * 1.225 * 18.0**2 * 0.75
     Z_alpha = -(q_S * 4.0203 + 3.459) / (3.364 * 18.0)
     M_alpha = -q_S * 0.35714 * 0.4629 / 0.165
@@ -164,7 +196,9 @@ def test_zeros_of_the_osprey() -> None:
 def test_minors_are_of_omega_in_si() -> None:
     facts = airframe_facts(load_airframe("f16_lateral"))
     per_degree = np.array([-0.7333, -0.7333 * -0.0620 - 0.1315 * -0.0319])
-    np.testing.assert_allclose(facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12)
+    np.testing.assert_allclose(
+        facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12
+    )
 
 
 def test_the_foot_is_exact() -> None:
@@ -172,33 +206,89 @@ def test_the_foot_is_exact() -> None:
     assert si_per_unit("ft/s") == 0.3048
 
 
-AEROSONDE = {"Jx": 0.8244, "Jz": 1.759, "Jxz": 0.1204, "S": 0.55, "b": 2.8956, "rho": 1.2682, "g": 9.81, "V": 25.0}
+AEROSONDE = {
+    "Jx": 0.8244,
+    "Jz": 1.759,
+    "Jxz": 0.1204,
+    "S": 0.55,
+    "b": 2.8956,
+    "rho": 1.2682,
+    "g": 9.81,
+    "V": 25.0,
+}
 SECOND_EDITION = (
-    {"mass": 11.0, "CL0": 0.23, "CLa": 5.61, "CLde": 0.13, "Cm0": 0.0135, "Cma": -2.74, "Cmde": -0.99}
-    | {"Y_beta": -0.98, "l_beta": -0.13, "n_beta": 0.073, "l_p": -0.51, "n_p": 0.069, "l_r": 0.25, "n_r": -0.095}
+    {
+        "mass": 11.0,
+        "CL0": 0.23,
+        "CLa": 5.61,
+        "CLde": 0.13,
+        "Cm0": 0.0135,
+        "Cma": -2.74,
+        "Cmde": -0.99,
+    }
+    | {
+        "Y_beta": -0.98,
+        "l_beta": -0.13,
+        "n_beta": 0.073,
+        "l_p": -0.51,
+        "n_p": 0.069,
+        "l_r": 0.25,
+        "n_r": -0.095,
+    }
     | {"Y_da": 0.075, "l_da": 0.17, "n_da": -0.011, "Y_dr": 0.19, "l_dr": 0.0024, "n_dr": -0.069}
 )
 FIRST_EDITION = (
-    {"mass": 13.5, "CL0": 0.28, "CLa": 3.45, "CLde": -0.36, "Cm0": -0.02338, "Cma": -0.38, "Cmde": -0.5}
-    | {"Y_beta": -0.98, "l_beta": -0.12, "n_beta": 0.25, "l_p": -0.26, "n_p": 0.022, "l_r": 0.14, "n_r": -0.35}
+    {
+        "mass": 13.5,
+        "CL0": 0.28,
+        "CLa": 3.45,
+        "CLde": -0.36,
+        "Cm0": -0.02338,
+        "Cma": -0.38,
+        "Cmde": -0.5,
+    }
+    | {
+        "Y_beta": -0.98,
+        "l_beta": -0.12,
+        "n_beta": 0.25,
+        "l_p": -0.26,
+        "n_p": 0.022,
+        "l_r": 0.14,
+        "n_r": -0.35,
+    }
     | {"Y_da": 0.0, "l_da": 0.08, "n_da": 0.06, "Y_dr": -0.17, "l_dr": 0.105, "n_dr": -0.032}
 )
 
 
 def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-    """Beard and McLain, Table 5.1, states v, p, r, phi; trim from lift = weight and zero pitching moment."""
+    """Beard and McLain, Table 5.1, states v, p, r, phi; trim from lift = weight and zero pitching
+    moment.
+    """
     pressure = 0.5 * c["rho"] * c["V"] ** 2 * c["S"]
     lift = c["mass"] * c["g"] / pressure - c["CL0"]
-    alpha = (lift * c["Cmde"] + c["Cm0"] * c["CLde"]) / (c["CLa"] * c["Cmde"] - c["Cma"] * c["CLde"])
+    alpha = (lift * c["Cmde"] + c["Cm0"] * c["CLde"]) / (
+        c["CLa"] * c["Cmde"] - c["Cma"] * c["CLde"]
+    )
     inertia = np.array([[c["Jx"], -c["Jxz"]], [-c["Jxz"], c["Jz"]]])
 
     def moments(key: str) -> FloatArray:
-        return np.linalg.solve(inertia, np.array([c["l_" + key], c["n_" + key]])) * pressure * c["b"]
+        return (
+            np.linalg.solve(inertia, np.array([c["l_" + key], c["n_" + key]])) * pressure * c["b"]
+        )
 
     force, rate = pressure / c["mass"], c["b"] / (2.0 * c["V"])
     A = np.zeros((4, 4))
-    A[0] = [force * c["Y_beta"] / c["V"], c["V"] * math.sin(alpha), -c["V"] * math.cos(alpha), c["g"] * math.cos(alpha)]
-    A[1:3, 0], A[1:3, 1], A[1:3, 2] = moments("beta") / c["V"], moments("p") * rate, moments("r") * rate
+    A[0] = [
+        force * c["Y_beta"] / c["V"],
+        c["V"] * math.sin(alpha),
+        -c["V"] * math.cos(alpha),
+        c["g"] * math.cos(alpha),
+    ]
+    A[1:3, 0], A[1:3, 1], A[1:3, 2] = (
+        moments("beta") / c["V"],
+        moments("p") * rate,
+        moments("r") * rate,
+    )
     A[3] = [0.0, 1.0, math.tan(alpha), 0.0]
     B = np.zeros((4, 2))
     B[0] = [force * c["Y_da"], force * c["Y_dr"]]
@@ -207,9 +297,12 @@ def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]
 
 
 @pytest.mark.parametrize(
-    ("name", "coefficients"), [("aerosonde_lateral", SECOND_EDITION), ("aerosonde_first_edition_lateral", FIRST_EDITION)]
+    ("name", "coefficients"),
+    [("aerosonde_lateral", SECOND_EDITION), ("aerosonde_first_edition_lateral", FIRST_EDITION)],
 )
-def test_the_aerosondes_follow_from_their_published_coefficients(name: str, coefficients: Mapping[str, float]) -> None:
+def test_the_aerosondes_follow_from_their_published_coefficients(
+    name: str, coefficients: Mapping[str, float]
+) -> None:
     A, B = lateral_state_space({**AEROSONDE, **coefficients})
     airframe = load_airframe(name)
     # The files keep four figures: half a unit of the fourth is at most 5e-4 of the value.
@@ -218,11 +311,20 @@ def test_the_aerosondes_follow_from_their_published_coefficients(name: str, coef
 
 
 def toy(k: float) -> Airframe:
-    """y_dot = -y + z + u, z_dot = z + k u: holding y at zero takes u = -z, so the zero is at 1 - k."""
+    """y_dot = -y + z + u, z_dot = z + k u: holding y at zero takes u = -z, so the zero is at 1 -
+    k.
+    """
     inputs = {"u": {"unit": "1", "positive": "more y"}}
     states = {"y": "1", "z": "1"}
     return Airframe.validate_mapping(
-        {"name": "toy", "source": "none", "speed": 1.0, "states": states, "inputs": inputs, "outputs": ["y"]}
+        {
+            "name": "toy",
+            "source": "none",
+            "speed": 1.0,
+            "states": states,
+            "inputs": inputs,
+            "outputs": ["y"],
+        }
         | {"A": [[-1.0, 1.0], [0.0, 1.0]], "B": [[1.0], [k]]},
         "toy",
     )
@@ -231,9 +333,15 @@ def toy(k: float) -> Airframe:
 @pytest.mark.equation(5, 6, 7, 8, 9)
 @pytest.mark.parametrize(
     ("k", "zero", "kind"),
-    [(3.0, -2.0, ZeroDynamics.STABLE), (1.0, 0.0, ZeroDynamics.MARGINAL), (0.5, 0.5, ZeroDynamics.UNSTABLE)],
+    [
+        (3.0, -2.0, ZeroDynamics.STABLE),
+        (1.0, 0.0, ZeroDynamics.MARGINAL),
+        (0.5, 0.5, ZeroDynamics.UNSTABLE),
+    ],
 )
-def test_zero_dynamics_are_classified_by_their_zeros(k: float, zero: float, kind: ZeroDynamics) -> None:
+def test_zero_dynamics_are_classified_by_their_zeros(
+    k: float, zero: float, kind: ZeroDynamics
+) -> None:
     facts = airframe_facts(toy(k))
     np.testing.assert_allclose(facts.zeros, [zero], atol=1e-12)
     assert facts.zero_dynamics is kind
@@ -276,6 +384,8 @@ def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
         if np.linalg.cond(T) > 100.0:
             continue  # beyond that the result measures the rounding of T, not the zeros
         found = invariant_zeros(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T))
-        assert len(found) == 4  # rounding in dense coordinates must not turn infinite zeros into finite ones
+        assert (
+            len(found) == 4
+        )  # rounding in dense coordinates must not turn infinite zeros into finite ones
         np.testing.assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
         assert controllable(T @ A @ np.linalg.inv(T), T @ B)

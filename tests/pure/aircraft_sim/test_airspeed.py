@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An aircraft whose A, B and trim follow its airspeed: at each speed it is the airframe of there."""
+"""An aircraft whose A, B and trim follow its airspeed: at each speed it is the airframe of
+there.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ from flight_core.vectors import FloatArray
 
 OSPREY = load_airframe("osprey")
 SCENARIO = find_scenario("osprey_servo").vary(
-    aircraft={"over_airspeed": "thrust", "gusts": {}, "rate": 100.0, "step": 0.01}, reference_model={"rate": 100.0}
+    aircraft={"over_airspeed": "thrust", "gusts": {}, "rate": 100.0, "step": 0.01},
+    reference_model={"rate": 100.0},
 )
 PLANT = SCENARIO.aircraft.plant()
 
@@ -24,7 +27,9 @@ PLANT = SCENARIO.aircraft.plant()
 def x_dot(x: FloatArray, u: FloatArray) -> FloatArray:
     aircraft = aircraft_at(0, PLANT, x)
     assert aircraft.trim is not None
-    return np.asarray(aircraft.A @ x + aircraft.gravity @ np.sin(x) + aircraft.B @ u + aircraft.trim)
+    return np.asarray(
+        aircraft.A @ x + aircraft.gravity @ np.sin(x) + aircraft.B @ u + aircraft.trim
+    )
 
 
 @pytest.mark.parametrize("ratio", [0.7, 1.0, 1.4])
@@ -32,42 +37,67 @@ def test_small_motion_about_level_flight_is_that_of_the_airframe_of_the_speed(ra
     x, u = level_flight(OSPREY, ratio, "thrust")
     assert x_dot(x, u) == pytest.approx(np.zeros(8), abs=1e-9)
     near = 1e-4
-    of_x = np.array([x_dot(x + near * unit, u) - x_dot(x - near * unit, u) for unit in np.eye(8)]).T / (2.0 * near)
+    of_x = np.array(
+        [x_dot(x + near * unit, u) - x_dot(x - near * unit, u) for unit in np.eye(8)]
+    ).T / (2.0 * near)
     moved = at_speed(OSPREY, ratio, "thrust")
     # the trims are 0.05 V0 apart and integrated in 20 steps: 1e-3 of the largest entry of V
     assert of_x == pytest.approx(moved.matrix_a() + moved.matrix_gravity() * np.cos(x), abs=2e-3)
 
 
 def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
-    """Lift of V^2 holds the weight: with A[alpha,V] = -2 g / V^2 the incidence of lift, alpha - alpha_0, grows with V^-2."""
-    (slow, at_slow), (fast, at_fast) = (level_flight(OSPREY, ratio, "thrust") for ratio in (0.8, 1.25))
+    """Lift of V^2 holds the weight: with A[alpha,V] = -2 g / V^2 the incidence of lift, alpha -
+    alpha_0, grows with V^-2.
+    """
+    (slow, at_slow), (fast, at_fast) = (
+        level_flight(OSPREY, ratio, "thrust") for ratio in (0.8, 1.25)
+    )
     alpha, V0 = OSPREY.index("alpha"), OSPREY.speed
-    lift = -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0  # that of the trim, of rad
+    lift = (
+        -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
+    )  # that of the trim, of rad
     for x, ratio in ((slow, 0.8), (fast, 1.25)):
-        assert x[alpha] == pytest.approx(lift * (ratio**-2.0 - 1.0), rel=0.1)  # the elevator has lift too
+        assert x[alpha] == pytest.approx(
+            lift * (ratio**-2.0 - 1.0), rel=0.1
+        )  # the elevator has lift too
     thrust = list(OSPREY.inputs).index("thrust")
     assert at_slow[thrust] < 0.0 < at_fast[thrust]
 
 
 def test_flight_to_another_speed_ends_in_its_trim() -> None:
     pulse = {"V": {"start": [1.0], "stop": [100.0], "value": [4.0]}}
-    tape = simulate(SCENARIO.vary(flight={"duration": 30.0}, reference_model={"pulses": pulse, "coordinated_turn": None}))
-    last = {name: tape["truth"][name][-1] for name in ("x.V", "x.alpha", "x.theta", "x.q", "actuator.thrust")}
+    tape = simulate(
+        SCENARIO.vary(
+            flight={"duration": 30.0}, reference_model={"pulses": pulse, "coordinated_turn": None}
+        )
+    )
+    last = {
+        name: tape["truth"][name][-1]
+        for name in ("x.V", "x.alpha", "x.theta", "x.q", "actuator.thrust")
+    }
     x, _ = level_flight(OSPREY, 1.16, "thrust")
     assert last["x.V"] == pytest.approx(4.0, abs=0.02)
-    assert last["x.alpha"] == pytest.approx(x[OSPREY.index("alpha")], abs=2e-3)  # q is held at 0, and theta where it is
+    assert last["x.alpha"] == pytest.approx(
+        x[OSPREY.index("alpha")], abs=2e-3
+    )  # q is held at 0, and theta where it is
     assert last["actuator.thrust"] > 0.1
 
 
 def test_what_the_trim_speed_alone_has_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"^aircraft\.over_airspeed: found elevators, expected an input: elevator, thrust"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^aircraft\.over_airspeed: found elevators, expected an input: elevator, thrust",
+    ):
         SCENARIO.vary(aircraft={"over_airspeed": "elevators"})
-    with pytest.raises(ParameterError, match=r"^aircraft\.over_airspeed: found kinematics euler beside it"):
+    with pytest.raises(
+        ParameterError, match=r"^aircraft\.over_airspeed: found kinematics euler beside it"
+    ):
         SCENARIO.vary(aircraft={"kinematics": "euler"})
     with pytest.raises(ParameterError, match=r"^aircraft\.over_airspeed: found a drift beside it"):
         SCENARIO.vary(aircraft={"drift": {"start": 1.0, "A": 0.1}})
     with pytest.raises(
-        ParameterError, match=r"^aircraft\.over_airspeed: found thrust, expected none: the aircraft of a campaign"
+        ParameterError,
+        match=r"^aircraft\.over_airspeed: found thrust, expected none: the aircraft of a campaign",
     ):
         build_course(SCENARIO)
     assert initial_state(PLANT).x == pytest.approx(np.zeros(8))

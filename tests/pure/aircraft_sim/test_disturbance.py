@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2, and exactly no effect with amplitude 0."""
+"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2, and exactly no effect with
+amplitude 0.
+"""
 
 import math
 from collections.abc import Callable
@@ -35,7 +37,9 @@ def aircraft(**section: Any) -> Aircraft:
     return aircraft_parameters(**section).load()[1]
 
 
-@given(H=st.floats(9.144, 106.68), peak=st.floats(-17.07, 17.07))  # 30 to 350 ft and U_ref at sea level, CS-25.341
+@given(
+    H=st.floats(9.144, 106.68), peak=st.floats(-17.07, 17.07)
+)  # 30 to 350 ft and U_ref at sea level, CS-25.341
 def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
     gust = single(Gusts, 40.0, peak, H)
 
@@ -44,24 +48,33 @@ def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
 
     # U_ds/2 (1 - cos(pi s/H)): U_ds at H, half of it at H/2 and 3H/2, zero at 0 and from 2H on.
     speeds = [w(distance * H) for distance in (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 2.5)]
-    assert speeds == pytest.approx([0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
+    assert speeds == pytest.approx(
+        [0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9
+    )
 
 
 def test_gust_comes_again_after_its_time() -> None:
     once, again = single(Gusts, 2.0, 5.0, 15.0), single(Gusts, 2.0, 5.0, 15.0, 7.0)
     t = np.linspace(0.0, 6.0, 50)[:, None]
-    np.testing.assert_array_equal(one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0)))
-    later = one_minus_cosine(t + 21.0, again, np.array(V0))[t > 2.0]  # before the first entry there was none
+    np.testing.assert_array_equal(
+        one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0))
+    )
+    later = one_minus_cosine(t + 21.0, again, np.array(V0))[
+        t > 2.0
+    ]  # before the first entry there was none
     assert later == pytest.approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
 
 
 def test_wind_along_axis_changes_relative_velocity() -> None:
-    # x_rel = x - w gives minus the column of V, of beta = v / V0 and, published to three digits, of alpha = w / V0.
+    # x_rel = x - w gives minus the column of V, of beta = v / V0 and, published to three digits, of
+    # alpha = w / V0.
     osprey = load_airframe("osprey")
     A = osprey.matrix_a()
     assert osprey.gust_direction("longitudinal") == pytest.approx(-A[:, osprey.index("V")])
     assert osprey.gust_direction("lateral") == pytest.approx(-A[:, osprey.index("beta")] / V0)
-    assert osprey.gust_direction("vertical") == pytest.approx(-A[:, osprey.index("alpha")] / V0, abs=0.051 / V0)
+    assert osprey.gust_direction("vertical") == pytest.approx(
+        -A[:, osprey.index("alpha")] / V0, abs=0.051 / V0
+    )
     assert set(osprey.gusts) == set(AXES)
 
 
@@ -69,13 +82,22 @@ def test_bias_rises_along_half_cosine_and_stays() -> None:
     params = single(Bias, 2.0, 0.3, 4.0)
     at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
     # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
-    assert at == pytest.approx([0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3], abs=1e-15)
+    assert at == pytest.approx(
+        [0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3],
+        abs=1e-15,
+    )
 
 
 def test_biases_and_sines_act_on_state_they_name() -> None:
     params = aircraft(
-        bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
-        sines={"r": {"amplitude": 0.1, "frequency": 2.0}, "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0}},
+        bias={
+            "q": {"start": 1.0, "value": 0.3, "rise": 0.0},
+            "V": {"start": 0.0, "value": -2.0, "rise": 1.0},
+        },
+        sines={
+            "r": {"amplitude": 0.1, "frequency": 2.0},
+            "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0},
+        },
     )
     f = dict(zip(load_airframe("osprey").states, dynamics.f(3.0, np.zeros(8), params), strict=True))
     assert f["q"] == pytest.approx(0.3 + 0.2 * math.sin(4.0))
@@ -88,9 +110,19 @@ def test_biases_and_sines_act_on_state_they_name() -> None:
 
 Disturbance = Callable[[FloatArray], FloatArray]
 GUST: Gusts = single(Gusts, 2.0, 10.0, 15.0)
-SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # the function, its largest derivative, its largest second derivative
-    "gust": (lambda t: one_minus_cosine(t, GUST, np.array(V0)), 5.0 * math.pi * V0 / 15.0, 5.0 * (math.pi * V0 / 15.0) ** 2),
-    "bias": (lambda t: bias(t, single(Bias, 2.0, 10.0, 0.6)), 5.0 * math.pi / 0.6, 5.0 * (math.pi / 0.6) ** 2),
+SMOOTH: dict[
+    str, tuple[Disturbance, float, float]
+] = {  # the function, its largest derivative, its largest second derivative
+    "gust": (
+        lambda t: one_minus_cosine(t, GUST, np.array(V0)),
+        5.0 * math.pi * V0 / 15.0,
+        5.0 * (math.pi * V0 / 15.0) ** 2,
+    ),
+    "bias": (
+        lambda t: bias(t, single(Bias, 2.0, 10.0, 0.6)),
+        5.0 * math.pi / 0.6,
+        5.0 * (math.pi / 0.6) ** 2,
+    ),
     "sine": (lambda t: sines(t, single(Sines, 10.0, 4.0, 1.0)), 40.0, 160.0),
 }
 
@@ -98,7 +130,8 @@ SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # the function, its lar
 @pytest.mark.equation("Assumption 2")
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gusts_sines_and_biases_with_rise_meet_assumption_2(name: str) -> None:
-    # A derivative bounded by d1 that changes by at most d2 dt in dt is continuous. Below 2 ms second differences are rounding.
+    # A derivative bounded by d1 that changes by at most d2 dt in dt is continuous. Below 2 ms
+    # second differences are rounding.
     value, first, second = SMOOTH[name]
     for dt in (0.02, 0.002):
         d = value(np.arange(0.0, 5.0, dt))
@@ -111,7 +144,9 @@ def test_gusts_sines_and_biases_with_rise_meet_assumption_2(name: str) -> None:
 def test_bias_without_rise_lies_outside_assumption_2() -> None:
     # The largest difference does not fall with dt, so the derivative is unbounded.
     step = single(Bias, 2.0, 10.0, 0.0)
-    assert [np.abs(np.diff(bias(np.arange(0.0, 5.0, dt), step))).max() for dt in (0.02, 0.002, 0.0002)] == [10.0] * 3
+    assert [
+        np.abs(np.diff(bias(np.arange(0.0, 5.0, dt), step))).max() for dt in (0.02, 0.002, 0.0002)
+    ] == [10.0] * 3
 
 
 INSIDE: dict[str, dict[str, Any]] = {
@@ -125,7 +160,9 @@ OUTSIDE: dict[str, dict[str, Any]] = {
 
 
 def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> FloatArray:
-    """The largest errors of q and r with the default law at a rate, in 6 s without commands and gusts, mrad/s."""
+    """The largest errors of q and r with the default law at a rate, in 6 s without commands and
+    gusts, mrad/s.
+    """
     no_commands = scenario.vary(
         aircraft={"gusts": {}, "rate": 400.0, "step": 0.0025} | disturbed,
         reference_model={"rate": 400.0, "pulses": {}},
@@ -137,20 +174,28 @@ def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> Float
 
 
 @pytest.mark.parametrize("name", INSIDE)
-def test_inside_assumption_2_error_falls_with_square_of_period(name: str, osprey_gust: Scenario) -> None:
-    # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s with the sine, 1.56 and 0.39 with the bias.
+def test_inside_assumption_2_error_falls_with_square_of_period(
+    name: str, osprey_gust: Scenario
+) -> None:
+    # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s with the sine, 1.56 and 0.39 with the
+    # bias.
     coarse, fine = (largest(INSIDE[name], rate, osprey_gust)[0] for rate in (100.0, 200.0))
     assert coarse / fine == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize(("name", "channel"), [("step", 0), ("turbulence", 1)])
-def test_outside_assumption_2_shorter_period_does_not_help(name: str, channel: int, osprey_gust: Scenario) -> None:
-    # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q with the step, 63 and 61 in r in light turbulence at 100 m.
+def test_outside_assumption_2_shorter_period_does_not_help(
+    name: str, channel: int, osprey_gust: Scenario
+) -> None:
+    # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q with the step, 63 and 61 in r in light
+    # turbulence at 100 m.
     coarse, fine = (largest(OUTSIDE[name], rate, osprey_gust)[channel] for rate in (100.0, 200.0))
     assert coarse / fine < 1.2
 
 
-INERTIA = np.array([[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]])  # Aerosonde, kg m^2
+INERTIA = np.array(
+    [[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]]
+)  # Aerosonde, kg m^2
 PQR = [5, 2, 6]  # indices of p, q, r in the state of the osprey
 
 
@@ -173,16 +218,26 @@ def test_the_coupling_is_that_of_eulers_equations() -> None:
 
 
 def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
-    # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation and the conserved quantities.
-    w = np.array([0.3, 2.0, -0.4])  # about the intermediate axis, which is unstable: the body turns over
+    # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation and
+    # the conserved quantities.
+    w = np.array(
+        [0.3, 2.0, -0.4]
+    )  # about the intermediate axis, which is unstable: the body turns over
     x: FloatArray = np.zeros(8)
     x[PQR] = w
     free = aircraft_parameters().plant()._replace(aircraft=coupled(1.0))
     exact = solve_ivp(
-        lambda _, w: np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w)), (0.0, 10.0), w, rtol=1e-11, atol=1e-12, max_step=0.01
+        lambda _, w: np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w)),
+        (0.0, 10.0),
+        w,
+        rtol=1e-11,
+        atol=1e-12,
+        max_step=0.01,
     )
     end = advance(0, AircraftState(x, np.zeros(4)), np.zeros(4), 10_000 * MS, free).x[PQR]
-    assert end == pytest.approx(exact.y[:, -1], abs=1e-4)  # six digits of the gains, over three turns
+    assert end == pytest.approx(
+        exact.y[:, -1], abs=1e-4
+    )  # six digits of the gains, over three turns
     assert np.ptp(exact.y[1]) > 3.0  # it has turned over
     for kept in (lambda w: w @ INERTIA @ w, lambda w: np.linalg.norm(INERTIA @ w)):
         assert kept(end) == pytest.approx(kept(w), rel=1e-5)
@@ -207,22 +262,46 @@ def tail_wind(speed: float) -> dict[str, Any]:
 SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
     "gust": ("gusts", tail_wind(0.0), tail_wind(1.0)),
     "turbulence": ("turbulence", {"altitude": 50.0, "wind": 0.0}, {"altitude": 50.0, "wind": 1.0}),
-    "bias": ("bias", {"q": {"start": 0.1, "value": 0.0, "rise": 0.1}}, {"q": {"start": 0.1, "value": 1e-3, "rise": 0.1}}),
-    "sines": ("sines", {"r": {"amplitude": 0.0, "frequency": 1.0}}, {"r": {"amplitude": 1e-3, "frequency": 1.0}}),
+    "bias": (
+        "bias",
+        {"q": {"start": 0.1, "value": 0.0, "rise": 0.1}},
+        {"q": {"start": 0.1, "value": 1e-3, "rise": 0.1}},
+    ),
+    "sines": (
+        "sines",
+        {"r": {"amplitude": 0.0, "frequency": 1.0}},
+        {"r": {"amplitude": 1e-3, "frequency": 1.0}},
+    ),
     "inertial_coupling": ("inertial_coupling", 0.0, 1.0),
-    "uncertainty": ("uncertainty", {"A": 0.0, "B": 0.0, "seed": 5}, {"A": 0.0, "B": 0.1, "seed": 5}),
+    "uncertainty": (
+        "uncertainty",
+        {"A": 0.0, "B": 0.0, "seed": 5},
+        {"A": 0.0, "B": 0.1, "seed": 5},
+    ),
     "dead_zone": ("actuators", {"dead_zone": NONE}, {"dead_zone": [1e-4, 0.0, 0.0, 0.0]}),
-    "loose_at": ("actuators", {"loose_at": [NEVER] * 4}, {"loose_at": [0.6, NEVER, NEVER, NEVER], "loose_play": [1e-4] * 4}),
-    "drift of A and B": ("drift", {"start": NEVER, "B": 0.1}, {"start": 0.6, "duration": 0.0, "B": 0.1}),
+    "loose_at": (
+        "actuators",
+        {"loose_at": [NEVER] * 4},
+        {"loose_at": [0.6, NEVER, NEVER, NEVER], "loose_play": [1e-4] * 4},
+    ),
+    "drift of A and B": (
+        "drift",
+        {"start": NEVER, "B": 0.1},
+        {"start": 0.6, "duration": 0.0, "B": 0.1},
+    ),
     "sensor bias": ("sensors", {"bias": NONE}, {"bias": [0.0, 1e-3, 0.0, 0.0]}),
 }
 
 
 @pytest.fixture(scope="module")
 def baseline(osprey_gust: Scenario) -> Scenario:
-    """1.2 s of the default flight with servos, noise and two gusts, without the disturbances under test."""
+    """1.2 s of the default flight with servos, noise and two gusts, without the disturbances under
+    test.
+    """
     slow = {"rate": 100.0, "step": 0.005}
-    return osprey_gust.vary(aircraft=BASELINE | slow, reference_model={"rate": 100.0}, flight={"duration": 1.2})
+    return osprey_gust.vary(
+        aircraft=BASELINE | slow, reference_model={"rate": 100.0}, flight={"duration": 1.2}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -235,11 +314,17 @@ def published(scenario: Scenario) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_amplitude_zero_has_exactly_no_effect(name: str, baseline: Scenario, baseline_bytes: dict[str, bytes]) -> None:
+def test_amplitude_zero_has_exactly_no_effect(
+    name: str, baseline: Scenario, baseline_bytes: dict[str, bytes]
+) -> None:
     section, off, on = SECTIONS[name]
 
     def vary(value: Any) -> Scenario:
-        return baseline.vary(aircraft={section: BASELINE.get(section, {}) | value if isinstance(value, dict) else value})
+        return baseline.vary(
+            aircraft={
+                section: BASELINE.get(section, {}) | value if isinstance(value, dict) else value
+            }
+        )
 
     assert published(vary(off)) == baseline_bytes
     assert published(vary(on)) != baseline_bytes

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of the simulated aircraft that begin in flight, against an aircraft that has them in its scenario."""
+"""Faults of the simulated aircraft that begin in flight, against an aircraft that has them in its
+scenario.
+"""
 
 import math
 from typing import Any
@@ -27,7 +29,9 @@ def flown(before: AircraftConfig, after: AircraftConfig) -> FloatArray:
     for number in range(SAMPLES):
         if number == CHANGE:
             simulator.retune(after)
-        arrived = simulator.sample(number, 0.01 * np.sin(0.1 * number) * np.array([1.0, 0.0, -1.0, 1.0]))
+        arrived = simulator.sample(
+            number, 0.01 * np.sin(0.1 * number) * np.array([1.0, 0.0, -1.0, 1.0])
+        )
         y = arrived[-1].value if arrived else np.full(len(simulator.outputs), np.nan)
         rows.append(np.concatenate([y, simulator.truth()]))
     return np.array(rows)
@@ -41,29 +45,56 @@ def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
 @pytest.mark.parametrize(
     ("now", "scheduled"),
     [
-        ({"actuators": {"stuck_at": [0.0, NEVER, 0.0, NEVER]}}, {"actuators": {"stuck_at": [BEGIN, NEVER, BEGIN, NEVER]}}),
-        ({"actuators": {"lost_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"lost_at": [BEGIN, NEVER, NEVER, NEVER]}}),
-        ({"actuators": {"weak_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"weak_at": [BEGIN, NEVER, NEVER, NEVER]}}),
-        ({"actuators": {"lost_at": [NEVER, 0.0, NEVER, NEVER]}}, {"actuators": {"lost_at": [NEVER, BEGIN, NEVER, NEVER]}}),
-        ({"actuators": {"weak_at": [NEVER, 0.0, NEVER, NEVER]}}, {"actuators": {"weak_at": [NEVER, BEGIN, NEVER, NEVER]}}),
-        ({"actuators": {"slow_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"slow_at": [BEGIN, NEVER, NEVER, NEVER]}}),
-        ({"actuators": {"loose_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"loose_at": [BEGIN, NEVER, NEVER, NEVER]}}),
+        (
+            {"actuators": {"stuck_at": [0.0, NEVER, 0.0, NEVER]}},
+            {"actuators": {"stuck_at": [BEGIN, NEVER, BEGIN, NEVER]}},
+        ),
+        (
+            {"actuators": {"lost_at": [0.0, NEVER, NEVER, NEVER]}},
+            {"actuators": {"lost_at": [BEGIN, NEVER, NEVER, NEVER]}},
+        ),
+        (
+            {"actuators": {"weak_at": [0.0, NEVER, NEVER, NEVER]}},
+            {"actuators": {"weak_at": [BEGIN, NEVER, NEVER, NEVER]}},
+        ),
+        (
+            {"actuators": {"lost_at": [NEVER, 0.0, NEVER, NEVER]}},
+            {"actuators": {"lost_at": [NEVER, BEGIN, NEVER, NEVER]}},
+        ),
+        (
+            {"actuators": {"weak_at": [NEVER, 0.0, NEVER, NEVER]}},
+            {"actuators": {"weak_at": [NEVER, BEGIN, NEVER, NEVER]}},
+        ),
+        (
+            {"actuators": {"slow_at": [0.0, NEVER, NEVER, NEVER]}},
+            {"actuators": {"slow_at": [BEGIN, NEVER, NEVER, NEVER]}},
+        ),
+        (
+            {"actuators": {"loose_at": [0.0, NEVER, NEVER, NEVER]}},
+            {"actuators": {"loose_at": [BEGIN, NEVER, NEVER, NEVER]}},
+        ),
         ({"gusts": {"vertical": GUST}}, {"gusts": {"vertical": GUST}}),
     ],
     ids=["stuck", "lost", "weak", "engine lost", "engine weak", "slow", "loose", "gust"],
 )
-def test_fault_that_begins_now_is_one_that_was_scheduled(name: str, now: dict[str, Any], scheduled: dict[str, Any]) -> None:
+def test_fault_that_begins_now_is_one_that_was_scheduled(
+    name: str, now: dict[str, Any], scheduled: dict[str, Any]
+) -> None:
     scenario = find_scenario(name).vary(aircraft={"gusts": {}, "rate": 500.0, "step": 0.002})
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
     whole = flown(varied(scenario, **scheduled), varied(scenario, **scheduled))
-    assert np.array_equal(changed, whole, equal_nan=True)  # no bytes: a lag of 0 s gives -0.0 for a command of 0
+    assert np.array_equal(
+        changed, whole, equal_nan=True
+    )  # no bytes: a lag of 0 s gives -0.0 for a command of 0
     assert not np.array_equal(changed, flown(still, still), equal_nan=True)
 
 
 def test_sensor_errors_begin_and_end_between_two_samples(osprey_gust: Scenario) -> None:
     still = osprey_gust.aircraft
-    bias = flown(still, varied(osprey_gust, sensors={"bias": [0.1, 2.0, 0.0, 0.0]})) - flown(still, still)
+    bias = flown(still, varied(osprey_gust, sensors={"bias": [0.1, 2.0, 0.0, 0.0]})) - flown(
+        still, still
+    )
     assert not bias[:CHANGE].any()
     assert bias[CHANGE:, :4] == pytest.approx(np.tile([0.1, 2.0, 0.0, 0.0], (SAMPLES - CHANGE, 1)))
     lost = np.isnan(flown(still, varied(osprey_gust, sensors={"dropout": 0.5}))[:, 0])
@@ -73,27 +104,43 @@ def test_sensor_errors_begin_and_end_between_two_samples(osprey_gust: Scenario) 
 
 def test_gust_changes_neither_past_nor_gust_that_acts(osprey_gust: Scenario) -> None:
     scenario = osprey_gust.vary(aircraft={"gusts": {"vertical": GUST | {"start": 0.3}}})
-    with pytest.raises(ParameterError, match=r"gusts\.lateral\.start: found 0\.1 s, expected at least t = 0\.4 s"):
+    with pytest.raises(
+        ParameterError, match=r"gusts\.lateral\.start: found 0\.1 s, expected at least t = 0\.4 s"
+    ):
         flown(scenario.aircraft, varied(scenario, gusts={"lateral": GUST | {"start": 0.1}}))
     with pytest.raises(
-        ParameterError, match=r"gusts\.vertical: found a change of a gust that acts, expected one after its end"
+        ParameterError,
+        match=r"gusts\.vertical: found a change of a gust that acts, expected one after its end",
     ):
         flown(scenario.aircraft, varied(scenario, gusts={"vertical": GUST}))
 
 
 def test_drift_that_is_scheduled_in_flight_is_one_of_the_scenario(osprey_gust: Scenario) -> None:
     ice = {"duration": 0.2, "A": 0.3, "B": 0.3}
-    never, later = (varied(osprey_gust, drift=ice | {"start": start}) for start in (NEVER, BEGIN + 0.1))
+    never, later = (
+        varied(osprey_gust, drift=ice | {"start": start}) for start in (NEVER, BEGIN + 0.1)
+    )
     assert flown(never, later).tobytes() == flown(later, later).tobytes()
-    with pytest.raises(ParameterError, match=r"drift\.start: found 0\.1 s, expected at least t = 0\.4 s"):
+    with pytest.raises(
+        ParameterError, match=r"drift\.start: found 0\.1 s, expected at least t = 0\.4 s"
+    ):
         flown(never, varied(osprey_gust, drift=ice | {"start": 0.1}))
-    with pytest.raises(ParameterError, match=r"^drift: found a change of a drift that acts, expected one before its start"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^drift: found a change of a drift that acts, expected one before its start",
+    ):
         flown(varied(osprey_gust, drift=ice | {"start": 0.1}), later)
 
 
 def test_faults_may_change_in_flight_and_nothing_else() -> None:
     names = AircraftConfig.tunable()
-    assert {"actuators.stuck_at", "actuators.weak_effect", "sensors.noise", "gusts.lateral.start", "drift.start"} <= names
+    assert {
+        "actuators.stuck_at",
+        "actuators.weak_effect",
+        "sensors.noise",
+        "gusts.lateral.start",
+        "drift.start",
+    } <= names
     assert not names & {
         "airframe",
         "rate",

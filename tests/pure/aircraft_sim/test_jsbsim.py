@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim as flight dynamics models: trim, signs, wind, repeatability, process isolation, and every failure."""
+"""Aircraft of JSBSim as flight dynamics models: trim, signs, wind, repeatability, process
+isolation, and every failure.
+"""
 
 import ctypes
 import math
@@ -39,7 +41,13 @@ CESSNA = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
 C182 = FlightCondition("c182", 56.6, 1219.2, STEP_NS)
 ZEROS = np.zeros(len(AXES))
 NO_WIND = WindModel(Gusts(ZEROS, ZEROS, ZEROS + 1.0), None)
-SECTION: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
+SECTION: dict[str, Any] = {
+    "airframe": "jsbsim:c172p",
+    "speed": 46.3,
+    "altitude": 1219.2,
+    "rate": 200.0,
+    "step": 0.005,
+}
 
 
 def cessna(wind_model: WindModel = NO_WIND, condition: FlightCondition = CESSNA) -> JsbsimModel:
@@ -60,19 +68,22 @@ def command(**values: float) -> FloatArray:
 
 
 def one_gust(axis: str, speed: float, length: float) -> WindModel:
-    return WindModel(Gusts(ZEROS, np.array([speed * (name == axis) for name in AXES]), ZEROS + length), None)
+    return WindModel(
+        Gusts(ZEROS, np.array([speed * (name == axis) for name in AXES]), ZEROS + length), None
+    )
 
 
 @pytest.mark.parametrize(
     "condition",
-    # c172p: JSBSim's own trim. c182: JSBSim's trim fails, because the engine does not run in it. DHC6: JSBSim's trim does not
-    # last, because the turboprops have not settled.
+    # c172p: JSBSim's own trim. c182: JSBSim's trim fails, because the engine does not run in it.
+    # DHC6: JSBSim's trim does not last, because the turboprops have not settled.
     [CESSNA, C182, FlightCondition("DHC6", 66.9, 1828.8, STEP_NS)],
     ids=lambda condition: condition.name,
 )
 def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
-    # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Over 5 s without control, residuals of that size give at most
-    # 1e-3 m/s, 5e-4 rad/s, and 4 mm to a few cm of altitude. DHC6 in JSBSim's own trim loses 1 m/s.
+    # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Over 5 s without control, residuals of
+    # that size give at most 1e-3 m/s, 5e-4 rad/s, and 4 mm to a few cm of altitude. DHC6 in
+    # JSBSim's own trim loses 1 m/s.
     model = cessna(condition=condition)
     assert np.max(np.abs(model.trim.residuals[:3])) < 3e-3
     assert np.max(np.abs(model.trim.residuals[3:])) < 3e-4
@@ -91,9 +102,12 @@ def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
         ("rudder", "r", -1.0, 0.2),  # nose left
     ],
 )
-def test_positive_command_has_sign_of_table(name: str, output: str, sign: float, duration: float) -> None:
+def test_positive_command_has_sign_of_table(
+    name: str, output: str, sign: float, duration: float
+) -> None:
     truth = fly(cessna(), command(**{name: 0.1}), duration)
-    # A tenth of the travel for this long moves its own output by 0.016 (rudder) to 0.08 rad/s, or 0.07 m/s.
+    # A tenth of the travel for this long moves its own output by 0.016 (rudder) to 0.08 rad/s, or
+    # 0.07 m/s.
     assert sign * truth[f"x.{output}"][-1] > 0.01
     rates = {channel: abs(truth[f"x.{channel}"][-1]) for channel in ("q", "p", "r")}
     assert output == "V" or max(rates, key=lambda channel: rates[channel]) == output
@@ -101,11 +115,17 @@ def test_positive_command_has_sign_of_table(name: str, output: str, sign: float,
 
 @pytest.mark.parametrize(
     ("axis", "state", "scale"),
-    # A wind w along x, y, z of the flight path adds -w to airspeed, -w/V0 to sideslip, -w/V0 to alpha.
-    [("longitudinal", "V", -1.0), ("lateral", "beta", -1.0 / 46.3), ("vertical", "alpha", -1.0 / 46.3)],
+    # A wind w along x, y, z of the flight path adds -w to airspeed, -w/V0 to sideslip, -w/V0 to
+    # alpha.
+    [
+        ("longitudinal", "V", -1.0),
+        ("lateral", "beta", -1.0 / 46.3),
+        ("vertical", "alpha", -1.0 / 46.3),
+    ],
 )
 def test_wind_acts_along_the_axes_of_trim(axis: str, state: str, scale: float) -> None:
-    # The gust lasts 0.1 s: at its peak the aircraft itself has hardly moved (alpha responds at about 4 1/s: a fifth).
+    # The gust lasts 0.1 s: at its peak the aircraft itself has hardly moved (alpha responds at
+    # about 4 1/s: a fifth).
     truth = fly(cessna(one_gust(axis, 2.0, 46.3 * 0.05)), command(), 0.05)
     peak = truth[f"gust.{axis}"][-1]
     assert peak == pytest.approx(2.0, rel=0.01)
@@ -119,32 +139,47 @@ def test_turbulence_acts_from_the_first_sample_on() -> None:
     simulator.sample(0, command())
     truth = truth_of(simulator)
     assert abs(truth["gust.longitudinal"]) > 0.1
-    # Airspeed is the norm of ground velocity less wind; the ground velocity is 46.3 m/s along the first axis.
+    # Airspeed is the norm of ground velocity less wind; the ground velocity is 46.3 m/s along the
+    # first axis.
     wind = np.array([truth[f"gust.{axis}"] for axis in AXES])
-    assert 46.3 + truth["x.V"] == pytest.approx(float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3)
+    assert 46.3 + truth["x.V"] == pytest.approx(
+        float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3
+    )
 
 
 def test_actuators_act_before_the_aircraft() -> None:
     # An aileron stuck from the start has no effect. A lag of 0.1 s passes 63 % after 0.1 s.
-    stuck = JsbsimModel(CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), NO_WIND)
+    stuck = JsbsimModel(
+        CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), NO_WIND
+    )
     assert np.max(np.abs(fly(stuck, command(aileron=0.1), 0.5)["x.p"])) < 1e-4
     slow = JsbsimModel(CESSNA, Actuators(lag=np.full(4, 0.1)), NO_WIND)
-    assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
+    assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(
+        0.1 * (1.0 - math.exp(-1.0))
+    )
 
 
 def with_lost_throttle(lost_at: float) -> AircraftConfig:
-    return aircraft_parameters(**SECTION, actuators={"lost_at": [math.inf, lost_at, math.inf, math.inf]})
+    return aircraft_parameters(
+        **SECTION, actuators={"lost_at": [math.inf, lost_at, math.inf, math.inf]}
+    )
 
 
 def thrusts(model: JsbsimModel) -> list[float]:
-    return [model._fdm[jsbsim_trim.thrust_property(engine)] for engine in range(engine_count(model._fdm))]
+    return [
+        model._fdm[jsbsim_trim.thrust_property(engine)]
+        for engine in range(engine_count(model._fdm))
+    ]
 
 
 @pytest.mark.parametrize(
-    "condition", [CESSNA, FlightCondition("737", 150.0, 5000.0, STEP_NS)], ids=["a piston with a propeller", "two turbines"]
+    "condition",
+    [CESSNA, FlightCondition("737", 150.0, 5000.0, STEP_NS)],
+    ids=["a piston with a propeller", "two turbines"],
 )
 def test_lost_engines_give_no_thrust(condition: FlightCondition) -> None:
-    """JSBSim's own thrust. At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller turned by the wind brakes.
+    """JSBSim's own thrust. At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller
+    turned by the wind brakes.
 
     The flight goes on: an engine that stops for another reason ends it.
     """
@@ -166,7 +201,9 @@ def test_flight_in_another_process_agrees_to_last_bit() -> None:
         "truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)\n"
         "print(np.array(list(truth.values())).tobytes().hex())\n"
     )
-    output = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, cwd=REPOSITORY).stdout
+    output = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, cwd=REPOSITORY
+    ).stdout
     truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)
     assert output.strip() == np.array(list(truth.values())).tobytes().hex()
 
@@ -175,7 +212,9 @@ def test_nothing_is_printed_and_nothing_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    model = cessna(condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS))  # it asks for a table as output
+    model = cessna(
+        condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS)
+    )  # it asks for a table as output
     fly(model, command(), 0.1)
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
@@ -189,12 +228,16 @@ def test_hang_in_isolated_process_times_out(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_computation_without_end_in_isolated_process_times_out_by_processor_time() -> None:
     before = os.times()
-    with pytest.raises(isolated.IsolatedCallError, match=r"^timed out after 2 s of processor time$"):
+    with pytest.raises(
+        isolated.IsolatedCallError, match=r"^timed out after 2 s of processor time$"
+    ):
         isolated.call(re.match, "(a+)+$", "a" * 100 + "b", timeout=2.0)  # tries 2**100 ways
     after = os.times()
-    used = after.children_user + after.children_system - before.children_user - before.children_system
-    # Linux counts whole ticks for the limit: beside load of real-time priority 2 s where the process ran for 1.2 s. The rest is
-    # what starts and ends a process.
+    used = (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
+    # Linux counts whole ticks for the limit: beside load of real-time priority 2 s where the
+    # process ran for 1.2 s. The rest is what starts and ends a process.
     assert 1.0 < used < 3.5
 
 
@@ -202,10 +245,15 @@ def test_isolated_process_keeps_limit_of_processor_time_that_user_has() -> None:
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (60, 60))\n"
         "from flight_core import isolated\n"
-        "print(*(isolated.call(resource.getrlimit, resource.RLIMIT_CPU, timeout=one) for one in (30.0, 90.0)))\n"
+        "print(*(isolated.call(resource.getrlimit, resource.RLIMIT_CPU, timeout=one) for one in "
+        "(30.0, 90.0)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout == "(30, 60) (60, 60)\n"  # raising the second number needs a privilege, setrlimit(2)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert (
+        done.stdout == "(30, 60) (60, 60)\n"
+    )  # raising the second number needs a privilege, setrlimit(2)
 
 
 def test_crash_exception_and_exit_of_isolated_process_are_errors_here() -> None:
@@ -218,34 +266,57 @@ def test_crash_exception_and_exit_of_isolated_process_are_errors_here() -> None:
     assert isolated.call(math.hypot, 3.0, 4.0, timeout=120.0) == 5.0
 
 
-def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     real = isolated.call
-    monkeypatch.setattr(isolated, "call", lambda *_, timeout, **_limits: real(ctypes.string_at, 0, timeout=timeout))
+    monkeypatch.setattr(
+        isolated, "call", lambda *_, timeout, **_limits: real(ctypes.string_at, 0, timeout=timeout)
+    )
     # No other test has cached the trim of this condition.
     scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})
-    assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
+    assert (
+        simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
+    )
 
 
 @pytest.mark.parametrize(
     ("condition", "sentence"),
     [
-        (("c172p", 20.0, 1219.2), "does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best"),
-        (("dr1", 41.0, 900.0), ".*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone "),
+        (
+            ("c172p", 20.0, 1219.2),
+            "does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best",
+        ),
+        (
+            ("dr1", 41.0, 900.0),
+            (
+                ".*: its model needs the property /sim/model/pushback/position-norm, which JSBSim "
+                "alone "
+            ),
+        ),
         (("blank", 41.0, 900.0), "cannot be loaded: "),
     ],
     ids=["stalled", "property", "empty"],
 )
-def test_condition_without_trim_refused_in_one_sentence(condition: tuple[str, float, float], sentence: str) -> None:
+def test_condition_without_trim_refused_in_one_sentence(
+    condition: tuple[str, float, float], sentence: str
+) -> None:
     with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
-        cessna(condition=FlightCondition(*condition, 4 * STEP_NS))  # larger steps: the search for a trim takes long
+        cessna(
+            condition=FlightCondition(*condition, 4 * STEP_NS)
+        )  # larger steps: the search for a trim takes long
     assert "\n" not in str(ended.value)
 
 
 def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     cessna()  # caches the trim found with the real table
-    wrong = dict(INPUTS) | {"rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")}
+    wrong = dict(INPUTS) | {
+        "rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")
+    }
     monkeypatch.setattr(jsbsim_aircraft, "INPUTS", wrong)
-    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p cannot be flown: it has no property fcs/ruder-cmd-norm$"):
+    with pytest.raises(
+        FlightEnded, match=r"^jsbsim:c172p cannot be flown: it has no property fcs/ruder-cmd-norm$"
+    ):
         cessna()
 
 
@@ -259,8 +330,14 @@ def test_the_ground_ends_a_flight() -> None:
     [
         ({"airframe": "jsbsim:../c172p"}, r"airframe: found 'jsbsim:../c172p', where no file is"),
         ({"speed": None}, r"speed: found none, expected the true airspeed to trim at, m/s"),
-        ({"uncertainty": {"A": 0.1}}, r"uncertainty: found a value, expected none: jsbsim:c172p has no matrices"),
-        ({"airframe": "osprey"}, r"speed: found 46.3, expected none: the airframe osprey has a fixed trim"),
+        (
+            {"uncertainty": {"A": 0.1}},
+            r"uncertainty: found a value, expected none: jsbsim:c172p has no matrices",
+        ),
+        (
+            {"airframe": "osprey"},
+            r"speed: found 46.3, expected none: the airframe osprey has a fixed trim",
+        ),
     ],
 )
 def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: str) -> None:
@@ -271,5 +348,7 @@ def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentenc
 def test_without_jsbsim_aircraft_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     aircraft_names.cache_clear()
     monkeypatch.setitem(sys.modules, "jsbsim", None)  # its import then fails
-    with pytest.raises(ParameterError, match=r"^aircraft\.airframe: found no Python package jsbsim, expected it"):
+    with pytest.raises(
+        ParameterError, match=r"^aircraft\.airframe: found no Python package jsbsim, expected it"
+    ):
         aircraft_parameters(**SECTION)

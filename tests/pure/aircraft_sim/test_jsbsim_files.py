@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Foreign models of JSBSim: the files that they name as JSBSim finds them, and what they may not do to the user's host."""
+"""Foreign models of JSBSim: the files that they name as JSBSim finds them, and what they may not do
+to the user's host.
+"""
 
 import io
 import os
@@ -36,7 +38,9 @@ def write_model(folder: Path, line: str = "", text: str = CESSNA) -> Path:
 
 def loaded(model: Path) -> jsbsim.FGFDMExec:
     """The model, loaded for a flight in this process and run for a moment."""
-    fdm, _ = trimmed_fdm(FlightCondition(str(model), 46.3, 1219.2, 10_000_000), (0.0,) * 6 + (0.0, 0.0))
+    fdm, _ = trimmed_fdm(
+        FlightCondition(str(model), 46.3, 1219.2, 10_000_000), (0.0,) * 6 + (0.0, 0.0)
+    )
     fdm.run_ic()
     for _ in range(20):
         fdm.run()
@@ -80,7 +84,10 @@ def test_section_in_another_file_is_left_out_and_said(
     assert table.read_text(encoding="utf-8") == "precious data of the user\n"
     assert sorted(table.parent.rglob("*")) == before
     assert caplog.messages == [
-        f'note: plane.xml: left out <{section} file="{file}">: a foreign model opens no socket and writes no file'
+        (
+            f'note: plane.xml: left out <{section} file="{file}">: a foreign model opens no socket '
+            "and writes no file"
+        )
     ]
 
 
@@ -88,7 +95,9 @@ def test_section_in_another_file_is_left_out_and_said(
     "line",
     [
         OUTPUT,
-        OUTPUT.replace("<output", '<output xmlns="urn:of-another-program"'),  # which JSBSim does not look at
+        OUTPUT.replace(
+            "<output", '<output xmlns="urn:of-another-program"'
+        ),  # which JSBSim does not look at
     ],
 )
 def test_output_writes_no_file(line: str, table: Path) -> None:
@@ -120,20 +129,33 @@ def test_model_opens_no_socket(line: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["system", "flight_control"])
 @pytest.mark.parametrize("name", WRITERS)
-def test_property_that_writes_a_file_is_refused(name: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """JSBSim writes NAME_lin.sce and initfile.TIME.xml where a model sets them; NAME of the model may be a path."""
+def test_property_that_writes_a_file_is_refused(
+    name: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """JSBSim writes NAME_lin.sce and initfile.TIME.xml where a model sets them; NAME of the model
+    may be a path.
+    """
     monkeypatch.chdir(tmp_path)
     switch = f'<property value="1">simulation/{name}</property>'
     if place == "system":
         model = write_model(tmp_path / "plane", '<system file="writes"/>')
-        (model.parent / "writes.xml").write_text(f'<system name="s">{switch}</system>', encoding="utf-8")
+        (model.parent / "writes.xml").write_text(
+            f'<system name="s">{switch}</system>', encoding="utf-8"
+        )
     else:
-        model = write_model(tmp_path / "plane", text=CESSNA.replace("<flight_control", f"<!-- {name} --><flight_control", 1))
+        model = write_model(
+            tmp_path / "plane",
+            text=CESSNA.replace("<flight_control", f"<!-- {name} --><flight_control", 1),
+        )
         assert name not in model_files(model).left_out  # a comment does nothing
-        text = CESSNA.replace("</flight_control>", f'<channel name="c"><switch name="s"><default value="1"/>'
-                              f"<output>simulation/{name}</output></switch></channel></flight_control>")  # fmt: skip
+        switch = f'<switch name="s"><default value="1"/><output>simulation/{name}</output></switch>'
+        channel = f'<channel name="c">{switch}</channel></flight_control>'
+        text = CESSNA.replace("</flight_control>", channel)
         model = write_model(tmp_path / "plane", text=text)
-    assert f"found the property simulation/{name}, which writes a file, expected a model without it" in refused(model)
+    assert (
+        f"found the property simulation/{name}, which writes a file, expected a model without it"
+        in refused(model)
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["plane"]
 
 
@@ -152,12 +174,19 @@ def test_child_model_is_refused(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("element", ["system", "aerodynamics", "engine"])
-def test_file_outside_of_the_folder_of_the_model_is_in_no_archive(element: str, file: str, tmp_path: Path) -> None:
-    (tmp_path / "secret.xml").write_text("<system><key>of the user</key></system>", encoding="utf-8")
+def test_file_outside_of_the_folder_of_the_model_is_in_no_archive(
+    element: str, file: str, tmp_path: Path
+) -> None:
+    (tmp_path / "secret.xml").write_text(
+        "<system><key>of the user</key></system>", encoding="utf-8"
+    )
     file = file.format(tmp_path)
     model = write_model(tmp_path / "plane", f'<{element} file="{file}"/>')
     (model.parent / "sub").mkdir()
-    with pytest.raises(ParameterError, match=r"found the file .*, expected one below the folder of the model, without \.\.$"):
+    with pytest.raises(
+        ParameterError,
+        match=r"found the file .*, expected one below the folder of the model, without \.\.$",
+    ):
         model_files(model)
 
 
@@ -171,7 +200,10 @@ def test_link_to_a_file_elsewhere_is_refused(linked: str, tmp_path: Path) -> Non
         (model.parent / "secret.xml").symlink_to(secret)
     else:
         (model.parent / "Systems").symlink_to(secret.parent)
-    with pytest.raises(ParameterError, match=rf"found the file secret\.xml, a link to {secret}, expected a file below"):
+    with pytest.raises(
+        ParameterError,
+        match=rf"found the file secret\.xml, a link to {secret}, expected a file below",
+    ):
         model_files(model)
 
 
@@ -197,10 +229,14 @@ def test_engine_that_an_included_propulsion_names_is_in_the_archive(tmp_path: Pa
     head, _, rest = CESSNA.partition("<propulsion>")
     body, _, tail = rest.partition("</propulsion>")
     model = write_model(tmp_path / "plane", text=f'{head}<propulsion file="Propulsion.xml"/>{tail}')
-    (model.parent / "Propulsion.xml").write_text(f"<propulsion>{body}</propulsion>", encoding="utf-8")
-    assert {"aircraft/plane/Propulsion.xml", "engine/eng_io320.xml", "engine/prop_75in2f.xml"} <= model_files(
-        model
-    ).members.keys()
+    (model.parent / "Propulsion.xml").write_text(
+        f"<propulsion>{body}</propulsion>", encoding="utf-8"
+    )
+    assert {
+        "aircraft/plane/Propulsion.xml",
+        "engine/eng_io320.xml",
+        "engine/prop_75in2f.xml",
+    } <= model_files(model).members.keys()
     loaded(model)
 
 
@@ -219,13 +255,17 @@ def loads(root: Path, aircraft: Path) -> int | None:
     fdm.set_output_path(os.devnull)
     fdm.set_aircraft_path(str(aircraft.parent))
     try:
-        return fdm.get_propulsion().get_num_engines() if fdm.load_model(aircraft.stem, False) else None
+        return (
+            fdm.get_propulsion().get_num_engines() if fdm.load_model(aircraft.stem, False) else None
+        )
     except jsbsim.BaseError:
         return None
 
 
 @pytest.mark.parametrize("name", aircraft_names())
-def test_copy_of_each_aircraft_of_the_package_loads_as_the_aircraft(name: str, tmp_path: Path) -> None:
+def test_copy_of_each_aircraft_of_the_package_loads_as_the_aircraft(
+    name: str, tmp_path: Path
+) -> None:
     """With nothing but the files that `model_files` finds."""
     path = PACKAGE / "aircraft" / name / f"{name}.xml"
     expected = loads(PACKAGE, path)

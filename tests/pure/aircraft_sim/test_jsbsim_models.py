@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models of JSBSim of the user's own: found by path, with engines beside them or in a root, electric engines too."""
+"""Models of JSBSim of the user's own: found by path, with engines beside them or in a root,
+electric engines too.
+"""
 
 import shutil
 import zipfile
@@ -39,10 +41,14 @@ STEP_NS = 5_000_000
 SECTION: dict[str, Any] = {"speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
 
 
-def write_model(folder: Path, engine: str, name: str = "plane.xml", engines: str = "Engines") -> Path:
+def write_model(
+    folder: Path, engine: str, name: str = "plane.xml", engines: str = "Engines"
+) -> Path:
     """A c172p with an engine of the package, whose file is copied beside the model."""
     (folder / engines).mkdir(parents=True)
-    (folder / engines / "own_engine.xml").write_bytes((PACKAGE / "engine" / f"{engine}.xml").read_bytes())
+    (folder / engines / "own_engine.xml").write_bytes(
+        (PACKAGE / "engine" / f"{engine}.xml").read_bytes()
+    )
     (folder / name).write_text(CESSNA.replace("eng_io320", "own_engine"), encoding="utf-8")
     return folder / name
 
@@ -55,13 +61,21 @@ def electric(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def external(tmp_path: Path) -> Path:
-    """A c172p whose flight control reads the elevator in rad, half of the opposite, and ailerons by two properties."""
-    declared = "".join(f'<property value="0.0">fcs/cmd{name}</property>' for name in ("Elev_ext_rad", "AilL", "AilR"))
-    text = CESSNA.replace('<flight_control name="FCS: c172">', f'<flight_control name="FCS: c172">{declared}', 1)
+    """A c172p whose flight control reads the elevator in rad, half of the opposite, and ailerons by
+    two properties.
+    """
+    declared = "".join(
+        f'<property value="0.0">fcs/cmd{name}</property>'
+        for name in ("Elev_ext_rad", "AilL", "AilR")
+    )
+    text = CESSNA.replace(
+        '<flight_control name="FCS: c172">', f'<flight_control name="FCS: c172">{declared}', 1
+    )
     half = (
         "<channel name='External'>"
         + "".join(
-            f'<fcs_function name="{name}"><function>{term}</function><output>{name}</output></fcs_function>'
+            "<fcs_function "
+            f'name="{name}"><function>{term}</function><output>{name}</output></fcs_function>'
             for name, term in {
                 "own/elevator": "<product><v>-2.0</v><p>fcs/cmdElev_ext_rad</p></product>",
                 "own/aileron": "<difference><p>fcs/cmdAilR</p><p>fcs/cmdAilL</p></difference>",
@@ -72,7 +86,9 @@ def external(tmp_path: Path) -> Path:
     text = text.replace('<channel name="Pitch">', f'{half}<channel name="Pitch">', 1)
     text = text.replace("<input>fcs/elevator-cmd-norm</input>", "<input>own/elevator</input>")
     text = text.replace("<input>fcs/aileron-cmd-norm</input>", "<input>own/aileron</input>")
-    text = text.replace("<input>fcs/pitch-trim-cmd-norm</input>", "").replace("<input>fcs/roll-trim-cmd-norm</input>", "")
+    text = text.replace("<input>fcs/pitch-trim-cmd-norm</input>", "").replace(
+        "<input>fcs/roll-trim-cmd-norm</input>", ""
+    )
     path = tmp_path / "own.xml"
     path.write_text(text, encoding="utf-8")
     return path
@@ -82,16 +98,29 @@ def test_command_without_effect_is_named_with_what_the_model_reads(external: Pat
     with pytest.raises(FlightEnded) as ended:
         trim_solution(FlightCondition(str(external), 46.3, 1219.2, STEP_NS))
     sentence = str(ended.value)
-    assert "cannot be flown: elevator: fcs/elevator-cmd-norm, aileron: fcs/aileron-cmd-norm moves no acceleration" in sentence
-    assert "its flight control reads fcs/cmdAilL, fcs/cmdAilR, fcs/cmdElev_ext_rad: name them in `commands`" in sentence
+    assert (
+        "cannot be flown: elevator: fcs/elevator-cmd-norm, aileron: fcs/aileron-cmd-norm moves "
+        "no acceleration" in sentence
+    )
+    assert (
+        "its flight control reads fcs/cmdAilL, fcs/cmdAilR, fcs/cmdElev_ext_rad: name them in "
+        "`commands`" in sentence
+    )
     assert "rudder" not in sentence
     assert "throttle" not in sentence
 
 
 def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) -> None:
-    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad, and half of the aileron to each side."""
-    commands = {"elevator": "fcs/cmdElev_ext_rad=-0.5", "aileron": "fcs/cmdAilR=0.5 fcs/cmdAilL=-0.5"}
-    named = aircraft_parameters(**SECTION, airframe=f"{PREFIX}{external}", commands=commands).flight_condition()
+    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad, and half of the aileron to each
+    side.
+    """
+    commands = {
+        "elevator": "fcs/cmdElev_ext_rad=-0.5",
+        "aileron": "fcs/cmdAilR=0.5 fcs/cmdAilL=-0.5",
+    }
+    named = aircraft_parameters(
+        **SECTION, airframe=f"{PREFIX}{external}", commands=commands
+    ).flight_condition()
     flights = []
     for condition in (named, FlightCondition("c172p", 46.3, 1219.2, STEP_NS)):
         none = np.zeros(len(AXES))
@@ -109,7 +138,10 @@ def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) ->
     ("commands", "sentence"),
     [
         ({"flaps": "fcs/flap"}, "commands: found 'flaps', expected an input: elevator"),
-        ({"elevator": "simulation/write-state-file"}, "commands.elevator: found 'simulation/write-state-file', expected"),
+        (
+            {"elevator": "simulation/write-state-file"},
+            "commands.elevator: found 'simulation/write-state-file', expected",
+        ),
         ({"elevator": "fcs/a=0"}, "commands.elevator: found 'fcs/a=0', expected PROPERTY=VALUE"),
         ({"elevator": "fcs/a=x"}, "commands.elevator: found 'fcs/a=x', expected PROPERTY=VALUE"),
         ({"elevator": " "}, "commands.elevator: found ' ', expected a property"),
@@ -117,11 +149,15 @@ def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) ->
 )
 def test_named_property_that_is_none_is_refused(commands: dict[str, str], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
-        aircraft_parameters(**SECTION, airframe=f"{PREFIX}c172p", commands=commands).flight_condition()
+        aircraft_parameters(
+            **SECTION, airframe=f"{PREFIX}c172p", commands=commands
+        ).flight_condition()
 
 
 def test_named_property_that_the_model_lacks_is_refused(external: Path) -> None:
-    condition = FlightCondition(str(external), 46.3, 1219.2, STEP_NS, (("elevator", (("fcs/absent", 1.0),)),))
+    condition = FlightCondition(
+        str(external), 46.3, 1219.2, STEP_NS, (("elevator", (("fcs/absent", 1.0),)),)
+    )
     with pytest.raises(FlightEnded, match="it has no property fcs/absent"):
         trim_solution(condition)
 
@@ -149,7 +185,9 @@ def test_folder_names_its_only_model(electric: Path) -> None:
     assert require_aircraft(f"{PREFIX}{electric.parent}") == str(electric)
 
 
-def test_relative_path_is_that_of_working_folder(electric: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relative_path_is_that_of_working_folder(
+    electric: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(electric.parent)
     assert require_aircraft(f"{PREFIX}plane.xml") == str(electric)
 
@@ -168,10 +206,14 @@ def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
         archive.extractall(tmp_path / "elsewhere")
     copy = tmp_path / "elsewhere" / "aircraft" / "plane"
     assert np.array_equal(throttle_step(f"{PREFIX}{copy}"), throttle_step(f"{PREFIX}{electric}"))
-    assert (tmp_path / "elsewhere" / "engine" / "prop_75in2f.xml").is_file()  # of the package, which the model names
+    assert (
+        tmp_path / "elsewhere" / "engine" / "prop_75in2f.xml"
+    ).is_file()  # of the package, which the model names
 
 
-def test_model_without_trim_of_its_own_trims_by_its_elevator(electric: Path, tmp_path: Path) -> None:
+def test_model_without_trim_of_its_own_trims_by_its_elevator(
+    electric: Path, tmp_path: Path
+) -> None:
     # as flying wings have it: no surface reads fcs/pitch-trim-cmd-norm
     text = electric.read_text(encoding="utf-8")
     cut = text.replace("fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
@@ -186,12 +228,16 @@ def test_model_without_trim_of_its_own_trims_by_its_elevator(electric: Path, tmp
     assert solution[-1] == 1.0  # all of it by the elevator
 
 
-def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_root_of_user_has_names_and_engines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tree = tmp_path / "root"
     model = write_model(tree / "aircraft" / "mine", "electric147kW", "mine.xml")
     (tree / "engine").mkdir()
     (model.parent / "Engines" / "own_engine.xml").rename(tree / "engine" / "own_engine.xml")
-    (tree / "engine" / "prop_75in2f.xml").write_bytes((PACKAGE / "engine" / "prop_75in2f.xml").read_bytes())
+    (tree / "engine" / "prop_75in2f.xml").write_bytes(
+        (PACKAGE / "engine" / "prop_75in2f.xml").read_bytes()
+    )
     expected = throttle_step(f"{PREFIX}{model}")  # the root is that of the path
     monkeypatch.setenv("JSBSIM_ROOT", str(tree))
     aircraft_names.cache_clear()
@@ -199,7 +245,10 @@ def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.
         assert aircraft_names() == ("mine",)
         assert np.array_equal(throttle_step(f"{PREFIX}mine"), expected)
         monkeypatch.setenv("JSBSIM_ROOT", str(tmp_path))
-        with pytest.raises(ParameterError, match=r"^JSBSIM_ROOT: found .*, expected a folder with aircraft and engine$"):
+        with pytest.raises(
+            ParameterError,
+            match=r"^JSBSIM_ROOT: found .*, expected a folder with aircraft and engine$",
+        ):
             root()
     finally:
         aircraft_names.cache_clear()
@@ -208,8 +257,17 @@ def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.parametrize(
     ("path", "sentence"),
     [
-        ("nowhere.xml", "found 'jsbsim:nowhere.xml', where no file is, expected the XML file of an aircraft of JSBSim"),
-        ("./two", "found 'jsbsim:./two', a folder with a.xml, b.xml, expected a folder with one model"),
+        (
+            "nowhere.xml",
+            (
+                "found 'jsbsim:nowhere.xml', where no file is, expected the XML file of an "
+                "aircraft of JSBSim"
+            ),
+        ),
+        (
+            "./two",
+            "found 'jsbsim:./two', a folder with a.xml, b.xml, expected a folder with one model",
+        ),
         ("empty", "found 'jsbsim:empty', expected jsbsim:./empty perhaps"),
         ("./page", "found 'jsbsim:./page', a file with html, expected the XML file of an aircraft"),
         ("zzz", "found 'jsbsim:zzz', expected a name in .*/aircraft, or jsbsim:PATH with a /"),
@@ -223,7 +281,9 @@ def test_wrong_path_refused_with_what_is_there(
         (tmp_path / folder).mkdir()
     (tmp_path / "page" / "page.xml").write_text("<html/>", encoding="utf-8")
     for name in ("a", "b"):
-        (tmp_path / "two" / f"{name}.xml").write_text('<?xml version="1.0"?><fdm_config/>', encoding="utf-8")
+        (tmp_path / "two" / f"{name}.xml").write_text(
+            '<?xml version="1.0"?><fdm_config/>', encoding="utf-8"
+        )
     (tmp_path / "engine.xml").write_bytes((PACKAGE / "engine" / "eng_io320.xml").read_bytes())
     (tmp_path / "text.xml").write_text("x,y\n1,2\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
@@ -235,5 +295,8 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
     model = tmp_path / "lone.xml"
     model.write_bytes(electric.read_bytes())
     condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
-    with pytest.raises(FlightEnded, match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$"):
+    with pytest.raises(
+        FlightEnded,
+        match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$",
+    ):
         trim_solution(condition)

@@ -40,19 +40,35 @@ QUIET: dict[str, Any] = {"gusts": {}, "sensors": {}}
 def test_heading_wrapped_to_half_turn_either_way(angle: float) -> None:
     wrapped = pose.wrapped(angle)
     assert -math.pi < wrapped <= math.pi
-    assert (math.sin(wrapped), math.cos(wrapped)) == pytest.approx((math.sin(angle), math.cos(angle)), abs=1e-12)
+    assert (math.sin(wrapped), math.cos(wrapped)) == pytest.approx(
+        (math.sin(angle), math.cos(angle)), abs=1e-12
+    )
 
 
 def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_down() -> None:
     speed, alpha, beta, phi, theta, psi = 40.0, 0.1, -0.05, 0.6, 0.2, 2.5
-    body = speed * np.array([math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)])
-    north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(body)  # scipy's intrinsic rotations
-    assert pose.velocity(speed, alpha, beta, phi, theta, psi) == pytest.approx((north, east, -down), rel=1e-14)
+    body = speed * np.array(
+        [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
+    )
+    north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(
+        body
+    )  # scipy's intrinsic rotations
+    assert pose.velocity(speed, alpha, beta, phi, theta, psi) == pytest.approx(
+        (north, east, -down), rel=1e-14
+    )
 
 
 def test_a_start_elsewhere_turns_and_moves_the_flight() -> None:
-    flown = dict.fromkeys(POSE, 0.0) | {"psi": 3.0, "north": 10.0, "east": 2.0, "v_north": 5.0, "v_east": -1.0}
-    moved = pose.over_ground(np.array([*flown.values()]), 0.0, (0.0, 0.0), pose.Start(100.0, -50.0, math.pi / 2.0))
+    flown = dict.fromkeys(POSE, 0.0) | {
+        "psi": 3.0,
+        "north": 10.0,
+        "east": 2.0,
+        "v_north": 5.0,
+        "v_east": -1.0,
+    }
+    moved = pose.over_ground(
+        np.array([*flown.values()]), 0.0, (0.0, 0.0), pose.Start(100.0, -50.0, math.pi / 2.0)
+    )
     found = dict(zip(POSE, moved.tolist(), strict=True))
     # A quarter turn to the right: what was ahead is east, what was to the right is south.
     assert (found["north"], found["east"]) == pytest.approx((100.0 - 2.0, -50.0 + 10.0))
@@ -64,15 +80,22 @@ def euler_rates(x: dict[str, float]) -> dict[str, float]:
     """Derivatives of equation (1) for the osprey with kinematics euler, without input."""
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
     state = np.array([x.get(name, 0.0) for name in airframe.states])
-    return dict(zip(airframe.states, dynamics.x_dot(0.0, state, np.zeros(4), aircraft).tolist(), strict=True))
+    return dict(
+        zip(
+            airframe.states, dynamics.x_dot(0.0, state, np.zeros(4), aircraft).tolist(), strict=True
+        )
+    )
 
 
 def test_euler_kinematics_turn_body_rates_as_attitude_turns() -> None:
-    # The derivative of the rotation matrix of (phi, theta, psi) is R times the skew matrix of (p, q, r).
+    # The derivative of the rotation matrix of (phi, theta, psi) is R times the skew matrix of (p,
+    # q, r).
     phi, theta, (p, q, r) = 0.7, 0.3, (0.2, -0.1, 0.25)
     rates = euler_rates({"phi": phi, "theta": theta, "p": p, "q": q, "r": r})
     dt = 1e-6
-    after = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(np.array([p, q, r]) * dt)
+    after = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
+        np.array([p, q, r]) * dt
+    )
     psi_after, theta_after, phi_after = after.as_euler("ZYX")
     assert rates["phi"] == pytest.approx((phi_after - phi) / dt, abs=1e-6)
     assert rates["theta"] == pytest.approx((theta_after - theta) / dt, abs=1e-6)
@@ -80,7 +103,8 @@ def test_euler_kinematics_turn_body_rates_as_attitude_turns() -> None:
 
 
 def test_level_turn_keeps_attitude_and_costs_lift() -> None:
-    # q = psi_dot sin(phi), r = psi_dot cos(phi), psi_dot = (g/V) tan(phi): the rates of a level turn hold phi and theta.
+    # q = psi_dot sin(phi), r = psi_dot cos(phi), psi_dot = (g/V) tan(phi): the rates of a level
+    # turn hold phi and theta.
     phi, turn = 0.5, GRAVITY / 25.0 * math.tan(0.5)
     rates = euler_rates({"phi": phi, "q": turn * math.sin(phi), "r": turn * math.cos(phi)})
     assert abs(rates["phi"]) < 1e-15
@@ -96,13 +120,17 @@ def test_level_turn_keeps_attitude_and_costs_lift() -> None:
         ("osprey", {"wind": [3.0]}, "wind"),
     ],
 )
-def test_kinematics_and_wind_that_aircraft_cannot_have_refused(airframe: str, values: dict[str, Any], sentence: str) -> None:
+def test_kinematics_and_wind_that_aircraft_cannot_have_refused(
+    airframe: str, values: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         aircraft_parameters(airframe=airframe, **values)
 
 
 def test_pose_of_airframe_agrees_with_another_integrator() -> None:
-    """From an aileron step on: heading and position by SciPy's integrator with the rotations of SciPy."""
+    """From an aileron step on: heading and position by SciPy's integrator with the rotations of
+    SciPy.
+    """
     simulator = Simulator(aircraft_parameters(kinematics="euler"))
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
     states, u = list(airframe.states), np.array([0.0, 0.0, 0.01, 0.0])
@@ -110,7 +138,9 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     def derivative(t: float, z: Any) -> Any:
         x, psi = z[:8], z[8]
         V, alpha, q, theta, beta, _, r, phi = (x[states.index(name)] for name in states)
-        air = (25.0 + V) * np.array([math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)])
+        air = (25.0 + V) * np.array(
+            [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
+        )
         north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(air)
         turn = (q * math.sin(phi) + r * math.cos(phi)) / math.cos(theta)
         return np.concatenate([dynamics.x_dot(t, x, u, aircraft), [turn, north, east, -down]])
@@ -119,10 +149,18 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     for number in range(int(5.0 * RATE) + 1):
         simulator.sample(number, u if number else np.zeros(4))
     found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
-    expected = {"phi": exact[states.index("phi")], "psi": exact[8], "north": exact[9], "east": exact[10], "altitude": exact[11]}
+    expected = {
+        "phi": exact[states.index("phi")],
+        "psi": exact[8],
+        "north": exact[9],
+        "east": exact[10],
+        "altitude": exact[11],
+    }
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
-        assert found[name] == pytest.approx(value, abs=2e-3), name  # m and rad: the trapezoidal rule at 100 Hz
+        assert found[name] == pytest.approx(value, abs=2e-3), (
+            name
+        )  # m and rad: the trapezoidal rule at 100 Hz
 
 
 def guided(signal: Signal) -> dict[str, Any]:
@@ -136,19 +174,33 @@ def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
     for topic in ("y", "u", "truth"):
         assert still[topic].values.tobytes() == windy[topic].values.tobytes()
     before, after, t = guided(still["pose"]), guided(windy["pose"]), still.time("pose")
-    for name, moved in (("north", -4.0 * t), ("east", 3.0 * t), ("v_north", -4.0), ("v_east", 3.0), ("altitude", 0.0)):
-        assert after[name] - before[name] == pytest.approx(np.broadcast_to(moved, t.shape), abs=1e-10), name
+    for name, moved in (
+        ("north", -4.0 * t),
+        ("east", 3.0 * t),
+        ("v_north", -4.0),
+        ("v_east", 3.0),
+        ("altitude", 0.0),
+    ):
+        assert after[name] - before[name] == pytest.approx(
+            np.broadcast_to(moved, t.shape), abs=1e-10
+        ), name
 
 
 def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     tape = simulate(C172P.vary(flight={"duration": 20.0}, aircraft=QUIET))
     found, t, truth = tape["pose"], tape.time("pose"), tape["truth"].group("x")
     speed, altitude = C172P.aircraft.speed, C172P.aircraft.altitude
-    assert (found["v_north"][0], found["altitude"][0]) == (pytest.approx(speed, rel=1e-3), pytest.approx(altitude, rel=1e-6))
+    assert (found["v_north"][0], found["altitude"][0]) == (
+        pytest.approx(speed, rel=1e-3),
+        pytest.approx(altitude, rel=1e-6),
+    )
     at = np.isin(tape["truth"].stamp_ns, found.stamp_ns)
     for name in ("theta", "altitude", "phi"):  # truth holds deviations from trim
-        assert found[name] - found[name][0] == pytest.approx(truth[name][at] - truth[name][0], abs=1e-9), name
-    # JSBSim integrates the altitude, the model the place from JSBSim's velocities: the derivatives of both are the velocities.
+        assert found[name] - found[name][0] == pytest.approx(
+            truth[name][at] - truth[name][0], abs=1e-9
+        ), name
+    # JSBSim integrates the altitude, the model the place from JSBSim's velocities: the derivatives
+    # of both are the velocities.
     for position, velocity in (("altitude", "climb"), ("north", "v_north"), ("east", "v_east")):
         slope = np.gradient(found[position], t)
         assert slope[1:-1] == pytest.approx(found[velocity][1:-1], abs=0.05), position
@@ -167,17 +219,30 @@ def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
         simulator.sample(number, np.array([0.0, 0.0, 0.05 if pulse else 0.0, 0.0]))
     found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
     radius = 0.3048 * model._fdm["position/radius-to-vehicle-ft"]
-    north, east = (radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True))
+    north, east = (
+        radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True)
+    )
     assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude
-    assert (found["north"], found["east"]) == (pytest.approx(north, rel=0.01), pytest.approx(east, rel=0.01))
+    assert (found["north"], found["east"]) == (
+        pytest.approx(north, rel=0.01),
+        pytest.approx(east, rel=0.01),
+    )
     assert east > 300.0  # m: it has turned
 
 
-POOR = {"rate": 5.0, "delay": 0.1, "bias": {"psi": 0.1}, "noise": {"north": 2.0, "psi": 0.02}, "drift": {"altitude": 0.3}}
+POOR = {
+    "rate": 5.0,
+    "delay": 0.1,
+    "bias": {"psi": 0.1},
+    "noise": {"north": 2.0, "psi": 0.02},
+    "drift": {"altitude": 0.3},
+}
 
 
 def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
-    """100 s: the noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that specified."""
+    """100 s: the noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that
+    specified.
+    """
     simulator = Simulator(aircraft_parameters(pose=POOR, rate=100.0))
     truth, arrived = {}, []
     for number in range(100 * 100 + 1):
@@ -189,8 +254,12 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
     assert {now - sample.stamp_ns for now, sample in arrived} == {100_000_000}
     assert [sample.stamp_ns for _, sample in arrived[:3]] == [0, 200_000_000, 400_000_000]
     off = np.array([sample.value - truth[sample.stamp_ns] for _, sample in arrived])
-    assert off[:, POSE.index("north")].std() == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(off)))
-    assert off[:, POSE.index("psi")].mean() == pytest.approx(0.1, abs=4.0 * 0.02 / math.sqrt(len(off)))
+    assert off[:, POSE.index("north")].std() == pytest.approx(
+        2.0, rel=4.0 / math.sqrt(2.0 * len(off))
+    )
+    assert off[:, POSE.index("psi")].mean() == pytest.approx(
+        0.1, abs=4.0 * 0.02 / math.sqrt(len(off))
+    )
     steps = np.diff(off[:, POSE.index("altitude")])
     assert steps.std() == pytest.approx(0.3 * math.sqrt(0.2), rel=4.0 / math.sqrt(2.0 * len(steps)))
     assert not off[:, POSE.index("phi")].any()
@@ -201,7 +270,10 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
     ("section", "sentence"),
     [
         ({"noise": {"pitch": 1.0}}, "pose.noise: found pitch, expected some of phi, theta"),
-        ({"rate": 40.0}, r"rate: found 0.01 s, expected a whole fraction of 1 / pose.rate \(0.025 s\)"),
+        (
+            {"rate": 40.0},
+            r"rate: found 0.01 s, expected a whole fraction of 1 / pose.rate \(0.025 s\)",
+        ),
     ],
 )
 def test_pose_that_aircraft_cannot_measure_refused(section: dict[str, Any], sentence: str) -> None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor noise, bias, drift, quantisation, dropout and transport delay: statistics, repeatability, effect on a flight."""
+"""Sensor noise, bias, drift, quantisation, dropout and transport delay: statistics, repeatability,
+effect on a flight.
+"""
 
 from typing import Any
 
@@ -9,7 +11,16 @@ import pytest
 from tests.builders import MS, aircraft_parameters
 from tests.closed_loop import PROTOTYPE_SERVO
 
-from aircraft_sim.sensors import DelayLine, Sensors, arrives, initial_drift, measure, noise, transmit, walk
+from aircraft_sim.sensors import (
+    DelayLine,
+    Sensors,
+    arrives,
+    initial_drift,
+    measure,
+    noise,
+    transmit,
+    walk,
+)
 from aircraft_sim.simulator import Simulator, StateSpaceModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -32,8 +43,9 @@ def samples() -> FloatArray:
 
 
 def test_noise_has_mean_zero_and_specified_variance(samples: FloatArray) -> None:
-    # For N samples the standard deviation of the mean is 1/sqrt(N), that of the variance sqrt(2/N). Four of these hold in
-    # 99.95 % of seeds for four channels of mean and variance together. The seed is fixed: the test is deterministic.
+    # For N samples the standard deviation of the mean is 1/sqrt(N), that of the variance sqrt(2/N).
+    # Four of these hold in 99.95 % of seeds for four channels of mean and variance together. The
+    # seed is fixed: the test is deterministic.
     assert np.abs(samples.mean(axis=0)).max() < 4.0 / np.sqrt(COUNT)
     assert np.abs(samples.var(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / COUNT)
     assert (np.array([noise(k, sensors(NOISE)) for k in range(5)]) == samples[:5] * NOISE).all()
@@ -59,7 +71,9 @@ def test_channel_without_noise_exact_and_does_not_change_others() -> None:
 @pytest.mark.parametrize("dropout", [0.05, 0.2, 0.5])
 def test_fraction_of_dropped_samples_is_specified_one(dropout: float) -> None:
     lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
-    tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / COUNT)  # four standard deviations of a fraction
+    tolerance = 4.0 * np.sqrt(
+        dropout * (1.0 - dropout) / COUNT
+    )  # four standard deviations of a fraction
     assert lost.mean() == pytest.approx(dropout, abs=tolerance)
     # Dropouts are independent: the fraction of two in a row is dropout^2.
     assert (lost[1:] & lost[:-1]).mean() == pytest.approx(dropout**2, abs=tolerance)
@@ -114,13 +128,17 @@ def test_sample_is_output_with_noise_or_dropped() -> None:
 def test_errors_add_up_and_quantisation_comes_last() -> None:
     y = np.array([0.1234, -0.1234, 0.1234, 20.0])
     params = sensors([0.01] * 4)._replace(
-        bias=np.array([0.2, -0.3, 0.0, 0.0]), drift=np.array([0.1, 0.1, 0.0, 0.1]), quantum=np.array([0.0, 0.05, 0.05, 0.5])
+        bias=np.array([0.2, -0.3, 0.0, 0.0]),
+        drift=np.array([0.1, 0.1, 0.0, 0.1]),
+        quantum=np.array([0.0, 0.05, 0.05, 0.5]),
     )
     drift = walk(6, initial_drift(params), params)
     measured = measure(7, y, drift, params)
     analog = y + params.bias + walk(7, drift, params).value + noise(7, params)
     assert measured.y[0] == pytest.approx(analog[0], abs=1e-15)
-    assert measured.y[1:] == pytest.approx([0.05, 0.05, 0.5] * np.round(analog[1:] / [0.05, 0.05, 0.5]), abs=1e-15)
+    assert measured.y[1:] == pytest.approx(
+        [0.05, 0.05, 0.5] * np.round(analog[1:] / [0.05, 0.05, 0.5]), abs=1e-15
+    )
     assert np.abs(measured.y - analog).max() <= 0.25  # half a step
     assert measured.error == pytest.approx(measured.y - y, abs=1e-15)
 
@@ -128,28 +146,45 @@ def test_errors_add_up_and_quantisation_comes_last() -> None:
 def test_quantisation_rounds_to_nearest_step_and_halves_to_even() -> None:
     params = sensors([0.0] * 6)._replace(quantum=np.full(6, 0.25))
     y = np.array([0.1, 0.125, 0.375, -0.1, -0.2, 0.3])  # 0.125 and 0.375 are exact halves
-    assert measure(0, y, initial_drift(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
+    assert measure(0, y, initial_drift(params), params).y.tolist() == [
+        0.0,
+        0.0,
+        0.5,
+        -0.0,
+        -0.25,
+        0.25,
+    ]
 
 
 def test_variance_of_drift_grows_with_time_at_any_rate() -> None:
-    # 0.2 SI per sqrt(s) gives variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; the
-    # limit of four of them holds in 99.99 % of seeds.
+    # 0.2 SI per sqrt(s) gives variance 0.04 t. 400 walks at two rates: chi-square of 400 has a
+    # standard deviation of 7 %; the limit of four of them holds in 99.99 % of seeds.
     for rate, samples in ((10.0, 20), (40.0, 80)):
-        params = aircraft_parameters(rate=rate, step=0.005, sensors={"drift": [0.2, 0.0, 0.4, 0.0]}).sensor_arrays()
-        ends = np.array([walk(samples, initial_drift(params), params._replace(seed=seed)).value for seed in range(400)])
+        params = aircraft_parameters(
+            rate=rate, step=0.005, sensors={"drift": [0.2, 0.0, 0.4, 0.0]}
+        ).sensor_arrays()
+        ends = np.array(
+            [
+                walk(samples, initial_drift(params), params._replace(seed=seed)).value
+                for seed in range(400)
+            ]
+        )
         variance = np.mean(ends**2, axis=0)
         assert variance[[0, 2]] == pytest.approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
         assert (variance[[1, 3]] == 0.0).all()
 
 
-# Flights of osprey_servo. With aircraft and controller both at 100 Hz a dropped sample is a missed tick. The expected figures
-# are those of the prototype of the gains: softened sign, width 3 (lag + 1.5 dt).
+# Flights of osprey_servo. With aircraft and controller both at 100 Hz a dropped sample is a missed
+# tick. The expected figures are those of the prototype of the gains: softened sign, width 3 (lag +
+# 1.5 dt).
 
 
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
     slow, controller = {"rate": 100.0}, {"delay": 0.0, "softening": 3.0}
-    return PROTOTYPE_SERVO.vary(aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller)
+    return PROTOTYPE_SERVO.vary(
+        aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller
+    )
 
 
 def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:
@@ -157,13 +192,21 @@ def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:
 
 
 def test_truth_holds_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
-    faults = {"bias": [0.01, 0.5, 0.0, -0.01], "drift": [1e-3, 0.0, 1e-3, 1e-3], "quantisation": [1e-3, 0.0, 1e-3, 5e-4]}
+    faults = {
+        "bias": [0.01, 0.5, 0.0, -0.01],
+        "drift": [1e-3, 0.0, 1e-3, 1e-3],
+        "quantisation": [1e-3, 0.0, 1e-3, 5e-4],
+    }
     tape = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
     y, truth = tape["y"], tape["truth"]
     at = np.searchsorted(truth.stamp_ns, y.stamp_ns)
     for name in y.names:
-        assert y[name] == pytest.approx(truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15)
-    assert np.mean(truth["noise.V"]) == pytest.approx(0.5, abs=0.01)  # the bias; the noise is 0.03 over 200 samples
+        assert y[name] == pytest.approx(
+            truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15
+        )
+    assert np.mean(truth["noise.V"]) == pytest.approx(
+        0.5, abs=0.01
+    )  # the bias; the noise is 0.03 over 200 samples
     assert y["q"] / 1e-3 == pytest.approx(np.round(y["q"] / 1e-3), abs=1e-9)
     again = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
     assert again["truth"].values.tobytes() == truth.values.tobytes()

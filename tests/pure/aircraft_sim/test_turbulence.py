@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence against the published spectra: lengths, intensities, filters, ensemble statistics, repeatability."""
+"""Dryden turbulence against the published spectra: lengths, intensities, filters, ensemble
+statistics, repeatability.
+"""
 
 import math
 from typing import Any
@@ -23,21 +25,29 @@ pytestmark = pytest.mark.slow
 
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
-SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))  # about 60 ft above the ground in 15 kt
+SMALL = Dryden(
+    np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8])
+)  # about 60 ft above the ground in 15 kt
 ALL = (0, 1, 2)
 TURBULENCE = {"altitude": 30.0, "wind": 7.7}
 
 
 def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega = omega / V0."""
+    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega
+    = omega / V0.
+    """
     L, sigma, space = model.length[axis], model.sigma[axis], omega / V0
     if axis == 0:
         return np.asarray(sigma**2 * 2.0 * L / np.pi / (1.0 + (L * space) ** 2) / V0)
-    return np.asarray(sigma**2 * L / np.pi * (1.0 + 3.0 * (L * space) ** 2) / (1.0 + (L * space) ** 2) ** 2 / V0)
+    return np.asarray(
+        sigma**2 * L / np.pi * (1.0 + 3.0 * (L * space) ** 2) / (1.0 + (L * space) ** 2) ** 2 / V0
+    )
 
 
 def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """Dryden's correlation at a distance d = V0 lag: sigma^2 exp(-d/L) along the flight, (1 - d/2L) times that across it."""
+    """Dryden's correlation at a distance d = V0 lag: sigma^2 exp(-d/L) along the flight, (1 - d/2L)
+    times that across it.
+    """
     d = V0 * np.abs(lag) / model.length[axis]
     return np.asarray(model.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))
 
@@ -57,15 +67,26 @@ def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
 @pytest.mark.parametrize(
     ("feet", "wind", "sigma", "lengths", "intensities"),
     [
-        # c = 0.177 + 0.000823 h. At 1000 ft c = 1, and all lengths are 1000 ft, all intensities W_20 / 10.
+        # c = 0.177 + 0.000823 h. At 1000 ft c = 1, and all lengths are 1000 ft, all intensities
+        # W_20 / 10.
         (1000.0, 15.0, 0.0, (1000.0, 1000.0, 1000.0), (1.5, 1.5, 1.5)),
-        (100.0, 15.0, 0.0, (100.0 / 0.2593**1.2, 100.0 / 0.2593**1.2, 100.0), (1.5 / 0.2593**0.4, 1.5 / 0.2593**0.4, 1.5)),
+        (
+            100.0,
+            15.0,
+            0.0,
+            (100.0 / 0.2593**1.2, 100.0 / 0.2593**1.2, 100.0),
+            (1.5 / 0.2593**0.4, 1.5 / 0.2593**0.4, 1.5),
+        ),
         (2000.0, 0.0, 5.0, (1750.0,) * 3, (5.0,) * 3),
         (1500.0, 15.0, 5.0, (1375.0,) * 3, (3.25,) * 3),  # in the middle
     ],
 )
 def test_lengths_and_intensities_are_those_published(
-    feet: float, wind: float, sigma: float, lengths: tuple[float, ...], intensities: tuple[float, ...]
+    feet: float,
+    wind: float,
+    sigma: float,
+    lengths: tuple[float, ...],
+    intensities: tuple[float, ...],
 ) -> None:
     found = dryden(feet * FEET, wind * KNOTS, sigma * KNOTS)
     assert found.length == pytest.approx(np.array(lengths) * FEET)
@@ -90,13 +111,15 @@ def test_the_filters_have_the_published_spectra(axis: int) -> None:
     for omega in np.logspace(-2, 2, 9):
         response = output[axis] @ np.linalg.solve(1j * omega * np.eye(5) - F, G)
         # White noise of unit intensity has the one-sided spectrum 1/pi.
-        assert np.sum(np.abs(response) ** 2) / np.pi == pytest.approx(float(spectrum(omega, axis, SMALL)), rel=1e-12)
+        assert np.sum(np.abs(response) ** 2) / np.pi == pytest.approx(
+            float(spectrum(omega, axis, SMALL)), rel=1e-12
+        )
 
 
 @given(dt=st.floats(1e-6, 10.0), altitude=st.floats(3.048, 600.0))
 def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
-    # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows: at h = 5 the covariance has
-    # lost four digits of sixteen, so the comparison ends there.
+    # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows:
+    # at h = 5 the covariance has lost four digits of sixteen, so the comparison ends there.
     model = dryden(altitude, 7.7, 1.5)
     params = filters(model, V0, dt, ALL, 1)
     transition, added = params.transition, params.spread @ params.spread.T
@@ -111,10 +134,13 @@ def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
 def test_published_correlations_are_integrals_of_published_spectra(axis: int) -> None:
-    # The ensemble tests below use both: sigma^2 and the correlation are integrals of the spectrum over omega.
+    # The ensemble tests below use both: sigma^2 and the correlation are integrals of the spectrum
+    # over omega.
     for lag in (0.0, 0.3, 2.0):
         weight: dict[str, Any] = {"weight": "cos", "wvar": lag} if lag else {}
-        total = quad(lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight)[0]
+        total = quad(
+            lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight
+        )[0]
         assert total == pytest.approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
 
 
@@ -123,16 +149,26 @@ SEEDS, STEPS = 300, 1024
 
 @pytest.mark.equation("Assumption 2")
 def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> None:
-    # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they are proportional to dt: 2
-    # sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The difference quotient grows without limit.
+    # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they
+    # are proportional to dt: 2 sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The
+    # difference quotient grows without limit.
     for axis, slope in enumerate((2.0, 3.0, 3.0)):
         for dt in (1e-3, 1e-4, 1e-5):
-            increment = 2.0 * (correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL))
+            increment = 2.0 * (
+                correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL)
+            )
             expected = slope * SMALL.sigma[axis] ** 2 * dt * V0 / SMALL.length[axis]
             assert float(increment) == pytest.approx(expected, rel=2e-3)
     fine = ensemble(SMALL, 1e-3, 100, 64)
-    mean = np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2)) / SMALL.sigma**2 * SMALL.length / (1e-3 * V0)
-    assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 nearly independent increments: 1.8 % standard deviation
+    mean = (
+        np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2))
+        / SMALL.sigma**2
+        * SMALL.length
+        / (1e-3 * V0)
+    )
+    assert mean == pytest.approx(
+        [2.0, 3.0, 3.0], rel=0.1
+    )  # 6300 nearly independent increments: 1.8 % standard deviation
 
 
 def test_numbers_of_step_k_do_not_depend_on_range() -> None:

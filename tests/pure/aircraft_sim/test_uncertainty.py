@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft of Monte Carlo campaigns: distribution around the published airframe, repeatability by seed."""
+"""Uncertain aircraft of Monte Carlo campaigns: distribution around the published airframe,
+repeatability by seed.
+"""
 
 from pathlib import Path
 
@@ -9,7 +11,13 @@ import pytest
 from scipy.stats import kstest
 
 from aircraft_sim.airframe import LIBRARY, load_airframe
-from aircraft_sim.uncertainty import Spread, as_yaml, gust_directions, nominal_and_sampled, sample_airframe
+from aircraft_sim.uncertainty import (
+    Spread,
+    as_yaml,
+    gust_directions,
+    nominal_and_sampled,
+    sample_airframe,
+)
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.slow
@@ -23,18 +31,23 @@ def relative_change(sampled: FloatArray, published: FloatArray) -> FloatArray:
 
 
 def test_entries_are_uniform_and_independent() -> None:
-    # 2000 samples of A[q, q] are uniform on +-0.3. The Kolmogorov-Smirnov test rejects one seed in a hundred.
+    # 2000 samples of A[q, q] are uniform on +-0.3. The Kolmogorov-Smirnov test rejects one seed in
+    # a hundred.
     A, B = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3)
     q = OSPREY.index("q")
     d = A[1:, q, q] / A[0, q, q] - 1.0
     assert kstest(d, "uniform", args=(-0.3, 0.6)).pvalue > 0.01
     others = (A[1:, q, 1] / A[0, q, 1] - 1.0, B[1:, q, 0] / B[0, q, 0] - 1.0)
-    for entry in others:  # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of them
+    # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of
+    # them
+    for entry in others:
         assert abs(np.corrcoef(d, entry)[0, 1]) < 0.09
 
 
 def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
-    """2000 samples: the standard deviation is known to 1/sqrt(4000) = 1.6 %, the limit is four of these."""
+    """2000 samples: the standard deviation is known to 1/sqrt(4000) = 1.6 %, the limit is four of
+    these.
+    """
     A, _ = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3, spread=Spread(distribution="normal"))
     q = OSPREY.index("q")
     d = A[1:, q, q] / A[0, q, q] - 1.0
@@ -59,28 +72,45 @@ def test_sampled_airframe_keeps_zeros_angles_and_everything_but_and_b() -> None:
 
 
 def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
-    # An aircraft with alpha = w / V0, beta = v / V0 or V = u has no velocity relative to steady air of that wind: A x and the
-    # effect of the wind cancel. The airframe file rounds its effect of wind to two or three digits: 3e-3 at most.
+    # An aircraft with alpha = w / V0, beta = v / V0 or V = u has no velocity relative to steady air
+    # of that wind: A x and the effect of the wind cancel. The airframe file rounds its effect of
+    # wind to two or three digits: 3e-3 at most.
     sampled = sample_airframe(OSPREY, 0.5, 0.0, seed=7)
     A, effect = sampled.matrix_a(), sampled.matrix_gusts()
-    for axis, state, drift in (("vertical", "alpha", 1.0 / 25.0), ("lateral", "beta", 1.0 / 25.0), ("longitudinal", "V", 1.0)):
-        by_state, by_wind = A[:, OSPREY.index(state)] * drift, effect[:, list(OSPREY.gusts).index(axis)]
+    for axis, state, drift in (
+        ("vertical", "alpha", 1.0 / 25.0),
+        ("lateral", "beta", 1.0 / 25.0),
+        ("longitudinal", "V", 1.0),
+    ):
+        by_state, by_wind = (
+            A[:, OSPREY.index(state)] * drift,
+            effect[:, list(OSPREY.gusts).index(axis)],
+        )
         assert by_wind == pytest.approx(-by_state, rel=5e-3, abs=0.0), axis
         published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
-        assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis  # what it would feel otherwise
+        assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), (
+            axis
+        )  # what it would feel otherwise
 
 
 def test_effect_of_wind_of_published_airframe_is_published_one_to_last_bit() -> None:
     for wind in ("air_relative", "published"):
-        assert (gust_directions(OSPREY, OSPREY.matrix_a()[None], wind)[0] == OSPREY.matrix_gusts()).all()
-        assert (sample_airframe(OSPREY, 0.0, 0.3, seed=7, wind=wind).matrix_gusts() == OSPREY.matrix_gusts()).all()
+        assert (
+            gust_directions(OSPREY, OSPREY.matrix_a()[None], wind)[0] == OSPREY.matrix_gusts()
+        ).all()
+        assert (
+            sample_airframe(OSPREY, 0.0, 0.3, seed=7, wind=wind).matrix_gusts()
+            == OSPREY.matrix_gusts()
+        ).all()
 
 
 def test_a_seed_determines_the_aircraft() -> None:
     sampled, again, other = (sample_airframe(OSPREY, 0.3, 0.3, seed) for seed in (7, 7, 8))
     assert sampled == again != other
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    assert sampled.matrix_a() == pytest.approx(A[1], rel=1e-15)  # rounding of the conversion to the file's units
+    assert sampled.matrix_a() == pytest.approx(
+        A[1], rel=1e-15
+    )  # rounding of the conversion to the file's units
     assert sampled.matrix_b() == pytest.approx(B[1], rel=1e-15)
 
 

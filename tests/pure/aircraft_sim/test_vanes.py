@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vanes: what they read, icing and loss, the filter with them, what a still vane leaves, flights, refusals."""
+"""Vanes: what they read, icing and loss, the filter with them, what a still vane leaves, flights,
+refusals.
+"""
 
 from functools import cache
 from typing import Any
@@ -13,7 +15,13 @@ from tests.builders import aircraft_parameters, rms, truth_of
 from aircraft_sim import vanes
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
-from control_laws.observer_design import Names, Weights, aircraft_correction, aircraft_model, vane_correction
+from control_laws.observer_design import (
+    Names,
+    Weights,
+    aircraft_correction,
+    aircraft_model,
+    vane_correction,
+)
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -29,7 +37,9 @@ from rise_di_controller.observer import VaneObserverState, correct, without_froz
 
 SHIPPED = find_scenario("osprey_vanes")
 SHORT = SHIPPED.vary(
-    flight={"duration": 12.0}, aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    flight={"duration": 12.0},
+    aircraft={"rate": 100.0, "step": 0.005},
+    reference_model={"rate": 100.0},
 )  # y at the rate of the law: a third of the time of the shipped one
 
 
@@ -48,24 +58,39 @@ def frozen() -> tuple[Scenario, Tape]:
 
 
 def test_vane_reads_angle_relative_to_air() -> None:
-    # AIR_STATE of docs/interfaces.md: alpha less the wind down over V0, beta less the wind to the right over V0.
-    gusts = {"vertical": {"start": 0.0, "speed": 5.0, "length": 5.0}, "lateral": {"start": 0.0, "speed": -3.0, "length": 8.0}}
+    # AIR_STATE of docs/interfaces.md: alpha less the wind down over V0, beta less the wind to the
+    # right over V0.
+    gusts = {
+        "vertical": {"start": 0.0, "speed": 5.0, "length": 5.0},
+        "lateral": {"start": 0.0, "speed": -3.0, "length": 8.0},
+    }
     turbulent = {"altitude": 100.0, "wind": 7.7}
-    found = aircraft_parameters(vanes={"channels": ["beta", "alpha"]}, gusts=gusts, turbulence=turbulent)
+    found = aircraft_parameters(
+        vanes={"channels": ["beta", "alpha"]}, gusts=gusts, turbulence=turbulent
+    )
     simulator = Simulator(found)
     assert simulator.outputs == ("q", "V", "p", "r", "beta", "alpha")
     speed = load_airframe("osprey").speed
     for number in range(30):
         (sample,) = simulator.sample(number, np.array([0.02, 0.0, 0.01, 0.0]))
         true = truth_of(simulator)
-        air = [true["x.beta"] - true["gust.lateral"] / speed, true["x.alpha"] - true["gust.vertical"] / speed]
+        air = [
+            true["x.beta"] - true["gust.lateral"] / speed,
+            true["x.alpha"] - true["gust.vertical"] / speed,
+        ]
         np.testing.assert_allclose(sample.value[4:], air, atol=1e-15)
 
 
 def test_vane_of_jsbsim_reads_its_air_angles() -> None:
     simulator = Simulator(
         SHORT.aircraft.validate_mapping(
-            {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 1000.0, "rate": 50.0, "step": 0.01}
+            {
+                "airframe": "jsbsim:c172p",
+                "speed": 50.0,
+                "altitude": 1000.0,
+                "rate": 50.0,
+                "step": 0.01,
+            }
             | {"vanes": {"channels": ["alpha"]}},
             "aircraft",
         )
@@ -94,7 +119,11 @@ def test_a_vane_freezes_in_flight() -> None:
     simulator = Simulator(found)
     u = np.array([0.05, 0.0, 0.0, 0.0])
     read = [simulator.sample(number, u)[0].value[4] for number in range(20)]
-    simulator.retune(found.validate_mapping(found.model_dump() | {"vanes": {"channels": ["alpha"], "frozen_at": [0.2]}}, ""))
+    simulator.retune(
+        found.validate_mapping(
+            found.model_dump() | {"vanes": {"channels": ["alpha"], "frozen_at": [0.2]}}, ""
+        )
+    )
     after = [simulator.sample(number, u)[0].value[4] for number in range(20, 30)]
     assert read[-1] != read[-2]
     assert set(after) == {read[-1]}
@@ -106,38 +135,64 @@ def test_a_vane_freezes_in_flight() -> None:
 def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
     controller, airframe = SHIPPED.rise_di(), load_airframe("osprey")
     model = model_for(airframe, controller, np.array([0.0017, 0.0017, 0.0017, 0.03]))
-    names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
+    names = Names(
+        tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts)
+    )
     T = model.total_lag
     weights = Weights(T, 0.4 * T, np.full(3, 0.5), np.full(3, 4.0), np.array([0.01]))
     sampled = aircraft_model(model, names, weights.wind_time)
-    row = np.array([1.0 * (name == "x.alpha") - 0.04 * (name == "wind.vertical") for name in sampled.states])
+    row = np.array(
+        [1.0 * (name == "x.alpha") - 0.04 * (name == "wind.vertical") for name in sampled.states]
+    )
     found = vane_correction(sampled, model, (weights, weights), row, 0.0035)
     L = np.column_stack([aircraft_correction(sampled, model, weights), np.zeros(len(row))]) + found
     # the same filter by scipy
     H, noise = np.vstack([sampled.H, row]), np.diag(np.append(model.noise, 0.0035) ** 2)
-    size = [weights.loose * model.size, np.full(4, 1e-6), weights.gust, weights.drift * (model.C @ model.size)]
-    S = solve_discrete_are(sampled.Phi.T, H.T, np.diag(np.concatenate(size) ** 2 * model.period), noise)
-    np.testing.assert_allclose(L, S @ H.T @ np.linalg.inv(H @ S @ H.T + noise), rtol=1e-6, atol=1e-9)
+    size = [
+        weights.loose * model.size,
+        np.full(4, 1e-6),
+        weights.gust,
+        weights.drift * (model.C @ model.size),
+    ]
+    S = solve_discrete_are(
+        sampled.Phi.T, H.T, np.diag(np.concatenate(size) ** 2 * model.period), noise
+    )
+    np.testing.assert_allclose(
+        L, S @ H.T @ np.linalg.inv(H @ S @ H.T + noise), rtol=1e-6, atol=1e-9
+    )
 
 
 def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
     params = SHIPPED.controller.tuned_law().params
     assert params.vanes is not None
     s, generator = len(params.Phi), np.random.default_rng(1)
-    z, e, reading = generator.standard_normal(s), generator.standard_normal(4), np.array([0.1, -0.2])
+    z, e, reading = (
+        generator.standard_normal(s),
+        generator.standard_normal(4),
+        np.array([0.1, -0.2]),
+    )
     zero = np.zeros(4)
     measured = Measurements(e, zero, zero, zero, zero, vane=reading, vane_m=np.zeros(2))
     none = np.zeros(2)
 
     def corrected(square: FloatArray, frozen: list[bool]) -> FloatArray:
         state = VaneObserverState(None, z, np.zeros(4), np.zeros(1), reading, square, none)
-        return np.asarray(correct(state, measured, np.float64(0.01), without_frozen(params, frozen)).z)
+        return np.asarray(
+            correct(state, measured, np.float64(0.01), without_frozen(params, frozen)).z
+        )
 
     alone = z + params.L @ (e - params.H @ z)
-    np.testing.assert_array_equal(corrected(none, [False, False]), corrected(np.ones(2), [True, True]))
+    np.testing.assert_array_equal(
+        corrected(none, [False, False]), corrected(np.ones(2), [True, True])
+    )
     np.testing.assert_allclose(corrected(none, [False, False]), alone, rtol=1e-12)
     one = np.append(e - params.H @ z, (reading - params.vanes.H @ z)[1])
-    np.testing.assert_allclose(corrected(np.ones(2), [True, False]), alone + params.vanes.L[1] @ one, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        corrected(np.ones(2), [True, False]),
+        alone + params.vanes.L[1] @ one,
+        rtol=1e-12,
+        atol=1e-12,
+    )
 
 
 # Flights
@@ -146,7 +201,8 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
 def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
     tape = simulate(SHORT)
     alone = rms(simulate(SHORT.vary(controller=SHORT.controller.without_vanes().model_dump())))
-    # measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in docs/evidence/tables/laws-vanes.csv
+    # measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in
+    # docs/evidence/tables/laws-vanes.csv
     assert rms(tape)[0] < 0.9 * alone[0]
     replayed = replay(tape)
     assert replayed.equal()
@@ -175,7 +231,10 @@ def test_frozen_vane_is_left_out_and_told() -> None:
             {"aircraft": {"vanes": {}, "sensors": {}}},
             "controller.observer.vanes.channels: found alpha, beta, expected",
         ),
-        ({"aircraft": {"vanes": {"channels": ["alpha"], "frozen_at": [1.0, 2.0]}}}, "aircraft.vanes.frozen_at: found 2 values"),
+        (
+            {"aircraft": {"vanes": {"channels": ["alpha"], "frozen_at": [1.0, 2.0]}}},
+            "aircraft.vanes.frozen_at: found 2 values",
+        ),
     ],
 )
 def test_vanes_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: str) -> None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of autopilots: airframe, scenario and map fit together. docs/autopilots-reference.md says how they flew."""
+"""The examples of autopilots: airframe, scenario and map fit together. docs/autopilots-reference.md
+says how they flew.
+"""
 
 from dataclasses import replace
 
@@ -14,12 +16,22 @@ from flight_core.parameters import ParameterError
 from flight_design.identification.sign_check import require_signs
 
 OF_PX4 = ("px4_airplane", "px4_quadrotor")
-EXAMPLES = {"arduplane": "ardupilot"} | {name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4}
-LARGEST = {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2, "vertical_speed": 1.0}  # an aircraft that is lost leaves them at once
+EXAMPLES = {"arduplane": "ardupilot"} | {
+    name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4
+}
+LARGEST = {
+    "q": 0.1,
+    "V": 1.0,
+    "p": 0.2,
+    "r": 0.2,
+    "vertical_speed": 1.0,
+}  # an aircraft that is lost leaves them at once
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(REPOSITORY)  # the path of an airframe counts from the working folder
     scenario = find_scenario(str(REPOSITORY / "examples" / name / "scenario.yaml"), 15.0)
     autopilot = find_autopilot(EXAMPLES[name], dry_run=False)
@@ -28,15 +40,22 @@ def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(name: str,
     tape = simulate(scenario)
     y, y_m = tape["y"], tape["y_m"]
     for output in y.names:
-        assert abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max() < LARGEST[output], output
+        assert (
+            abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max()
+            < LARGEST[output]
+        ), output
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:
     """The bridge would clip u, and the integrals of the law would go on."""
     scenario = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
-    wide = replace(scenario, controller=scenario.controller.model_copy(update={"upper": (0.13, 0.14, 0.13, 0.202)}))
+    wide = replace(
+        scenario,
+        controller=scenario.controller.model_copy(update={"upper": (0.13, 0.14, 0.13, 0.202)}),
+    )
     with pytest.raises(
-        ParameterError, match=r"controller\.upper: found 0\.14, expected at most 0\.13, the upper limit of aileron"
+        ParameterError,
+        match=r"controller\.upper: found 0\.14, expected at most 0\.13, the upper limit of aileron",
     ):
         require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=False), wide)
     require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), wide)
@@ -46,6 +65,9 @@ def test_controller_that_holds_u_while_it_is_inactive_refused_before_flight_that
     """The bridge deactivates it before an engagement, which needs a u near trim."""
     shipped = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
     scenario = shipped.vary(controller={"on_deactivate": "hold"})
-    with pytest.raises(ParameterError, match=r"controller\.on_deactivate: found 'hold', expected 'trim' with a bridge"):
+    with pytest.raises(
+        ParameterError,
+        match=r"controller\.on_deactivate: found 'hold', expected 'trim' with a bridge",
+    ):
         require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=False), scenario)
     require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), scenario)

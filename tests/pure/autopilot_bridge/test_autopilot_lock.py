@@ -19,7 +19,9 @@ class Sequence:
         self.lock = AutopilotLock(nanoseconds(SILENCE))
 
     def takes(self, now: float, since_boot: float | None, address: str = FIRST) -> bool:
-        """Take a message where the lock lets it pass. Returns whether the autopilot is another one, or has started again."""
+        """Take a message where the lock lets it pass. Returns whether the autopilot is another one,
+        or has started again.
+        """
         message = address, None if since_boot is None else nanoseconds(since_boot), nanoseconds(now)
         self.lock.check(*message)
         return self.lock.refresh(*message)
@@ -38,7 +40,9 @@ def test_first_address_is_taken_until_it_is_silent_then_the_next_one() -> None:
     assert sequence.refuses(12.9, 7.9, SECOND) == (
         f"a second sender, {SECOND}, sends as the autopilot: {FIRST} was first and is taken alone"
     )
-    assert not sequence.takes(13.0, None)  # a message without the time since boot counts for the address
+    assert not sequence.takes(
+        13.0, None
+    )  # a message without the time since boot counts for the address
     sequence.refuses(16.0, None, SECOND)
     assert sequence.takes(16.001, 80.0, SECOND)  # with a clock of its own
     sequence.refuses(16.1, 11.1, FIRST)
@@ -55,19 +59,26 @@ def test_late_messages_of_one_clock_are_taken() -> None:
 
 @pytest.mark.parametrize("drift", [-1e-3, 1e-3])
 def test_clock_that_drifts_stays_that_of_the_autopilot(drift: float) -> None:
-    """A crystal drifts by less than 1e-4. In an hour 1e-3 is 3.6 s, beyond the tolerance of a jump."""
+    """A crystal drifts by less than 1e-4. In an hour 1e-3 is 3.6 s, beyond the tolerance of a
+    jump.
+    """
     sequence = Sequence()
     sequence.takes(0.0, 100.0)
-    assert not any(sequence.takes(now, 100.0 + (1.0 + drift) * now) for now in map(float, range(1, 3600)))
+    assert not any(
+        sequence.takes(now, 100.0 + (1.0 + drift) * now) for now in map(float, range(1, 3600))
+    )
 
 
 @pytest.mark.parametrize("since_boot", [0.0, 3.9, 7.2, 400.0])
 def test_another_clock_at_the_address_is_refused(since_boot: float) -> None:
-    """Behind by more than the tolerance of 1 s, or ahead by more than it: the next one is due at 6.1 s."""
+    """Behind by more than the tolerance of 1 s, or ahead by more than it: the next one is due at
+    6.1 s.
+    """
     sequence = Sequence()
     sequence.takes(10.0, 5.0)
     assert sequence.refuses(11.1, since_boot) == (
-        f"the time since boot from {FIRST} jumps: a second autopilot sends there, or it has started again"
+        f"the time since boot from {FIRST} jumps: a second autopilot sends there, or it has "
+        "started again"
     )
     assert not sequence.takes(11.2, 6.2)
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give the time."""
+"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give
+the time.
+"""
 
 import signal
 import time
@@ -34,7 +36,9 @@ def at(t: float) -> int:
     return nanoseconds(1000.0 + t)
 
 
-def receive_outputs(bridge: Bridge, t: float, names: tuple[str, ...] = OUTPUTS, raw: float = 0.0) -> None:
+def receive_outputs(
+    bridge: Bridge, t: float, names: tuple[str, ...] = OUTPUTS, raw: float = 0.0
+) -> None:
     for name in names:
         bridge.take_output(name, raw, at(t), at(t))
 
@@ -55,7 +59,9 @@ def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) 
     return Bridge(channel_map, dry_run=dry_run)
 
 
-def ready_bridge(u: float = 0.0, *, channel_map: ChannelMap = CHANNEL_MAP, dry_run: bool = False) -> Bridge:
+def ready_bridge(
+    u: float = 0.0, *, channel_map: ChannelMap = CHANNEL_MAP, dry_run: bool = False
+) -> Bridge:
     """A bridge that has received y and u at t = 0."""
     bridge = new_bridge(channel_map, dry_run=dry_run)
     receive_outputs(bridge, 0.0)
@@ -77,7 +83,10 @@ def with_silence(neutral: float, release: float) -> ChannelMap:
 
 def test_only_service_engages_and_only_with_fresh_y_and_u() -> None:
     bridge = new_bridge()
-    for reason, receive in (("q, p, r not received yet", receive_outputs), ("u not received yet", receive_u)):
+    for reason, receive in (
+        ("q, p, r not received yet", receive_outputs),
+        ("u not received yet", receive_u),
+    ):
         assert reason in bridge.engage(at(0.0))
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
         receive(bridge, 0.0)
@@ -120,7 +129,9 @@ def test_u_stays_inside_its_limits_around_trim() -> None:
     for u, limit in ((9.0, "upper"), (-9.0, "lower")):
         receive_u(bridge, 0.01, u)
         rows = CHANNEL_MAP.inputs.values()
-        assert bridge.raw() == pytest.approx([to_raw(row.trim + getattr(row, limit), row.line) for row in rows])
+        assert bridge.raw() == pytest.approx(
+            [to_raw(row.trim + getattr(row, limit), row.line) for row in rows]
+        )
 
 
 def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
@@ -179,7 +190,10 @@ def test_times_of_zero_skip_neutral_and_release_values() -> None:
 def test_conflicting_publisher_of_u_refused_until_first_one_times_out() -> None:
     bridge = new_bridge()
     receive_u(bridge, 0.0)
-    with pytest.raises(ChannelError, match="conflicting publisher second ignored: already receiving from controller"):
+    with pytest.raises(
+        ChannelError,
+        match="conflicting publisher second ignored: already receiving from controller",
+    ):
         receive_u(bridge, 0.1, sender="second")
     receive_u(bridge, 0.3, sender="second")
 
@@ -236,7 +250,9 @@ def test_y_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh()
 def test_held_channel_of_vane_is_repeated_and_ends_no_y() -> None:
     content = CHANNEL_MAP.model_dump()
     vane = content["outputs"]["q"] | {"held": True, "field": "twist.linear.y"}
-    channel_map = ChannelMap.validate_mapping(content | {"outputs": content["outputs"] | {"alpha": vane}}, "map")
+    channel_map = ChannelMap.validate_mapping(
+        content | {"outputs": content["outputs"] | {"alpha": vane}}, "map"
+    )
     bridge = new_bridge(channel_map)
     receive_outputs(bridge, 0.0)
     assert bridge.y(at(0.0)) is None  # never received
@@ -257,7 +273,9 @@ def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -
         receive_outputs(bridge, t, raw=1.0)
         sample = bridge.y(at(t))
         assert sample is not None
-        step = np.abs(sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]])  # the row of q has sign -1, that of p no filter
+        step = np.abs(
+            sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]]
+        )  # the row of q has sign -1, that of p no filter
         assert step == pytest.approx([1.0 - np.exp(-t / 0.05), 1.0])
 
 
@@ -270,7 +288,11 @@ def test_stamps_of_autopilot_bounded_both_ways(name: str) -> None:
         for offset in (-10.0, -1.01 * limit, -0.99 * limit, 0.0, 0.99 * limit, 1.01 * limit, 10.0):
             side = "before" if offset < 0.0 else "after"
             expected = f"{key} is stamped {abs(offset):.3f} s {side} now"
-            with nullcontext() if abs(offset) <= limit else pytest.raises(ChannelError, match=expected):
+            with (
+                nullcontext()
+                if abs(offset) <= limit
+                else pytest.raises(ChannelError, match=expected)
+            ):
                 bridge.take_output(key, 0.0, at(offset), at(0.0))
 
 
@@ -286,7 +308,11 @@ def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-PX4_STATUS = {"armed": 2.0, "offboard": 4.0, "transmitter": 1.0}  # armed, in Hold, with a transmitter
+PX4_STATUS = {
+    "armed": 2.0,
+    "offboard": 4.0,
+    "transmitter": 1.0,
+}  # armed, in Hold, with a transmitter
 
 
 def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
@@ -328,7 +354,9 @@ def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: s
 
 def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
     bridge = px4_bridge()
-    assert sent(bridge, 0.0) == set()  # no heartbeat before the request: without it PX4 leaves offboard
+    assert (
+        sent(bridge, 0.0) == set()
+    )  # no heartbeat before the request: without it PX4 leaves offboard
     assert bridge.engage(at(0.0)) == ""
     assert bridge.phase is Phase.ENGAGING
     assert bridge.reason == "the mode is not offboard (nav_state is 4)"
@@ -356,7 +384,10 @@ def test_engagement_without_awaited_mode_ends_after_time_with_reason() -> None:
 
 def test_engagement_refused_with_sentence_of_condition() -> None:
     bridge = new_bridge(unlimited("px4"))
-    refused = "armed: arming_state not received yet (/fmu/out/vehicle_status_v1); transmitter: valid not received yet"
+    refused = (
+        "armed: arming_state not received yet (/fmu/out/vehicle_status_v1); transmitter: "
+        "valid not received yet"
+    )
     assert bridge.engage(at(0.0)).startswith(refused)
     bridge = px4_bridge(armed=1.0)
     assert bridge.engage(at(0.0)) == "the aircraft is not armed (arming_state is 1)"
@@ -370,7 +401,9 @@ def test_engagement_refused_with_sentence_of_condition() -> None:
         ({"offboard": 5.0}, "the mode is not offboard (nav_state is 5)"),
     ],
 )
-def test_lost_condition_ends_engagement_with_sentence(status: dict[str, float], reason: str) -> None:
+def test_lost_condition_ends_engagement_with_sentence(
+    status: dict[str, float], reason: str
+) -> None:
     bridge = px4_bridge(offboard=14.0)
     assert bridge.engage(at(0.0)) == ""
     assert bridge.phase is Phase.ENGAGED
@@ -391,7 +424,9 @@ def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
 
 
 def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
-    """Fresh inputs ten times a second, and the phase at the end. A status of NaN is not received."""
+    """Fresh inputs ten times a second, and the phase at the end. A status of NaN is not
+    received.
+    """
     for t in np.arange(begin, end, 0.1).tolist():
         receive_outputs(bridge, t, tuple(bridge.outputs), 20.0)
         receive_u(bridge, t)
@@ -424,16 +459,21 @@ def test_blind_engagement_ignores_the_transmitter() -> None:
     assert bridge.engage(at(0.0), blind=True) == ""
     assert fly(bridge, 0.05, 3.0, transmitter=0.0) is Phase.ENGAGED
     assert bridge.reason.endswith(
-        "the loss of the transmitter is not watched (--blind), and the override by pilot has no effect then; "
-        "released by a lost condition (armed, offboard), rise-di engage --off"
+        "the loss of the transmitter is not watched (--blind), and the override by pilot has no "
+        "effect then; released by a lost condition (armed, offboard), rise-di engage --off"
     )
     bridge.disengage("disengaged by request", at(3.0))
-    assert bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"  # blind for one engagement
+    assert (
+        bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"
+    )  # blind for one engagement
 
 
 def test_unwatched_transmitter_needs_a_bound() -> None:
     bridge = ready_bridge(channel_map=CHANNEL_MAP.model_copy(update={"max_engaged": None}))
-    refusal = "the loss of the transmitter cannot be seen over this link: set max_engaged in the map, or engage with --blind"
+    refusal = (
+        "the loss of the transmitter cannot be seen over this link: set max_engaged in "
+        "the map, or engage with --blind"
+    )
     assert bridge.engage(at(0.0)) == refusal
     assert bridge.engage(at(0.0), blind=True) == ""
     assert bridge.phase is Phase.ENGAGED
@@ -495,9 +535,13 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
     bridge = ardupilot_bridge()
     assert bridge.engage(at(0.0)) == ""
     for name in STICKS:
-        receive_outputs(bridge, 0.05, (trim_key(name),), 1900.0)  # while overridden, ArduPilot reports what it is sent
+        receive_outputs(
+            bridge, 0.05, (trim_key(name),), 1900.0
+        )  # while overridden, ArduPilot reports what it is sent
     assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
-    assert [bridge.trim(name) for name in STICKS] == pytest.approx([-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6)
+    assert [bridge.trim(name) for name in STICKS] == pytest.approx(
+        [-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -508,7 +552,9 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
         ("flying", 0.0, "the aircraft does not fly (flying is 0)"),
     ],
 )
-def test_ardupilot_engaged_in_manual_armed_and_flying_alone(condition: str, raw: float, sentence: str) -> None:
+def test_ardupilot_engaged_in_manual_armed_and_flying_alone(
+    condition: str, raw: float, sentence: str
+) -> None:
     bridge = ardupilot_bridge()
     bridge.take_condition(condition, raw, at(0.0))
     assert bridge.engage(at(0.0)) == sentence
@@ -521,8 +567,12 @@ def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
 
 
 def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Bridge:
-    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL; the parameter RC_OVERRIDE_TIME in s."""
-    bridge = new_bridge(unlimited("ardupilot_mavlink").model_copy(update={"max_engaged": max_engaged}))
+    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL; the parameter
+    RC_OVERRIDE_TIME in s.
+    """
+    bridge = new_bridge(
+        unlimited("ardupilot_mavlink").model_copy(update={"max_engaged": max_engaged})
+    )
     bridge.take_parameter("RC_OVERRIDE_TIME", override_time)
     receive_mavlink(bridge, 0.0)
     for name, us in STICKS.items():
@@ -531,7 +581,9 @@ def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Br
 
 
 def receive_mavlink(bridge: Bridge, t: float) -> None:
-    """y, u and the conditions of the map of ArduPilot over MAVLink, in MANUAL, armed and in the air."""
+    """y, u and the conditions of the map of ArduPilot over MAVLink, in MANUAL, armed and in the
+    air.
+    """
     receive_outputs(bridge, t, tuple(bridge.outputs))
     receive_u(bridge, t)
     for name, raw in {"manual": 0.0, "armed": 128.0, "flying": 2.0}.items():
@@ -566,8 +618,13 @@ def stop(bridge: Bridge, how: str) -> None:
     bridge.step(at(0.25))
 
 
-@pytest.mark.parametrize("how", ["y ends", "u ends", "conditions end", "another publisher", "max_engaged", "bridge shut down"])
-def test_release_that_no_pilot_requested_asks_for_a_mode_that_flies_until_the_mode_changes(how: str) -> None:
+@pytest.mark.parametrize(
+    "how",
+    ["y ends", "u ends", "conditions end", "another publisher", "max_engaged", "bridge shut down"],
+)
+def test_release_that_no_pilot_requested_asks_for_a_mode_that_flies_until_the_mode_changes(
+    how: str,
+) -> None:
     bridge = engaged_mavlink_bridge(1.0 if how == "max_engaged" else 120.0)
     stop(bridge, how)
     assert bridge.phase is Phase.RELEASE, bridge.reason
@@ -584,7 +641,11 @@ def test_release_by_the_pilot_leaves_the_mode(how: str) -> None:
     elif how == "request":
         bridge.disengage("disengaged by request", at(0.1), by_pilot=True)
     else:
-        name, raw = {"mode": ("manual", 2.0), "disarmed": ("armed", 0.0), "landed": ("flying", 1.0)}[how]
+        name, raw = {
+            "mode": ("manual", 2.0),
+            "disarmed": ("armed", 0.0),
+            "landed": ("flying", 1.0),
+        }[how]
         bridge.take_condition(name, raw, at(0.1))
     assert bridge.step(at(0.1)) is Phase.RELEASE
     assert sent(bridge, 0.1) == {"override"}
@@ -599,7 +660,9 @@ def test_pilot_who_takes_over_during_a_release_keeps_the_mode() -> None:
 
 
 def with_failsafe() -> Bridge:
-    """A bridge with the map of PX4 whose request for Hold is not sent after a release by the pilot."""
+    """A bridge with the map of PX4 whose request for Hold is not sent after a release by the
+    pilot.
+    """
     content = unlimited("px4").model_dump()
     content["messages"]["leave"]["when"] = "failsafe"
     return new_bridge(ChannelMap.validate_mapping(content, "map"))
@@ -622,7 +685,9 @@ def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_
 
 
 def test_lost_transmitter_asks_for_the_mode() -> None:
-    """A condition that does not hold is a choice of the pilot or the autopilot, but for the loss of the transmitter."""
+    """A condition that does not hold is a choice of the pilot or the autopilot, but for the loss of
+    the transmitter.
+    """
     bridge = with_failsafe()
     refresh(bridge, 0.0, offboard=14.0)
     assert bridge.engage(at(0.0)) == ""
@@ -631,13 +696,21 @@ def test_lost_transmitter_asks_for_the_mode() -> None:
     assert sent(bridge, 0.1) == {"leave"}
 
 
-OVERRIDE_TIME = "where the link is cut the last u stands so long, and 0.5 s is enough: param set RC_OVERRIDE_TIME 0.5"
+OVERRIDE_TIME = (
+    "where the link is cut the last u stands so long, and 0.5 s is enough: param "
+    "set RC_OVERRIDE_TIME 0.5"
+)
 
 
-@pytest.mark.parametrize("seconds", [-1.0, 0.0, 3.0])  # without end, no overrides, ArduPilot's default
+@pytest.mark.parametrize(
+    "seconds", [-1.0, 0.0, 3.0]
+)  # without end, no overrides, ArduPilot's default
 def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
     bridge = mavlink_bridge(seconds)
-    assert bridge.engage(at(0.0)) == f"RC_OVERRIDE_TIME is {seconds:g}, expected 0.2 to 1: {OVERRIDE_TIME}"
+    assert (
+        bridge.engage(at(0.0))
+        == f"RC_OVERRIDE_TIME is {seconds:g}, expected 0.2 to 1: {OVERRIDE_TIME}"
+    )
     bridge.take_parameter("RC_OVERRIDE_TIME", 0.5)
     assert bridge.engage(at(0.0)) == ""
     bridge.take_parameter("RC_OVERRIDE_TIME", seconds)
@@ -647,11 +720,13 @@ def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
 def test_engagement_without_an_answer_about_a_parameter_is_refused() -> None:
     bridge = mavlink_bridge()
     bridge._parameters.clear()
-    unknown = "RC_OVERRIDE_TIME not received yet: the autopilot does not answer, or has no such parameter"
+    unknown = (
+        "RC_OVERRIDE_TIME not received yet: the autopilot does not answer, or has no such parameter"
+    )
     assert bridge.engage(at(0.0)) == unknown
 
 
-def test_problem_of_the_link_refuses_an_engagement_is_said_while_engaged_and_stands_beside_what_ends_it() -> None:
+def test_problem_of_the_link_refuses_an_engagement_and_stands_beside_what_ends_it() -> None:
     bridge = mavlink_bridge()
     bridge.problem = "ATTITUDE comes at 4 Hz"
     assert bridge.engage(at(0.0)) == "ATTITUDE comes at 4 Hz"
@@ -669,12 +744,19 @@ def test_engagement_needs_sources_of_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))
     receive_u(bridge, 0.6)
-    assert bridge.engage(at(0.6)).startswith("trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s")
+    assert bridge.engage(at(0.6)).startswith(
+        "trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s"
+    )
 
 
 def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
-    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})  # 90 % of throttle, upper limit 30 % above
-    assert bridge.engage(at(0.0)) == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
+    bridge = ardupilot_bridge(
+        sticks=STICKS | {"thrust": 1900.0}
+    )  # 90 % of throttle, upper limit 30 % above
+    assert (
+        bridge.engage(at(0.0))
+        == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
+    )
 
 
 def test_u_that_times_out_sends_captured_trim_where_map_says_so() -> None:
@@ -707,7 +789,11 @@ def test_override_by_switch_in_bit_field_counts_own_bit_since_engagement() -> No
     content = CHANNEL_MAP.model_dump()
     content["overrides"]["gamepad"] |= {"above": None, "moved": 0.5, "bits": 4}
     row = ChannelMap.validate_mapping(content, "map").overrides["gamepad"]
-    assert [row.is_active(raw, at_engagement=5.0) for raw in (5.0, 6.0, 1.0)] == [False, False, True]
+    assert [row.is_active(raw, at_engagement=5.0) for raw in (5.0, 6.0, 1.0)] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_override_whose_topic_has_ended_does_not_block_engagement() -> None:
@@ -724,7 +810,9 @@ ENVELOPE = {"phi": [-0.8, 0.8], "theta": [-0.4, 0.5], "V": [-5.0, 8.0]}
 
 def enveloped_bridge() -> Bridge:
     """An engaged bridge with ENVELOPE in level flight at trim speed."""
-    bridge = new_bridge(ChannelMap.validate_mapping(CHANNEL_MAP.model_dump() | {"envelope": ENVELOPE}, "map"))
+    bridge = new_bridge(
+        ChannelMap.validate_mapping(CHANNEL_MAP.model_dump() | {"envelope": ENVELOPE}, "map")
+    )
     receive_u(bridge, 0.0)
     receive_outputs(bridge, 0.0)
     assert bridge.engage(at(0.0)) == "phi, theta not received yet (/ap/pose/filtered)"
@@ -735,8 +823,12 @@ def enveloped_bridge() -> Bridge:
     return bridge
 
 
-@pytest.mark.parametrize(("name", "raw", "channel"), [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)])
-def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float, channel: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "raw", "channel"), [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)]
+)
+def test_leaving_envelope_releases_channels_with_sentence(
+    name: str, raw: float, channel: float
+) -> None:
     bridge = enveloped_bridge()
     inside = {"phi": -0.79, "theta": -0.49, "V": 32.9}
     receive_outputs(bridge, 0.02, (name,), inside[name])
@@ -748,7 +840,10 @@ def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float,
 
 
 def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
-    content = CHANNEL_MAP.model_dump() | {"envelope": {"climb": [-8.0, 8.0]}, "engage_if": {"climb": [-2.0, 2.0]}}
+    content = CHANNEL_MAP.model_dump() | {
+        "envelope": {"climb": [-8.0, 8.0]},
+        "engage_if": {"climb": [-2.0, 2.0]},
+    }
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
     receive_u(bridge, 0.0)
     receive_outputs(bridge, 0.0, (*OUTPUTS, "climb"), raw=2.1)
@@ -757,7 +852,9 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     assert bridge.engage(at(0.01)) == ""
     receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
     assert bridge.step(at(0.02)) is Phase.ENGAGED
-    receive_outputs(bridge, 0.03, ("climb",), raw=-8.4)  # the sink of ArduPlane with a jammed elevator
+    receive_outputs(
+        bridge, 0.03, ("climb",), raw=-8.4
+    )  # the sink of ArduPlane with a jammed elevator
     assert bridge.step(at(0.03)) is Phase.RELEASE
     assert bridge.reason == "climb is -8.4, outside the envelope [-8, 8]"
 
@@ -768,7 +865,10 @@ def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not
         content["inputs"][name]["at_limit"] = 0.1
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
     assert bridge.engage(at(0.0)) == ""
-    lower, upper = (np.array([content["inputs"][name][key] for name in content["inputs"]]) for key in ("lower", "upper"))
+    lower, upper = (
+        np.array([content["inputs"][name][key] for name in content["inputs"]])
+        for key in ("lower", "upper")
+    )
 
     def fly(t: float, u: FloatArray) -> Phase:
         receive_outputs(bridge, t)
@@ -822,7 +922,11 @@ def test_pose_has_fresh_channels_and_stamp_of_first_row() -> None:
     receive_outputs(bridge, 0.01, ("phi",), 0.2)
     names, pose = bridge.pose(at(0.02)) or ((), None)
     assert pose is not None
-    assert dict(zip(names, pose.value.tolist(), strict=True)) == {"phi": 0.2, "theta": -0.1, "climb": 0.1}
+    assert dict(zip(names, pose.value.tolist(), strict=True)) == {
+        "phi": 0.2,
+        "theta": -0.1,
+        "climb": 0.1,
+    }
     assert pose.stamp_ns == at(0.01)
     assert bridge.pose(at(0.03)) is None  # each is published once
     receive_outputs(bridge, 0.3, ("phi",))
@@ -837,10 +941,16 @@ def followed(
     engaged_for: float = np.inf,
     begins: bool = False,
 ) -> str:
-    """The outcome of a flight of osprey_gust, 60 s, with an autopilot or else with an aircraft that begins it."""
+    """The outcome of a flight of osprey_gust, 60 s, with an autopilot or else with an aircraft that
+    begins it.
+    """
     scenario = find_scenario("osprey_gust")
     span = _Span(scenario, processes, monitor, begins=begins)
-    return last(_follow_real_time(scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span))
+    return last(
+        _follow_real_time(
+            scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -857,35 +967,60 @@ def followed(
 def test_flight_ends_once_log_holds_it(
     begins: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A log that stops is waited for for 5 s. With an autopilot (not `begins`) u may end, or never begin."""
+    """A log that stops is waited for for 5 s. With an autopilot (not `begins`) u may end, or never
+    begin.
+    """
     now = [0.0]
 
     def sleep(period: float) -> None:
         now[0] += period
 
-    monkeypatch.setattr("flight_bringup.fly.time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    monkeypatch.setattr(
+        "flight_bringup.fly.time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep)
+    )
 
     def recorded() -> float | None:
         return None if until is None else 1000.0 + min(now[0], until)
 
     processes = SimpleNamespace(
-        learner_ended=str, started=0.0, start_time=1000.0, ended_early=lambda: None, is_flying=lambda: True
+        learner_ended=str,
+        started=0.0,
+        start_time=1000.0,
+        ended_early=lambda: None,
+        is_flying=lambda: True,
     )
     monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=recorded)
-    assert followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins) == outcome
+    assert (
+        followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins)
+        == outcome
+    )
     assert now[0] == pytest.approx(end, abs=0.1)
 
 
 def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:
-    reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
-    waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
+    reasons = [
+        "would refuse: u not received yet",
+        "u is 0.30 s old",
+        "u is 0.41 s old",
+        "not engaged yet",
+        "not engaged yet",
+    ]
+    waiting, announced = (
+        [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")],
+        list[str](),
+    )
     processes = SimpleNamespace(
         learner_ended=str,
         start_time=1000.0,
         started=time.monotonic(),
         ended_early=lambda: None if waiting else "the end",
     )
-    monitor = SimpleNamespace(learned=list, engagement=lambda: [waiting.pop(0)], newest=lambda: None, recorded=lambda: None)
+    monitor = SimpleNamespace(
+        learned=list,
+        engagement=lambda: [waiting.pop(0)],
+        newest=lambda: None,
+        recorded=lambda: None,
+    )
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert followed(*nodes, announce=announced.append) == "the end"
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
@@ -893,8 +1028,15 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
 
 def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
-    processes = SimpleNamespace(learner_ended=str, start_time=1000.0, started=time.monotonic() - 0.3, ended_early=lambda: None)
-    monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=lambda: None)
+    processes = SimpleNamespace(
+        learner_ended=str,
+        start_time=1000.0,
+        started=time.monotonic() - 0.3,
+        ended_early=lambda: None,
+    )
+    monitor = SimpleNamespace(
+        learned=list, engagement=list, newest=lambda: None, recorded=lambda: None
+    )
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert followed(*nodes, engaged_for=59.8) == "not engaged within 0.2 s"
 
@@ -902,9 +1044,14 @@ def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
 def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(["", "", "the end"])
     processes = SimpleNamespace(
-        learner_ended=str, start_time=1000.0, started=time.monotonic(), ended_early=lambda: next(calls) or None
+        learner_ended=str,
+        start_time=1000.0,
+        started=time.monotonic(),
+        ended_early=lambda: next(calls) or None,
     )
-    monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=lambda: None)
+    monitor = SimpleNamespace(
+        learned=list, engagement=list, newest=lambda: None, recorded=lambda: None
+    )
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     later = time.time() + 3600.0
     monkeypatch.setattr(time, "time", lambda: later)
@@ -912,7 +1059,9 @@ def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatc
 
 
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
-    """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its nodes without end."""
+    """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its
+    nodes without end.
+    """
     before, clean = signal.getsignal(signal.SIGINT), False
     with suppress(KeyboardInterrupt), handle_signals(interrupt):
         try:

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channel maps: each row of each map against hand-worked values, the conversion, and the refusals of invalid maps.
+"""Channel maps: each row of each map against hand-worked values, the conversion, and the refusals
+of invalid maps.
 
-Plain objects with the published fields (tests/published_messages.py) replace the messages, because px4_msgs may not be
-installed. Tests with real messages: tests/nodes/autopilot_bridge/test_bridge.py and test_published_messages.py.
+Plain objects with the published fields (tests/published_messages.py) replace the messages, because
+px4_msgs may not be installed. Tests with real messages: tests/nodes/autopilot_bridge/test_bridge.py
+and test_published_messages.py.
 """
 
 import json
@@ -53,17 +55,41 @@ RATES = {
     "px4": Message(angular_velocity=FRD),
 }
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
-    "ardupilot": Message(true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "ardupilot": Message(
+        true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)
+    ),  # 9 (2, 2, 1), of length 27
     "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
     "ardupilot_mavlink": Message(airspeed=27.0),
     "odometry": Message(twist=Message(twist=Message(linear=Message(x=-18.0, y=18.0, z=-9.0)))),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
 }
-SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
-    "ardupilot": {"axes[1]": 0.1 / 0.523599, "axes[2]": 0.2, "axes[0]": 0.1 / 0.523599, "axes[3]": 0.1 / 0.523599},
-    "px4": {"torque.xyz[1]": 0.1 / 0.523599, "thrust.xyz[0]": 0.6, "torque.xyz[0]": 0.1 / 0.523599, "torque.xyz[2]": 0.190986},
-    "ardupilot_mavlink": {"chan2_raw": 1595.493, "chan3_raw": 1600.0, "chan1_raw": 1595.493, "chan4_raw": 1595.493},
-    "odometry": {"elevator.data": 0.1, "thrust.data": 12.0, "aileron.data": 0.1, "rudder.data": 0.1},  # 12 of 20 N
+# elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to
+# the right
+SENT = {
+    "ardupilot": {
+        "axes[1]": 0.1 / 0.523599,
+        "axes[2]": 0.2,
+        "axes[0]": 0.1 / 0.523599,
+        "axes[3]": 0.1 / 0.523599,
+    },
+    "px4": {
+        "torque.xyz[1]": 0.1 / 0.523599,
+        "thrust.xyz[0]": 0.6,
+        "torque.xyz[0]": 0.1 / 0.523599,
+        "torque.xyz[2]": 0.190986,
+    },
+    "ardupilot_mavlink": {
+        "chan2_raw": 1595.493,
+        "chan3_raw": 1600.0,
+        "chan1_raw": 1595.493,
+        "chan4_raw": 1595.493,
+    },
+    "odometry": {
+        "elevator.data": 0.1,
+        "thrust.data": 12.0,
+        "aileron.data": 0.1,
+        "rudder.data": 0.1,
+    },  # 12 of 20 N
 }
 SENT["ardupilot_2024"] = SENT["ardupilot"]
 
@@ -74,19 +100,27 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
     row = named_map(name).outputs[channel]
     message = AIRSPEED[name] if channel == "V" else RATES[name]
     value = to_channel(read_raw(message, row.field, row.function), row.line)
-    assert value == pytest.approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32 in a message of PX4
+    assert value == pytest.approx(
+        2.0 if channel == "V" else MOTION[channel], abs=1e-6
+    )  # float32 in a message of PX4
 
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
-    for (path, expected), row in zip(SENT[name].items(), named_map(name).inputs.values(), strict=True):
+    for (path, expected), row in zip(
+        SENT[name].items(), named_map(name).inputs.values(), strict=True
+    ):
         assert path in (row.field, f"{row.message}.{row.field}")
-        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # the fields in us are integers
+        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(
+            expected, abs=1e-3
+        )  # the fields in us are integers
 
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> None:
-    """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to half a unit."""
+    """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to
+    half a unit.
+    """
     channel_map = named_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
     messages = {key: blank(kind_) for key, kind_ in foreign.items()}
@@ -97,19 +131,33 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
             assert path in PUBLISHED[row.type]
         assert not row.stamped or "header" in PUBLISHED[row.type]
     for channel, input_row in channel_map.inputs.items():
-        message, kind_ = messages[f"messages.{input_row.message}"], channel_map.messages[input_row.message].type
+        message, kind_ = (
+            messages[f"messages.{input_row.message}"],
+            channel_map.messages[input_row.message].type,
+        )
         ((field, place), *_) = STEP.findall(input_row.field)
         element, length, is_array, _ = kind(PUBLISHED[kind_][field])
         assert is_array, channel
         assert int(place) < (length or 0), channel
-        for raw in (*input_row.range, input_row.neutral, input_row.release, to_raw(input_row.trim + 0.123, input_row.line)):
+        for raw in (
+            *input_row.range,
+            input_row.neutral,
+            input_row.release,
+            to_raw(input_row.trim + 0.123, input_row.line),
+        ):
             if not isinstance(raw, float):  # trim, or nothing to be sent
                 continue
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
-            assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
-    readers: dict[str, MeasuredRow | OverrideRow] = {"outputs." + channel: row for channel, row in channel_map.outputs.items()}
-    readers |= {"pose." + angle: row for angle, row in channel_map.pose.items() if row.function == "value"}
+            assert get_field(message, input_row.field) == pytest.approx(
+                raw, rel=0.0, abs=error, nan_ok=True
+            )
+    readers: dict[str, MeasuredRow | OverrideRow] = {
+        "outputs." + channel: row for channel, row in channel_map.outputs.items()
+    }
+    readers |= {
+        "pose." + angle: row for angle, row in channel_map.pose.items() if row.function == "value"
+    }
     readers |= {"overrides." + channel: row for channel, row in channel_map.overrides.items()}
     for key, reader in readers.items():
         if key in messages:
@@ -122,7 +170,9 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
 def test_each_input_of_map_states_own_trim_and_sign(name: str) -> None:
     """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
     inputs = MAP_FILES[name].read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
-    assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [len(named_map(name).inputs)]
+    assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [
+        len(named_map(name).inputs)
+    ]
 
 
 MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8.0-dev in SITL
@@ -134,7 +184,13 @@ MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8
         "HEARTBEAT": 5.0,
         "EXTENDED_SYS_STATE": 2.0,
     },
-    "ardupilot": {"imu/experimental/data": 139.0, "airspeed": 28.4, "pose/filtered": 28.4, "rc": 9.6, "status": 1.9},
+    "ardupilot": {
+        "imu/experimental/data": 139.0,
+        "airspeed": 28.4,
+        "pose/filtered": 28.4,
+        "rc": 9.6,
+        "status": 1.9,
+    },
 }
 
 
@@ -143,33 +199,50 @@ def test_lost_message_does_not_end_engagement(name: str) -> None:
     """Each age limit is longer than two periods at the measured rate."""
     channel_map = named_map(name)
     rows = (*channel_map.outputs.values(), *channel_map.pose.values(), *channel_map.trims.values())
-    ages = [(row.topic, row.max_age) for row in rows] + [(row.topic, row.max_age) for row in channel_map.conditions.values()]
+    ages = [(row.topic, row.max_age) for row in rows] + [
+        (row.topic, row.max_age) for row in channel_map.conditions.values()
+    ]
     for topic, rate in MEASURED[name].items():
         found = [
-            age for full, age in ages if full.removeprefix("/fmu/out/").removeprefix("/ap/").removeprefix("mavlink/") == topic
+            age
+            for full, age in ages
+            if full.removeprefix("/fmu/out/").removeprefix("/ap/").removeprefix("mavlink/") == topic
         ]
         assert found, topic
         assert min(found) > 2.0 / rate, topic
 
 
 def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> None:
-    """By definitions as a release publishes them. "2" has another topic for the status, and no true airspeed."""
+    """By definitions as a release publishes them. "2" has another topic for the status, and no true
+    airspeed.
+    """
     versions = {"1": {"VehicleStatus": 1}, "2": {"VehicleStatus": 4}}
     for release, of_release in versions.items():
         messages = tmp_path / release / "msg"
         messages.mkdir(parents=True)
-        (messages.parent / "package.xml").write_text("<package><name>px4_msgs</name></package>", encoding="utf-8")
+        (messages.parent / "package.xml").write_text(
+            "<package><name>px4_msgs</name></package>", encoding="utf-8"
+        )
         for type_name, fields in PUBLISHED.items():
             if type_name.startswith("px4_msgs/"):
                 name = type_name.rpartition("/")[2]
-                lines = [f"uint32 MESSAGE_VERSION = {of_release.get(name, 0)}", "uint8 ARMING_STATE_ARMED = 2"]
-                lines += [f"{of} {field}" for field, of in fields.items() if (release, field) != ("2", "true_airspeed_m_s")]
+                lines = [
+                    f"uint32 MESSAGE_VERSION = {of_release.get(name, 0)}",
+                    "uint8 ARMING_STATE_ARMED = 2",
+                ]
+                lines += [
+                    f"{of} {field}"
+                    for field, of in fields.items()
+                    if (release, field) != ("2", "true_airspeed_m_s")
+                ]
                 (messages / f"{name}.msg").write_text("\n".join(lines), encoding="utf-8")
     options = [word for release in versions for word in ("--definitions", str(tmp_path / release))]
     result = CliRunner().invoke(application(["check"]), ["check", "px4", *options, "--json"])
     assert result.exit_code == 1
     status = "/fmu/out/vehicle_status_v1: version 4, whose topic is /fmu/out/vehicle_status_v4"
-    found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
+    found = {
+        row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])
+    }
     assert found == {
         "outputs.V": ["", "no true_airspeed_m_s"],
         "conditions.armed": ["", status],
@@ -178,13 +251,19 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
     alone = CliRunner().invoke(application(["check"]), ["check", "px4", *options[:2]])
     assert alone.exit_code == 0
     assert "1: 24 of 24 rows hold" in alone.output
-    refused = CliRunner().invoke(application(["check"]), ["check", "px4", "--definitions", str(tmp_path / "1" / "msg")])
+    refused = CliRunner().invoke(
+        application(["check"]), ["check", "px4", "--definitions", str(tmp_path / "1" / "msg")]
+    )
     assert "expected a folder with the sources of a message package" in str(refused.exception)
 
 
-def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(installation, "find_spec", lambda name: None)
-    result = CliRunner().invoke(application(["check"]), ["check", "ardupilot_mavlink", "--definitions", "installed"])
+    result = CliRunner().invoke(
+        application(["check"]), ["check", "ardupilot_mavlink", "--definitions", "installed"]
+    )
     assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
 
 
@@ -196,25 +275,35 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pyt
         ("north", {"field": "pose.pose.position"}, "pose.pose.position: no number"),
     ],
 )
-def test_check_map_finds_field_that_row_cannot_use(key: str, change: dict[str, str], fault: str, tmp_path: Path) -> None:
+def test_check_map_finds_field_that_row_cannot_use(
+    key: str, change: dict[str, str], fault: str, tmp_path: Path
+) -> None:
     content = yaml.safe_load(MAP_FILES["odometry"].read_text(encoding="utf-8"))
     content["pose"][key] |= change
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     result = CliRunner().invoke(
-        application(["check"]), ["check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json"]
+        application(["check"]),
+        ["check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json"],
     )
-    found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
+    found = {
+        row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])
+    }
     assert found == {f"pose.{key}": [fault]}
 
 
 def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_path: Path) -> None:
     """The fields of the answer, below the line ---, do not count."""
-    (tmp_path / "package.xml").write_text("<package><name>ardupilot_msgs</name></package>", encoding="utf-8")
+    (tmp_path / "package.xml").write_text(
+        "<package><name>ardupilot_msgs</name></package>", encoding="utf-8"
+    )
     for section in ("msg", "srv"):
         (tmp_path / section).mkdir()
     service = tmp_path / "srv" / "ModeSwitch.srv"
     channel_map = named_map("ardupilot")
-    for text, fault in (("uint8 mode\n---\nbool status", ""), ("uint8 number\n---\nuint8 mode", "no mode")):
+    for text, fault in (
+        ("uint8 mode\n---\nbool status", ""),
+        ("uint8 number\n---\nuint8 mode", "no mode"),
+    ):
         service.write_text(text, encoding="utf-8")
         kinds = [kind for _, _, kind in channel_map.used_topics()]
         rows = check_map(channel_map, [definitions_below(tmp_path, kinds)])
@@ -224,40 +313,61 @@ def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_pa
 def test_service_is_requested_and_does_not_fly() -> None:
     """Its answer takes a round trip: setpoints and heartbeats are messages."""
     content = named_map("ardupilot").model_dump()
-    assert [name for name, row in named_map("ardupilot").messages.items() if row.is_service] == ["mode_after"]
+    assert [name for name, row in named_map("ardupilot").messages.items() if row.is_service] == [
+        "mode_after"
+    ]
     content["messages"]["mode_after"]["when"] = "heartbeat"
-    with pytest.raises(ParameterError, match=r"messages\.mode_after\.type: found the service ardupilot_msgs/srv/ModeSwitch"):
+    with pytest.raises(
+        ParameterError,
+        match=r"messages\.mode_after\.type: found the service ardupilot_msgs/srv/ModeSwitch",
+    ):
         ChannelMap.validate_mapping(content, "map")
 
 
 shipped = cache(named_map)  # parsed once, not for each example
 ANGLE = st.floats(-math.pi, math.pi)
-TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # x east, y north, z up
+TURN_NED_ENU = Rotation.from_matrix(
+    [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+)  # x east, y north, z up
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
 @pytest.mark.parametrize("name", ["ardupilot", "odometry", "px4"])
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
-def test_attitude_of_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
-    """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP 103)."""
+def test_attitude_of_map_is_that_of_body_frd_in_ned(
+    name: str, phi: float, theta: float, psi: float
+) -> None:
+    """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP
+    103).
+    """
     frd_in_ned, channel_map = Rotation.from_euler("ZYX", [psi, theta, phi]), shipped(name)
-    x, y, z, w = (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD).as_quat().tolist()
+    x, y, z, w = (
+        (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD)
+        .as_quat()
+        .tolist()
+    )
     quaternion = [w, x, y, z] if name == "px4" else Message(w=w, x=x, y=y, z=z)
     bridge = Bridge(channel_map, dry_run=True)
     for channel in ("phi", "theta", "psi"):
-        bridge.take_output(channel, read_raw(Message(q=quaternion), "q", channel_map.pose[channel].function), 1, 1)
+        bridge.take_output(
+            channel, read_raw(Message(q=quaternion), "q", channel_map.pose[channel].function), 1, 1
+        )
     names, pose = bridge.pose(1) or ((), None)
     assert names == ("phi", "theta", "psi")
     assert pose is not None
     expected = np.array([phi, theta, psi])
-    error = np.array([math.remainder(difference, math.tau) for difference in (pose.value - expected).tolist()])
+    error = np.array(
+        [math.remainder(difference, math.tau) for difference in (pose.value - expected).tolist()]
+    )
     assert np.abs(error).max() < 2e-6  # the offset of psi in a map has seven digits
     assert np.abs(pose.value).max() <= math.pi
 
 
-POSES = {  # 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north, 3 m/s east, climbing at 2 m/s
+# 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north, 3 m/s east, climbing at 2 m/s
+POSES = {
     "ardupilot": Message(
-        pose=Message(position=Message(x=30.0, y=40.0, z=20.0)), twist=Message(linear=Message(x=3.0, y=4.0, z=2.0))
+        pose=Message(position=Message(x=30.0, y=40.0, z=20.0)),
+        twist=Message(linear=Message(x=3.0, y=4.0, z=2.0)),
     ),
     "px4": Message(position=[40.0, 30.0, -20.0], velocity=[4.0, 3.0, -2.0]),
 }
@@ -266,15 +376,26 @@ POSES = {  # 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north,
 @pytest.mark.parametrize("name", POSES)
 def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
     rows = named_map(name).pose
-    expected = {"north": 40.0, "east": 30.0, "altitude": 20.0, "v_north": 4.0, "v_east": 3.0, "climb": 2.0}
+    expected = {
+        "north": 40.0,
+        "east": 30.0,
+        "altitude": 20.0,
+        "v_north": 4.0,
+        "v_east": 3.0,
+        "climb": 2.0,
+    }
     for channel, value in expected.items():
         row = rows[channel]
         assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == value
 
 
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
-def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(phi: float, theta: float, psi: float) -> None:
-    """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103). SciPy turns 4 m/s north, 3 east, 2 up into it."""
+def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(
+    phi: float, theta: float, psi: float
+) -> None:
+    """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103). SciPy turns 4 m/s north, 3
+    east, 2 up into it.
+    """
     flu_in_enu = TURN_NED_ENU * Rotation.from_euler("ZYX", [psi, theta, phi]) * TURN_FLU_FRD
     x, y, z, w = (2.0 * flu_in_enu.as_quat()).tolist()  # a quaternion of any length
     forward, left, up = flu_in_enu.inv().apply([3.0, 4.0, 2.0]).tolist()
@@ -305,11 +426,15 @@ def test_sending_value_and_reading_it_back_gives_value(line: Line, channel: floa
 @given(st.floats(0.0, 300.0))
 def test_speed_of_dynamic_pressure_is_one_that_makes_it(speed: float) -> None:
     message = Message(fluid_pressure=0.5 * 1.225 * speed**2)
-    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(speed, abs=1e-6)
+    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(
+        speed, abs=1e-6
+    )
 
 
 def test_fields_are_reached_by_their_paths() -> None:
-    message = Message(twist=Message(angular=Message(y=1.5)), axes=[0.0, 2.5], parts=[Message(z=3.5)])
+    message = Message(
+        twist=Message(angular=Message(y=1.5)), axes=[0.0, 2.5], parts=[Message(z=3.5)]
+    )
     assert get_field(message, "twist.angular.y") == 1.5
     assert get_field(message, "axes[1]") == 2.5
     set_field(message, "parts[0].z", 4.5)
@@ -337,7 +462,10 @@ def test_value_that_is_not_finite_refused(raw: float) -> None:
 
 
 def test_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> None:
-    expected = r"absent_msgs/msg/State: .*make messages PACKAGE=absent_msgs SOURCE=FOLDER .*ros-jazzy-absent-msgs"
+    expected = (
+        r"absent_msgs/msg/State: .*make messages PACKAGE=absent_msgs SOURCE=FOLDER "
+        r".*ros-jazzy-absent-msgs"
+    )
     with pytest.raises(ParameterError, match=expected):
         message_type("absent_msgs/msg/State")
 
@@ -347,20 +475,44 @@ ROW = load_map("ardupilot").pose["phi"].model_dump()
 REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     (("outputs", "q", "sign"), 2, r"map test\.outputs\.q\.sign: found 2, expected 1 or -1|-1 or 1"),
     (("outputs", "q", "type"), "TwistStamped", r"map test\.outputs\.q\.type"),
-    (("inputs", "elevator", "field"), "axes[0]", r"map test\.inputs\.aileron\.field: found axes\[0\], that of elevator"),
+    (
+        ("inputs", "elevator", "field"),
+        "axes[0]",
+        r"map test\.inputs\.aileron\.field: found axes\[0\], that of elevator",
+    ),
     (("inputs", "elevator", "lower"), 0.1, r"map test\.inputs\.elevator\.lower: found 0\.1"),
-    (("messages", "joy", "when"), "heartbeat", r"map test\.inputs\.elevator\.message: found one sent when heartbeat"),
-    (("overrides", "gamepad", "moved"), 0.1, r"map test\.overrides\.gamepad: found above and moved"),
+    (
+        ("messages", "joy", "when"),
+        "heartbeat",
+        r"map test\.inputs\.elevator\.message: found one sent when heartbeat",
+    ),
+    (
+        ("overrides", "gamepad", "moved"),
+        0.1,
+        r"map test\.overrides\.gamepad: found above and moved",
+    ),
     (("topics", "/ap/joy", "depth"), 0, r"map test\.topics\./ap/joy\.depth"),
-    (("envelope",), {"beta": [-0.1, 0.1]}, r"map test\.envelope\.beta: found a channel, expected one of .* phi, .*, r"),
-    (("outputs", "phi"), ROW | {"positive": "roll right"}, r"map test\.outputs\.phi: found a channel of the pose too"),
+    (
+        ("envelope",),
+        {"beta": [-0.1, 0.1]},
+        r"map test\.envelope\.beta: found a channel, expected one of .* phi, .*, r",
+    ),
+    (
+        ("outputs", "phi"),
+        ROW | {"positive": "roll right"},
+        r"map test\.outputs\.phi: found a channel of the pose too",
+    ),
 )
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "sentence"), REFUSALS, ids=lambda argument: ".".join(argument) if isinstance(argument, tuple) else ""
+    ("place", "value", "sentence"),
+    REFUSALS,
+    ids=lambda argument: ".".join(argument) if isinstance(argument, tuple) else "",
 )
-def test_bad_map_is_one_sentence_that_names_row(place: tuple[str, ...], value: object, sentence: str) -> None:
+def test_bad_map_is_one_sentence_that_names_row(
+    place: tuple[str, ...], value: object, sentence: str
+) -> None:
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
     part = content
     for key in place[:-1]:
@@ -373,7 +525,10 @@ def test_bad_map_is_one_sentence_that_names_row(place: tuple[str, ...], value: o
 
 
 def test_a_missing_map_is_one_sentence() -> None:
-    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_mavlink, px4, or the path of a channel map"
+    sentence = (
+        r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_mavlink, "
+        r"px4, or the path of a channel map"
+    )
     with pytest.raises(ParameterError, match=sentence):
         BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):

@@ -30,12 +30,20 @@ PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
 class Peer:
     """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
 
-    def __init__(self, port: int, system: int = 1, phrase: str = "", component: int = 1, kind: str = "udpout") -> None:
+    def __init__(
+        self, port: int, system: int = 1, phrase: str = "", component: int = 1, kind: str = "udpout"
+    ) -> None:
         self.connection: Any = mavutil.mavlink_connection(
-            f"{kind}:127.0.0.1:{port}", source_system=system, source_component=component, dialect="ardupilotmega"
+            f"{kind}:127.0.0.1:{port}",
+            source_system=system,
+            source_component=component,
+            dialect="ardupilotmega",
         )
-        # Of MAVLink 2 from the begin: the parser that pymavlink makes at the first packet of MAVLink 2 has no passphrase.
-        self.connection.mav = mavlink.MAVLink(self.connection, srcSystem=system, srcComponent=component)
+        # Of MAVLink 2 from the begin: the parser that pymavlink makes at the first packet of
+        # MAVLink 2 has no passphrase.
+        self.connection.mav = mavlink.MAVLink(
+            self.connection, srcSystem=system, srcComponent=component
+        )
         self.connection.mav.robust_parsing, self.connection.first_byte = True, False
         if phrase:
             self.connection.setup_signing(hashlib.sha256(phrase.encode()).digest())
@@ -48,7 +56,9 @@ class Peer:
 
     def attitude(self, pitchspeed: float, since_boot: float) -> None:
         """An ATTITUDE, rad/s, with the time since boot, s."""
-        self.connection.mav.attitude_send(round(1e3 * since_boot), 0.0, 0.0, 0.0, 0.0, pitchspeed, 0.0)
+        self.connection.mav.attitude_send(
+            round(1e3 * since_boot), 0.0, 0.0, 0.0, 0.0, pitchspeed, 0.0
+        )
 
     def received(self) -> list[Any]:
         """All that has come and was not taken yet."""
@@ -87,7 +97,9 @@ def ends() -> Iterator[Ends]:
             free.bind(("127.0.0.1", 0))
             port = at or free.getsockname()[1]
         url = f"{kind}:127.0.0.1:{port}"
-        config = LinkConfig(url=url, rates=rates, passphrase_file=passphrase_file, station_silence=STATION_SILENCE)
+        config = LinkConfig(
+            url=url, rates=rates, passphrase_file=passphrase_file, station_silence=STATION_SILENCE
+        )
         links.append(Link(config, parameters))
         return links[-1], port
 
@@ -142,11 +154,16 @@ def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) ->
         mavlink.MAVLINK_MSG_ID_ATTITUDE: pytest.approx(50.0),
         mavlink.MAVLINK_MSG_ID_VFR_HUD: pytest.approx(20.0),
     }
-    assert made.problem() == ("the autopilot denied 50 Hz of ATTITUDE (MAV_RESULT 2): ArduPilot grants 0.8 SCHED_LOOP_RATE")
+    assert made.problem() == (
+        "the autopilot denied 50 Hz of ATTITUDE (MAV_RESULT 2): ArduPilot grants 0.8 "
+        "SCHED_LOOP_RATE"
+    )
     assert made.problem("VFR_HUD") == ""
 
 
-def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others_do_not(ends: Ends) -> None:
+def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others_do_not(
+    ends: Ends,
+) -> None:
     made, port = ends.link()
     queue = made.listen("ATTITUDE")
     made.start()
@@ -170,23 +187,35 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
     peer = ends.peer(port)
     peer.beat()
     message = message_type("RC_CHANNELS_OVERRIDE")()
-    for path, value in {**named_map("ardupilot_mavlink").messages["override"].values, "chan2_raw": 1612.4}.items():
+    for path, value in {
+        **named_map("ardupilot_mavlink").messages["override"].values,
+        "chan2_raw": 1612.4,
+    }.items():
         set_field(message, path, value)
     taken: list[Any] = []
 
     def take() -> None:
         made.send(message)
-        if (received := peer.answer()) is not None and received.get_type() == "RC_CHANNELS_OVERRIDE":
+        if (
+            received := peer.answer()
+        ) is not None and received.get_type() == "RC_CHANNELS_OVERRIDE":
             taken.append(received)
 
     until(lambda: taken, take)
     sent = taken[0]
     assert (sent.get_srcSystem(), sent.target_system, sent.target_component) == (255, 1, 1)
-    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]  # released, set, as is, as is
+    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [
+        0,
+        1612,
+        65535,
+        0,
+    ]  # released, set, as is, as is
 
 
 def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
-    """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of this host."""
+    """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of
+    this host.
+    """
     made, port = ends.link()
     queue = made.listen("ATTITUDE")
     made.start()
@@ -197,7 +226,8 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     until(lambda: made.conflict, autopilot.received)
     locked, foreign = (end.connection.port.getsockname()[1] for end in (autopilot, second))
     assert made.conflict == (
-        f"a second sender, 127.0.0.1:{foreign}, sends as the autopilot: 127.0.0.1:{locked} was first and is taken alone"
+        f"a second sender, 127.0.0.1:{foreign}, sends as the autopilot: 127.0.0.1:{locked} was "
+        "first and is taken alone"
     )
     assert made.conflict in made.problem()
     autopilot.attitude(0.1, since_boot=50.1)
@@ -207,13 +237,19 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
 
     def send() -> None:
         made.send(message_type("RC_CHANNELS_OVERRIDE")())
-        overrides.extend(message for message in autopilot.received() if message.get_type() == "RC_CHANNELS_OVERRIDE")
+        overrides.extend(
+            message
+            for message in autopilot.received()
+            if message.get_type() == "RC_CHANNELS_OVERRIDE"
+        )
 
     until(lambda: len(overrides) >= 5, send)
     assert second.received() == []  # neither overrides nor heartbeats nor requests
 
 
-def test_next_sender_gets_the_messages_once_the_first_one_is_silent(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
     made, port = ends.link(HEARTBEAT=5.0)
     made.start()
@@ -232,7 +268,9 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(ends: Ends, 
     assert first.received() == []
 
 
-def test_conflict_of_second_sender_ends_after_its_last_message(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_conflict_of_second_sender_ends_after_its_last_message(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made, port = ends.link()
     made.start()
     autopilot, second = ends.peer(port), ends.peer(port)
@@ -244,12 +282,20 @@ def test_conflict_of_second_sender_ends_after_its_last_message(ends: Ends, monke
 
 
 def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
-    """Two autopilots with one number behind a router have one address, and times since boot of their own."""
+    """Two autopilots with one number behind a router have one address, and times since boot of
+    their own.
+    """
     made, port = ends.link()
     queue = made.listen("ATTITUDE")
     made.start()
     router = ends.peer(port)
-    for pitchspeed, since_boot in ((0.1, 100.0), (0.9, 40.0), (0.1, 100.1), (0.9, 400.0), (0.1, 100.2)):
+    for pitchspeed, since_boot in (
+        (0.1, 100.0),
+        (0.9, 40.0),
+        (0.1, 100.1),
+        (0.9, 400.0),
+        (0.1, 100.2),
+    ):
         router.attitude(pitchspeed, since_boot)
     until(lambda: len(queue) == 3, router.received)
     assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 3
@@ -257,7 +303,9 @@ def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends
 
 
 def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) -> None:
-    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves, on the link or beside it."""
+    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves,
+    on the link or beside it.
+    """
     made, port = ends.link()
     queue = made.listen("ATTITUDE")
     made.start()
@@ -267,7 +315,9 @@ def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) ->
         routed = mavlink.MAVLink(autopilot.connection, srcSystem=1, srcComponent=component)
         routed.attitude_send(50_000, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
         ends.peer(port, component=component).attitude(0.9, since_boot=50.0)
-    autopilot.attitude(0.1, since_boot=50.1)  # of the packets to one socket the last one is read last
+    autopilot.attitude(
+        0.1, since_boot=50.1
+    )  # of the packets to one socket the last one is read last
     until(lambda: len(queue) == 2, autopilot.received)
     assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
     assert made.conflict == ""
@@ -301,12 +351,22 @@ def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> 
 
 
 @pytest.mark.parametrize("name", ["RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"])
-def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(ends: Ends, name: str) -> None:
+def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(
+    ends: Ends, name: str
+) -> None:
     made, _ = ends.link()
     made._take(
-        received(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3), system=255, component=190), SENDER, 0
+        received(
+            mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3),
+            system=255,
+            component=190,
+        ),
+        SENDER,
+        0,
     )
-    assert made.conflict == ""  # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    assert (
+        made.conflict == ""
+    )  # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
     sticks = {
         "RC_CHANNELS_OVERRIDE": mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
         "MANUAL_CONTROL": mavlink.MAVLink_manual_control_message(1, 0, 0, 0, 0, 0),
@@ -326,7 +386,9 @@ def test_other_bridge_is_conflict(ends: Ends) -> None:
 
 
 def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
-    """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none of the map, has none."""
+    """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none
+    of the map, has none.
+    """
     made, port = ends.link(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
     made.start()
     peer, messages = ends.peer(port), list[Any]()
@@ -335,11 +397,20 @@ def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) 
         peer.beat()
         messages.extend(message for message in [peer.answer()] if message is not None)
 
-    until(lambda: {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"} <= {message.get_type() for message in messages}, take)
+    until(
+        lambda: (
+            {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"}
+            <= {message.get_type() for message in messages}
+        ),
+        take,
+    )
     senders = {(message.get_srcSystem(), message.get_srcComponent()) for message in messages}
     assert senders == {(1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER4)}
     beat = next(message for message in messages if message.get_type() == "HEARTBEAT")
-    assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+    assert (beat.type, beat.autopilot) == (
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        mavlink.MAV_AUTOPILOT_INVALID,
+    )
     made.send(message_type("RC_CHANNELS_OVERRIDE")())
     messages.clear()
     until(lambda: any(message.get_type() == "RC_CHANNELS_OVERRIDE" for message in messages), take)
@@ -347,12 +418,18 @@ def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) 
     assert override.get_srcSystem() == 255
     messages.clear()
     until(lambda: any(message.get_type() == "HEARTBEAT" for message in messages), take)
-    assert {message.get_srcSystem() for message in messages if message.get_type() == "HEARTBEAT"} == {1}  # also after it
+    assert {
+        message.get_srcSystem() for message in messages if message.get_type() == "HEARTBEAT"
+    } == {1}  # also after it
 
 
-def test_parameter_is_read_and_an_autopilot_that_starts_again_is_asked_again(ends: Ends, clock: Clock) -> None:
+def test_parameter_is_read_and_an_autopilot_that_starts_again_is_asked_again(
+    ends: Ends, clock: Clock
+) -> None:
     made, _ = ends.link(parameters=("RC_OVERRIDE_TIME",))
-    value = mavlink.MAVLink_param_value_message(b"RC_OVERRIDE_TIME", 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+    value = mavlink.MAVLink_param_value_message(
+        b"RC_OVERRIDE_TIME", 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
+    )
     made._take(received(value, system=2), SENDER, 0)
     assert made.parameters == {}  # of another autopilot
     made._take(received(value), SENDER, 0)
@@ -362,7 +439,9 @@ def test_parameter_is_read_and_an_autopilot_that_starts_again_is_asked_again(end
     assert made.parameters == {}
 
 
-def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_mend(ends: Ends, clock: Clock) -> None:
+def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_mend(
+    ends: Ends, clock: Clock
+) -> None:
     made, _ = ends.link(ATTITUDE=40.0)
     attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
 
@@ -380,7 +459,9 @@ def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_m
     made._requested = None  # granted
     come(5.0, 4.0)
     rate = "ATTITUDE comes at 4 Hz, requested are 40 Hz"
-    assert made.refusal().startswith(f"{rate}; requested again; a ground station on this link requests rates of its own")
+    assert made.refusal().startswith(
+        f"{rate}; requested again; a ground station on this link requests rates of its own"
+    )
     assert made.refusal().endswith("give the bridge a port of its own")
     assert made.lost() == f"{rate}; for 2 s"
     assert made._to_request == {"ATTITUDE": 40.0}
@@ -419,7 +500,10 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
     clock.now += 60.0
     assert made.lost() == ""  # of another number: the autopilot does not watch it either
     made._take(received(station, system=255, component=190), SENDER, 0)
-    assert "ground station 255: station 255, which is heard, ends the engagement by 5 s of silence" in made.station()
+    assert (
+        "ground station 255: station 255, which is heard, ends the engagement by 5 s of silence"
+        in made.station()
+    )
     clock.now += 4.9
     assert made.lost() == ""
     clock.now += 0.2
@@ -432,12 +516,17 @@ def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: E
     made, port = ends.link()
     made.start()
     station = ends.peer(port, system=254)
-    until(lambda: made.stations, lambda: station.connection.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4))
+    until(
+        lambda: made.stations,
+        lambda: station.connection.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4),
+    )
     assert made.stations == {254}
     assert made.conflict == ""
 
 
-def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(ends: Ends, tmp_path: Path) -> None:
+def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(
+    ends: Ends, tmp_path: Path
+) -> None:
     (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
     made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
     queue = made.listen("HEARTBEAT")
@@ -459,10 +548,15 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(e
     unsigned, port = ends.link()
     unsigned.start()
     until(lambda: unsigned.conflict, ends.peer(port, phrase="a phrase").beat)
-    assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+    assert (
+        unsigned.conflict
+        == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+    )
 
 
-def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphrase(ends: Ends, tmp_path: Path) -> None:
+def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphrase(
+    ends: Ends, tmp_path: Path
+) -> None:
     (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
     made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
     queue = made.listen("HEARTBEAT")
@@ -472,7 +566,10 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
     signing = peer.connection.mav.signing
     signing.timestamp -= 600 * 100_000  # of 10 us each
     until(lambda: made._refused, peer.beat)
-    assert re.match(r"messages with the right passphrase come, signed (59|60)\d s before the last ones", made._refused)
+    assert re.match(
+        r"messages with the right passphrase come, signed (59|60)\d s before the last ones",
+        made._refused,
+    )
     assert "the autopilot has started again without the time" in made._refused
     ends.peer(port, phrase="another").beat()
     until(lambda: "the passphrase differs" in made._refused, ends.peer(port, phrase="another").beat)
@@ -481,7 +578,9 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
 def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
     ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier one has set this variable."""
+    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier
+    one has set this variable.
+    """
     monkeypatch.delenv("MAVLINK20", raising=False)
     (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
     made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
@@ -499,32 +598,51 @@ def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("name", "key"), [("ardupilot", "mode"), ("ardupilot_mavlink", "param2")])
-def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(name: str, key: str) -> None:
-    """The numbers of the modes are those that pymavlink has of ArduPlane, MAV_CMD those of common.xml."""
+def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(
+    name: str, key: str
+) -> None:
+    """The numbers of the modes are those that pymavlink has of ArduPlane, MAV_CMD those of
+    common.xml.
+    """
     row = named_map(name).messages["mode_after"]
     assert row.when == "failsafe"
-    assert row.values[key] == {mode: number for number, mode in mavutil.mode_mapping_apm.items()}["LOITER"]
+    assert (
+        row.values[key]
+        == {mode: number for number, mode in mavutil.mode_mapping_apm.items()}["LOITER"]
+    )
     if name == "ardupilot_mavlink":
         assert row.values["command"] == mavlink.MAV_CMD_DO_SET_MODE
         assert row.values["param1"] == mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
 def test_wrong_map_or_message_is_one_sentence() -> None:
-    with pytest.raises(ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"):
+    with pytest.raises(
+        ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"
+    ):
         message_type("ALTITUD")
     with pytest.raises(ChannelError, match="chan1_raw cannot be 70000"):
         set_field(message_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
     content = named_map("ardupilot_mavlink").model_dump()
     for changes, sentence in (
-        ({"link": None}, "link: found none, expected one, for outputs.q of type mavlink/msg/ATTITUDE"),
+        (
+            {"link": None},
+            "link: found none, expected one, for outputs.q of type mavlink/msg/ATTITUDE",
+        ),
         ({"link": {**content["link"], "url": "serial"}}, "link.url: found 'serial'"),
-        ({"link": {**content["link"], "rates": {"ATTITUD": 40.0}}}, r"link\.rates\.ATTITUD: found a message"),
+        (
+            {"link": {**content["link"], "rates": {"ATTITUD": 40.0}}},
+            r"link\.rates\.ATTITUD: found a message",
+        ),
     ):
         with pytest.raises(ParameterError, match=sentence):
             ChannelMap.validate_mapping(content | changes, "map")
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves its socket open
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # pymavlink leaves its socket open
 def test_address_that_cannot_be_opened_is_one_sentence() -> None:
-    with pytest.raises(ParameterError, match=r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"):
+    with pytest.raises(
+        ParameterError, match=r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"
+    ):
         Link(LinkConfig(url="udpin:192.0.2.1:14550"))  # an address of documentation, RFC 5737

@@ -1,13 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rates of a link's messages: which are slow, requested again, refuse and end an engagement. The tests give the time."""
+"""The rates of a link's messages: which are slow, requested again, refuse and end an engagement.
+The tests give the time.
+"""
 
 import numpy as np
 import pytest
 
 from autopilot_bridge.message_rates import MessageRates
 
-REQUESTED = {"ATTITUDE": 40.0, "EXTENDED_SYS_STATE": 2.0}  # the highest and the lowest rate of the map ardupilot_mavlink
+REQUESTED = {
+    "ATTITUDE": 40.0,
+    "EXTENDED_SYS_STATE": 2.0,
+}  # the highest and the lowest rate of the map ardupilot_mavlink
 
 
 class Stream:
@@ -43,12 +48,16 @@ def test_rates_are_unknown_for_two_seconds_and_then_as_requested() -> None:
     assert (stream.again, stream.rates.slow(60.0), stream.rates.lasting(60.0)) == ([], {}, "")
 
 
-def test_rate_that_a_ground_station_takes_is_named_and_requested_again_and_does_not_end_the_engagement() -> None:
-    """From 40 to 4 Hz the count of 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s. The request mends it."""
+def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagement() -> None:
+    """From 40 to 4 Hz the count of 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s. The
+    request mends it.
+    """
     stream = Stream().run(10.0)
     stream.run(10.8, ATTITUDE=4.0)
     ((instant, requested),) = stream.again
-    assert instant == pytest.approx(10.67, abs=0.15)  # a message of the 4 Hz is 0.25 s, a judgement 0.1 s
+    assert instant == pytest.approx(
+        10.67, abs=0.15
+    )  # a message of the 4 Hz is 0.25 s, a judgement 0.1 s
     assert requested == {"ATTITUDE": 40.0}
     assert stream.rates.slow(10.8) == {"ATTITUDE": "ATTITUDE comes at 4 Hz, requested are 40 Hz"}
     for end in np.arange(10.9, 20.0, 0.1).tolist():
@@ -56,13 +65,19 @@ def test_rate_that_a_ground_station_takes_is_named_and_requested_again_and_does_
     assert len(stream.again) <= 2
     came = {"ATTITUDE": "ATTITUDE came at 4 Hz, requested are 40 Hz, less than 20 s ago"}
     assert stream.rates.slow(20.0) == came
-    assert stream.run(30.0).rates.slow(30.0) == came  # longer than the 15 s after which MAVProxy takes it again
+    assert (
+        stream.run(30.0).rates.slow(30.0) == came
+    )  # longer than the 15 s after which MAVProxy takes it again
     assert stream.run(33.0).rates.slow(33.0) == {}
 
 
 def test_rate_that_stays_low_is_requested_each_second_and_ends_the_engagement() -> None:
     stream = Stream().run(10.0)
-    first = next(end for end in np.arange(10.0, 15.0, 0.05).tolist() if stream.run(end, ATTITUDE=4.0).rates.lasting(end))
+    first = next(
+        end
+        for end in np.arange(10.0, 15.0, 0.05).tolist()
+        if stream.run(end, ATTITUDE=4.0).rates.lasting(end)
+    )
     assert first == pytest.approx(10.67 + 2.0, abs=0.2)
     assert stream.rates.lasting(first) == "ATTITUDE comes at 4 Hz, requested are 40 Hz; for 2 s"
     assert np.diff([instant for instant, _ in stream.again]) == pytest.approx(1.0, abs=0.11)

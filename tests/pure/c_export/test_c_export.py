@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: C code beside the Python controller, bit by bit; mutants of the C code, sanitizers, refusals."""
+"""`rise-di export`: C code beside the Python controller, bit by bit; mutants of the C code,
+sanitizers, refusals.
+"""
 
 import json
 import re
@@ -21,7 +23,14 @@ from tests.conftest import REPOSITORY
 
 from c_export.constants import exportable
 from c_export.drawn import drawn_calls, drawn_steps
-from c_export.events import RETUNE, Recorder, Recording, flight_recordings, parameter_sets, run_recording
+from c_export.events import (
+    RETUNE,
+    Recorder,
+    Recording,
+    flight_recordings,
+    parameter_sets,
+    run_recording,
+)
 from c_export.proof import (
     CODE,
     FLAGS,
@@ -57,7 +66,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 GCC = shutil.which("gcc")
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(GCC is None, reason="no gcc on this machine, which compiles the exported code"),
+    pytest.mark.skipif(
+        GCC is None, reason="no gcc on this machine, which compiles the exported code"
+    ),
 ]
 SCHEDULE = {"schedule": {"speed": 25.0}}
 TWIN = find_scenario("osprey_twin").controller
@@ -65,7 +76,9 @@ PRIORITY = {"allocation": {**TWIN.model_dump()["allocation"], "priority": TWIN.i
 SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "servo": lambda: find_scenario("osprey_servo"),
     "observer": lambda: find_scenario("osprey_observer"),
-    "schedule and allocation": lambda: find_scenario("osprey_twin").vary(controller=SCHEDULE | PRIORITY),
+    "schedule and allocation": lambda: find_scenario("osprey_twin").vary(
+        controller=SCHEDULE | PRIORITY
+    ),
 }
 
 
@@ -78,27 +91,42 @@ class Case(NamedTuple):
 
 
 def export_case(name: str, folder: Path) -> Case:
-    """Short flights at 100 Hz, 1500 drawn calls, and 300 steps with each parameter set; a tenth where Python allocates."""
+    """Short flights at 100 Hz, 1500 drawn calls, and 300 steps with each parameter set; a tenth
+    where Python allocates.
+    """
     slow = {"rate": 100.0, "step": 0.005}
-    scenario = SCENARIOS[name]().vary(aircraft=slow, reference_model={"rate": 100.0}, flight={"duration": 8.0})
+    scenario = SCENARIOS[name]().vary(
+        aircraft=slow, reference_model={"rate": 100.0}, flight={"duration": 8.0}
+    )
     sets = parameter_sets(exportable(scenario.controller))
     write_code(sets[0], name, folder, float32=False)
     part = 10 if sets[0].allocation is None else 1
     steps = [drawn_steps(sets, k, 30 * part, k) for k in range(len(sets))]
-    recordings = [*flight_recordings(scenario, sets), drawn_calls(sets, 150 * part, 3), any_numbers(sets), *steps]
+    recordings = [
+        *flight_recordings(scenario, sets),
+        drawn_calls(sets, 150 * part, 3),
+        any_numbers(sets),
+        *steps,
+    ]
     return Case(folder, sets, recordings)
 
 
 def any_numbers(sets: list[RiseDiConfig]) -> Recording:
-    """Ticks of the guard with y and y_m of any size, infinite and NaN too, at stamps up to both ends of int64."""
+    """Ticks of the guard with y and y_m of any size, infinite and NaN too, at stamps up to both
+    ends of int64.
+    """
     rng, recorder, m = np.random.default_rng(5), Recorder(sets), len(sets[0].outputs)
-    special = np.array([0.0, 1e-320, 1.0, -30.0, 1e6, 1e150, -1e200, 1e308, -1.7e308, np.inf, -np.inf, np.nan])
+    special = np.array(
+        [0.0, 1e-320, 1.0, -30.0, 1e6, 1e150, -1e200, 1e308, -1.7e308, np.inf, -np.inf, np.nan]
+    )
     with np.errstate(all="ignore"):
         for start_ns in (-(2**63) + 1, -(10**9), 2**63 - 3 * 10**9):
             recorder.begin()
             for k in range(200):
                 y, y_m = 0.05 * rng.normal(size=(2, m)) if k % 3 else rng.choice(special, (2, m))
-                now_ns = start_ns + 10_000_000 * k + int(rng.integers(-2_000_000, 2_000_000)) * (k > 0)
+                now_ns = (
+                    start_ns + 10_000_000 * k + int(rng.integers(-2_000_000, 2_000_000)) * (k > 0)
+                )
                 recorder.guard_tick(now_ns, (now_ns, y, y_m, 0), active=True)
             with suppress(ChannelError):
                 recorder.take_y(StampedVector(-start_ns, np.zeros(m)), start_ns + 5 * 10**8)
@@ -124,28 +152,46 @@ def test_every_bit_is_equal(case: Case) -> None:
     assert proof.figures["multiply"] > 0 or shutil.which("g++") is None
     modes = np.concatenate([recording.integers[:, 2] for recording in case.recordings])
     assert set(modes.tolist()) == set(map(int, Mode))
-    u, u_free = (np.concatenate([recording.reals[:, 4 * k : 4 * k + 4] for recording in case.recordings]) for k in range(2))
+    u, u_free = (
+        np.concatenate([recording.reals[:, 4 * k : 4 * k + 4] for recording in case.recordings])
+        for k in range(2)
+    )
     assert 0.05 < (u != u_free).mean() < 0.95  # limits act in many ticks and not in many
 
 
 def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
-    flags = [*FLAGS, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-error"]
+    flags = [
+        *FLAGS,
+        "-g",
+        "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+        "-Wno-error",
+    ]
     program = Program(case.code, ["gcc"], case.sets, tmp_path, flags=flags)
     for recording in case.recordings[:5]:
         assert program.compare(recording).differing == 0
 
 
 @pytest.mark.parametrize(
-    "flags", [("-O0",), ("-O3", "-march=native"), ("-Os", "-Wconversion", "-Wdouble-promotion", "-Wundef")]
+    "flags",
+    [("-O0",), ("-O3", "-march=native"), ("-Os", "-Wconversion", "-Wdouble-promotion", "-Wundef")],
 )
-def test_bits_do_not_depend_on_optimisation(flags: tuple[str, ...], case: Case, tmp_path: Path) -> None:
-    build(["gcc", *FLAGS, *flags, "-c", "-o", str(tmp_path / "rise_di.o"), "rise_di.c"], case.code)  # without a warning
-    program = Program(case.code, ["gcc"], case.sets, tmp_path / "program", flags=[*FLAGS, *flags, "-Wno-error"])
+def test_bits_do_not_depend_on_optimisation(
+    flags: tuple[str, ...], case: Case, tmp_path: Path
+) -> None:
+    build(
+        ["gcc", *FLAGS, *flags, "-c", "-o", str(tmp_path / "rise_di.o"), "rise_di.c"], case.code
+    )  # without a warning
+    program = Program(
+        case.code, ["gcc"], case.sets, tmp_path / "program", flags=[*FLAGS, *flags, "-Wno-error"]
+    )
     assert all(program.compare(recording).differing == 0 for recording in case.recordings[2:6])
 
 
 def test_contraction_does_not_start(case: Case, tmp_path: Path) -> None:
-    """A fused multiply-add has a single rounding: without -ffp-contract=off nothing flies where the processor has it."""
+    """A fused multiply-add has a single rounding: without -ffp-contract=off nothing flies where the
+    processor has it.
+    """
     if " fma " not in Path("/proc/cpuinfo").read_text(encoding="utf-8"):
         pytest.skip("no fused multiply-add on this processor")
     flags = [*FLAGS[:-1], "-mfma", "-ffp-contract=fast"]
@@ -161,7 +207,10 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "is_equal": ("(a <= b) && (a >= b)", "(a <= b)"),
     "magnitude": ("(a < ZERO) ? -a : a", "a"),
     "rounded": ("(a + ROUNDING) - ROUNDING", "(a + (ONE / TWO) + ROUNDING) - ROUNDING"),
-    "seconds": ("(rise_di_real)time_ns / NANOSECONDS", "(rise_di_real)time_ns * (ONE / NANOSECONDS)"),
+    "seconds": (
+        "(rise_di_real)time_ns / NANOSECONDS",
+        "(rise_di_real)time_ns * (ONE / NANOSECONDS)",
+    ),
     "elapsed_ns": ("(later_ns > earlier_ns) ?", "(later_ns < earlier_ns) ?"),
     "copy": ("to[i] = from[i];", "to[i] = from[0];"),
     "fill": ("values[i] = value;", "values[i] = value + ONE;"),
@@ -171,11 +220,17 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "least": ("before - reach);", "before + reach);"),
     "largest": ("before + reach);", "upper);"),
     "saturate": ("largest(limits->upper[i], before, reach)", "limits->upper[i]"),
-    "control": ("(after->e[i] - after->e_0[i]) + integral", "(after->e[i] + integral) - after->e_0[i]"),
+    "control": (
+        "(after->e[i] - after->e_0[i]) + integral",
+        "(after->e[i] + integral) - after->e_0[i]",
+    ),
     "engage_law": ("law->Pi[i] = ZERO;", "law->Pi[i] = law->e[i];"),
     "step_law": ("(dt * (e + before->e[i])) / TWO", "dt * e"),
     "limit_law": ("magnitude(beyond) - (outward ? magnitude(change) : ZERO)", "magnitude(beyond)"),
-    "retune_law": ("control(old, old_scale, law, law, i)", "control(next, next_scale, law, law, i)"),
+    "retune_law": (
+        "control(old, old_scale, law, law, i)",
+        "control(next, next_scale, law, law, i)",
+    ),
     "target_scale": ("(ratio * ratio)", "ratio"),
     "scheduled": ("p->input_scale[i] * law->scale[i]", "p->input_scale[i]"),
     "follow_schedule": ("lesser(dt / p->time, ONE)", "(dt / p->time)"),
@@ -184,13 +239,19 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "correct": ("lesser(law->sigma + (dt * p->fade_rate), ONE)", "ONE"),
     "same_values": ("same && is_equal(a[i], b[i])", "same"),
     "same_model": ("same_values(a->F, b->F", "same_values(a->F, a->F"),
-    "sine": ("(k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW)", "(k * (RISE_DI_PI_HIGH + RISE_DI_PI_LOW)))"),
+    "sine": (
+        "(k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW)",
+        "(k * (RISE_DI_PI_HIGH + RISE_DI_PI_LOW)))",
+    ),
     "sines": ("sine(x[i]) : ZERO", "x[i] : ZERO"),
     "drift": ("linear[i] + pulled[i]", "linear[i] - pulled[i]"),
     "slope": ("x_dot[i] + forced[i]", "x_dot[i]"),
     "stage": ("x[i] + (dt * k[i])", "x[i]"),
     "engage_feedforward": ("state->ticks = ZERO;", "state->ticks = ONE;"),
-    "step_feedforward": ("(k1[i] + (TWO * k2[i])) + (TWO * k3[i])", "k1[i] + (TWO * (k2[i] + k3[i]))"),
+    "step_feedforward": (
+        "(k1[i] + (TWO * k2[i])) + (TWO * k3[i])",
+        "k1[i] + (TWO * (k2[i] + k3[i]))",
+    ),
     "engage_all": ("engage_law(law, y, y_m);", "engage_law(law, y_m, y);"),
     "tick_law": ("u_trim[i] + begin.u_o[i]", "u_trim[i] - begin.u_o[i]"),
     "is_inside": ("inside && (u[j] >= low[j])", "(u[j] >= low[j])"),
@@ -198,7 +259,10 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "moved": ("(part * move[j])", "move[j]"),
     "towards": ("(step > ZERO) ?", "(step < ZERO) ?"),
     "add_by_priority": ("(int32_t)p->order[k]", "k"),
-    "allocate": ("product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);", "copy(change, rest, RISE_DI_P);"),
+    "allocate": (
+        "product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);",
+        "copy(change, rest, RISE_DI_P);",
+    ),
     "reached": ("(u_free[i] < u[i]) ? u[i] : -REAL_MAX", "-REAL_MAX"),
     "sample_at": ("samples->newest - back", "samples->newest"),
     "rise_di_append": ("samples->newest + 1)", "samples->newest + 2)"),
@@ -208,13 +272,19 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "failsafe": ("c->hold_ns = active ? p->hold_ns : 0;", "c->hold_ns = p->hold_ns;"),
     "engage": ("copy(c->u, c->u_trim, RISE_DI_M);", "fill(c->u_trim, RISE_DI_M, ZERO);"),
     "step": ("clipped(measured, p->dt_least, p->dt_largest)", "lesser(measured, p->dt_largest)"),
-    "is_fresh": ("elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns", "elapsed_ns(stamp_ns, now_ns) == 0U"),
+    "is_fresh": (
+        "elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns",
+        "elapsed_ns(stamp_ns, now_ns) == 0U",
+    ),
     "are_numbers": ("return is_finite(sum, RISE_DI_M);", "return true;"),
     "any": ("bool result = false;", "bool result = true;"),
     "rise_di_guard_tick": ("y->stamp_ns <= c->y_stamp_ns", "y->stamp_ns < c->y_stamp_ns"),
     "rise_di_start": ("fill(controller->u, RISE_DI_M, ZERO);", ""),
     "from_bits": ("(rise_di_real)number.value", "ZERO"),
-    "is_rounded_once": ("is_equal(rounded(ONE - (rise_di_real)part), ONE)", "is_equal(rounded((rise_di_real)part), ONE)"),
+    "is_rounded_once": (
+        "is_equal(rounded(ONE - (rise_di_real)part), ONE)",
+        "is_equal(rounded((rise_di_real)part), ONE)",
+    ),
     "is_nan_told": ("(!is_finite(special, 3))", "is_finite(special, 3)"),
     "checked": ("(uint64_t)c->parameters->max_age_ns", "0U"),
     "is_near": ("greater(RISE_DI_TIMES * c->change[i], p->y_reach[i])", "p->y_reach[i]"),
@@ -228,7 +298,10 @@ MUTANTS: dict[str, tuple[str, str]] = {
 }
 """Of each function of rise_di.c: a text of its body and what a mutant has instead."""
 
-FUNCTION = re.compile(r"^(?:static )?(?:const )?\w+ \*?(\w+)\([^;{]*\) \{(?:[^\n]*\}\n|\n.*?^\}\n)", re.MULTILINE | re.DOTALL)
+FUNCTION = re.compile(
+    r"^(?:static )?(?:const )?\w+ \*?(\w+)\([^;{]*\) \{(?:[^\n]*\}\n|\n.*?^\}\n)",
+    re.MULTILINE | re.DOTALL,
+)
 
 
 def bodies(source: str) -> dict[str, tuple[int, int]]:
@@ -275,7 +348,9 @@ def servo_program(tmp_path_factory: pytest.TempPathFactory) -> tuple[RiseDiConfi
     return config, Program(folder, ["gcc"], [config], tmp_path_factory.mktemp("program"))
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     st.fixed_dictionaries(
         {
@@ -297,7 +372,9 @@ def servo_program(tmp_path_factory: pytest.TempPathFactory) -> tuple[RiseDiConfi
     ),
     st.integers(0, 2**32 - 1),
 )
-def test_drawn_parameters(servo_program: tuple[RiseDiConfig, Program], changes: dict[str, Any], seed: int) -> None:
+def test_drawn_parameters(
+    servo_program: tuple[RiseDiConfig, Program], changes: dict[str, Any], seed: int
+) -> None:
     config, program = servo_program
     sets = [config, exportable(vary(config, changes))]
     program.take(sets)
@@ -318,7 +395,9 @@ def test_float32_is_within_its_bound(tmp_path: Path) -> None:
 
 def test_log_is_replayed_by_c(tmp_path: Path) -> None:
     """C gives every u of a log of an earlier version without feedforward, to the bit."""
-    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data")
+    shutil.unpack_archive(
+        REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data"
+    )
     sets, recording, as_logged = run_recording(read_run(tmp_path / "osprey_servo"))
     write_code(sets[0], "osprey_servo", tmp_path / "code", float32=False)
     program = Program(tmp_path / "code", ["gcc"], sets, tmp_path / "program")
@@ -328,22 +407,41 @@ def test_log_is_replayed_by_c(tmp_path: Path) -> None:
 
 def test_command_writes_code_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit) as status:
-        export("osprey_servo", tmp_path, duration=1.0, drawn=1000, compiler=["gcc"], fmu=True, as_json=True)
+        export(
+            "osprey_servo",
+            tmp_path,
+            duration=1.0,
+            drawn=1000,
+            compiler=["gcc"],
+            fmu=True,
+            as_json=True,
+        )
     result = json.loads(capsys.readouterr().out)
     assert (status.value.exit_code, result["proved"]) == (0, True)
     assert {Path(name).name for name in result["files"]} == {*CODE, PARAMETERS, REPORT, FMU}
-    assert (tmp_path / "proof.txt").read_text(encoding="utf-8").endswith("PROVED: every bit is equal\n")
+    assert (
+        (tmp_path / "proof.txt")
+        .read_text(encoding="utf-8")
+        .endswith("PROVED: every bit is equal\n")
+    )
 
 
-def test_command_proves_with_a_recorded_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_proves_with_a_recorded_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (run := tmp_path / "run").mkdir()
     scenario = find_scenario("osprey_gust", 0.5)
     write_run(simulate(scenario), run, attachments_for(scenario, run))
     with pytest.raises(typer.Exit) as status:
         export("osprey_gust", tmp_path / "c", run=run, compiler=["gcc"])
     assert status.value.exit_code == 0
-    assert "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out  # the ticks of the log
-    with pytest.raises(ParameterError, match="--run: found a flight with other parameters, expected those of osprey_servo"):
+    assert (
+        "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out
+    )  # the ticks of the log
+    with pytest.raises(
+        ParameterError,
+        match="--run: found a flight with other parameters, expected those of osprey_servo",
+    ):
         export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 
 
@@ -351,7 +449,9 @@ def test_wrong_code_is_not_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     wrong = tmp_path / "source"
     shutil.copytree(SOURCE, wrong)
     text = (wrong / "rise_di.c").read_text(encoding="utf-8")
-    (wrong / "rise_di.c").write_text(text.replace("dt * (e + before->e[i])", "dt * (e - before->e[i])"), encoding="utf-8")
+    (wrong / "rise_di.c").write_text(
+        text.replace("dt * (e + before->e[i])", "dt * (e - before->e[i])"), encoding="utf-8"
+    )
     monkeypatch.setattr("c_export.proof.SOURCE", wrong)
     with pytest.raises(typer.Exit) as status:
         export("osprey_servo", tmp_path / "c", duration=1.0, drawn=100, compiler=["gcc"])
@@ -361,47 +461,71 @@ def test_wrong_code_is_not_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_models_that_are_learned_are_refused() -> None:
     learns = find_scenario("osprey_learn")
-    with pytest.raises(ParameterError, match=r"^controller\.learn: found a section, expected none: C code replaces no model"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^controller\.learn: found a section, expected none: C code replaces no model",
+    ):
         exportable(learns.controller)
-    with pytest.raises(ParameterError, match=r"^controller\.observer\.part: found 0\.0, expected more than 0"):
+    with pytest.raises(
+        ParameterError, match=r"^controller\.observer\.part: found 0\.0, expected more than 0"
+    ):
         exportable(learns.vary(controller={"learn": None}).controller)
 
 
 def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     controller = find_scenario("osprey_servo").controller
-    common = {key: value for key, value in controller.model_dump().items() if key in ControllerConfig.model_fields}
-    pi = AnyLaw.validate_mapping({**common, "law": "pi", "Lambda": [1.0] * 4, "K": [1.0] * 4}, "controller")
+    common = {
+        key: value
+        for key, value in controller.model_dump().items()
+        if key in ControllerConfig.model_fields
+    }
+    pi = AnyLaw.validate_mapping(
+        {**common, "law": "pi", "Lambda": [1.0] * 4, "K": [1.0] * 4}, "controller"
+    )
     with pytest.raises(
-        ParameterError, match=r"^controller\.law: found pi, expected rise_di: C code exists for this law alone$"
+        ParameterError,
+        match=r"^controller\.law: found pi, expected rise_di: C code exists for this law alone$",
     ):
         exportable(pi)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(
-        ParameterError, match="compiler: found none of gcc, clang on the PATH, expected one for the proof; --no-proof"
+        ParameterError,
+        match="compiler: found none of gcc, clang on the PATH, expected one for the proof; "
+        "--no-proof",
     ):
         export("osprey_servo", tmp_path)
-    with pytest.raises(ParameterError, match="--compiler: found no program 'tcc', expected the command of a C compiler"):
+    with pytest.raises(
+        ParameterError,
+        match="--compiler: found no program 'tcc', expected the command of a C compiler",
+    ):
         export("osprey_servo", tmp_path, compiler=["tcc"])
     with pytest.raises(
-        ParameterError, match=r"--compiler: found .gcc '. \(No closing quotation\), expected the command of a C"
+        ParameterError,
+        match=r"--compiler: found .gcc '. \(No closing quotation\), expected the command of a C",
     ):
         export("osprey_servo", tmp_path, compiler=["gcc '"])
     (tmp_path / "file").touch()
     with pytest.raises(ParameterError, match=r"--c: .*file"):
         export("osprey_servo", tmp_path / "file", without_proof=True)
     (tmp_path / "c").mkdir()
-    (tmp_path / "c" / REPORT).write_text("PROVED: every bit is equal\n", encoding="utf-8")  # of an earlier export
+    (tmp_path / "c" / REPORT).write_text(
+        "PROVED: every bit is equal\n", encoding="utf-8"
+    )  # of an earlier export
     export("osprey_servo", tmp_path / "c", without_proof=True)
     assert not (tmp_path / "c" / REPORT).exists()
 
 
 def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """New gains in flight are an event of the recording, and every u is that of the log; without the changes it is refused."""
+    """New gains in flight are an event of the recording, and every u is that of the log; without
+    the changes it is refused.
+    """
     scenario, change = find_scenario("osprey_servo", 2.0), {"k_g": 2.0}
     tuned = vary(scenario.controller, change)
 
     class Tuned(Controller):
-        def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
+        def tick(
+            self, now_ns: int, late_ns: int = 0, *, active: bool = True
+        ) -> ControlOutput | None:
             if now_ns >= NANOSECONDS:
                 self.retune(tuned)
             return super().tick(now_ns, late_ns, active=active)
@@ -410,8 +534,14 @@ def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPa
     stored = StoredFile("osprey_servo.yaml", scenario_yaml(scenario).encode())
     run = RecordedRun(replace(tape, changes=(change,)), stored)
     sets, recording, equal = run_recording(run)
-    assert [parameters.digest() for parameters in sets] == [scenario.controller.digest(), tuned.digest()]
+    assert [parameters.digest() for parameters in sets] == [
+        scenario.controller.digest(),
+        tuned.digest(),
+    ]
     assert (recording.events["kind"] == RETUNE).sum() == 1
     assert equal == recording.ticks == 201
-    with pytest.raises(ParameterError, match="run: found parameters before tick 101 that no change of the log leads to"):
+    with pytest.raises(
+        ParameterError,
+        match="run: found parameters before tick 101 that no change of the log leads to",
+    ):
         run_recording(RecordedRun(tape, stored))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz, the unit of FMI 2.0."""
+"""Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz,
+the unit of FMI 2.0.
+"""
 
 import importlib.util
 import shutil
@@ -30,7 +32,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"),
+    pytest.mark.skipif(
+        shutil.which("gcc") is None,
+        reason="no gcc on this machine, which compiles the exported code",
+    ),
 ]
 TAKEN, FUTURE, ORDER, NOT_FINITE, IMPLAUSIBLE = range(5)  # rise_di_status of rise_di.h
 
@@ -39,13 +44,19 @@ TAKEN, FUTURE, ORDER, NOT_FINITE, IMPLAUSIBLE = range(5)  # rise_di_status of ri
 def c_controller(tmp_path: Path) -> Callable[[RiseDiConfig], CController]:
     def build(config: RiseDiConfig) -> CController:
         write_code(config, "test", tmp_path / "code", float32=False)
-        return CController(build_library(tmp_path / "code", ["gcc"], tmp_path / "rise_di.so"), len(config.outputs))
+        return CController(
+            build_library(tmp_path / "code", ["gcc"], tmp_path / "rise_di.so"), len(config.outputs)
+        )
 
     return build
 
 
-def test_library_replays_a_log(tmp_path: Path, c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data")
+def test_library_replays_a_log(
+    tmp_path: Path, c_controller: Callable[[RiseDiConfig], CController]
+) -> None:
+    shutil.unpack_archive(
+        REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data"
+    )
     run = read_run(tmp_path / "osprey_servo")
     (config,), recording, _ = run_recording(run)
     u = c_controller(config).replay(recording)
@@ -61,24 +72,36 @@ class Call(NamedTuple):
 
 
 def jittering_calls(count: int, seed: int) -> list[Call]:
-    """Calls at 250 Hz, late by up to a quarter of a period; a fifth of y and a tenth of y_m lost; a second without y."""
+    """Calls at 250 Hz, late by up to a quarter of a period; a fifth of y and a tenth of y_m lost; a
+    second without y.
+    """
     rng, calls = np.random.default_rng(seed), []
     for k in range(1, count):
         stamp_ns = k * NANOSECONDS // 250
         now_ns = stamp_ns + int(rng.integers(0, 1_000_000))
         y_m = 0.05 * np.sin(0.01 * k + np.arange(4.0))
         lost = rng.random(2) < (0.2, 0.1)
-        y = [] if lost[0] or 500 <= k < 750 else [(stamp_ns - int(rng.integers(0, 500_000)), y_m + 0.01 * rng.normal(size=4))]
+        y = (
+            []
+            if lost[0] or 500 <= k < 750
+            else [(stamp_ns - int(rng.integers(0, 500_000)), y_m + 0.01 * rng.normal(size=4))]
+        )
         calls.append(Call(now_ns, y, [] if lost[1] else [(stamp_ns, y_m)]))
     return calls
 
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
 def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    """The caller of the page on export, with jitter and lost samples: u and mode are those of the Python controller."""
+    """The caller of the page on export, with jitter and lost samples: u and mode are those of the
+    Python controller.
+    """
     controller = find_scenario(name).controller
     if controller.observer is None:  # the matrices of an observer hold at the rate of its design
-        controller = find_scenario(name).vary(controller={"rate": 250.0}, aircraft={"rate": 250.0, "step": 0.004}).controller
+        controller = (
+            find_scenario(name)
+            .vary(controller={"rate": 250.0}, aircraft={"rate": 250.0, "step": 0.004})
+            .controller
+        )
     python, c = Controller(controller), c_controller(exportable(controller))
     modes, moved = set(), np.zeros(4)
     for call in jittering_calls(1500, 3):
@@ -99,14 +122,18 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
 
 
 def test_fmu_flies_to_the_bit(tmp_path: Path) -> None:
-    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one process."""
+    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one
+    process.
+    """
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
     scenario = find_scenario("osprey_observer", 5.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
     )
     config = exportable(scenario.controller)
     write_code(config, "osprey_observer", tmp_path / "code", float32=False)
-    unit = build_fmu(tmp_path / "code", ["gcc"], config, "osprey_observer", tmp_path / "rise_di.fmu")
+    unit = build_fmu(
+        tmp_path / "code", ["gcc"], config, "osprey_observer", tmp_path / "rise_di.fmu"
+    )
     tape = simulate(scenario)
     groups = {group: tape["internals"].group(group) for group in ("y", "y_m", "u")}
     t = tape.time("internals")
@@ -127,13 +154,22 @@ def test_fmu_flies_to_the_bit(tmp_path: Path) -> None:
     )
     u = np.column_stack([flown[f"u.{name}"] for name in config.inputs])
     assert len(u) == len(t)
-    assert u[1:].tobytes() == groups["u"].values[:-1].tobytes()  # valid after the step, whose begin has the stamp
+    assert (
+        u[1:].tobytes() == groups["u"].values[:-1].tobytes()
+    )  # valid after the step, whose begin has the stamp
 
 
 def test_program_of_the_page_flies(tmp_path: Path) -> None:
     page = (REPOSITORY / "docs" / "export.md").read_text(encoding="utf-8")
-    (tmp_path / "caller.c").write_text(page.partition("```c\n")[2].partition("```")[0], encoding="utf-8")
-    write_code(exportable(find_scenario("osprey_servo").controller), "osprey_servo", tmp_path, float32=False)
+    (tmp_path / "caller.c").write_text(
+        page.partition("```c\n")[2].partition("```")[0], encoding="utf-8"
+    )
+    write_code(
+        exportable(find_scenario("osprey_servo").controller),
+        "osprey_servo",
+        tmp_path,
+        float32=False,
+    )
     build(["gcc", *FLAGS, "-o", "caller", "caller.c", "rise_di.c"], tmp_path)
     assert subprocess.run(["./caller"], cwd=tmp_path, check=False).returncode == 0
 
@@ -149,7 +185,14 @@ FAST_MATH = (
     "-fno-signed-zeros",
     "-freciprocal-math -fno-signed-zeros -fno-trapping-math",  # as PX4 has them
 )
-MACROS = ("FAST_MATH", "ASSOCIATIVE_MATH", "RECIPROCAL_MATH", "FINITE_MATH_ONLY", "NO_SIGNED_ZEROS", "NO_TRAPPING_MATH")
+MACROS = (
+    "FAST_MATH",
+    "ASSOCIATIVE_MATH",
+    "RECIPROCAL_MATH",
+    "FINITE_MATH_ONLY",
+    "NO_SIGNED_ZEROS",
+    "NO_TRAPPING_MATH",
+)
 WITHOUT_MACROS = [f"-U__{name}__" for name in MACROS]
 """As of a compiler that does not name its flags: clang has two of these macros."""
 
@@ -167,25 +210,36 @@ int main(void) {
         rise_di_take_y_m(&controller, 0, 0, y) == RISE_DI_NOT_STARTED && !rise_di_tick(&controller, 0, true, &output);
     return refused ? 1 : 2;
 }
-"""
+"""  # noqa: E501 - a text as it is written
 
 
 @pytest.fixture(scope="module")
 def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The code of osprey_observer, with a feedforward and so with the sine, and a program that starts it."""
+    """The code of osprey_observer, with a feedforward and so with the sine, and a program that
+    starts it.
+    """
     folder = tmp_path_factory.mktemp("code")
-    write_code(exportable(find_scenario("osprey_observer").controller), "osprey_observer", folder, float32=False)
+    write_code(
+        exportable(find_scenario("osprey_observer").controller),
+        "osprey_observer",
+        folder,
+        float32=False,
+    )
     (folder / "starter.c").write_text(STARTER, encoding="utf-8")
     return folder
 
 
 def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
-    """Exit status of the program: 0 where the controller starts, 1 where it does not and then refuses every call."""
+    """Exit status of the program: 0 where the controller starts, 1 where it does not and then
+    refuses every call.
+    """
     build([*compiler, *FLAGS, *flags, "-o", "starter", "starter.c", "rise_di.c"], code)
     return subprocess.run(["./starter"], cwd=code, check=False).returncode
 
 
-@pytest.mark.parametrize("flags", [*FAST_MATH, "-fno-trapping-math", "-fsingle-precision-constant", "-mfpmath=387"])
+@pytest.mark.parametrize(
+    "flags", [*FAST_MATH, "-fno-trapping-math", "-fsingle-precision-constant", "-mfpmath=387"]
+)
 def test_compiler_stops_at_flags_that_change_bits(flags: str, code: Path) -> None:
     with pytest.raises(ParameterError, match=r"rise_di\.c"):
         build(["gcc", *FLAGS, *flags.split(), "-c", "rise_di.c"], code)
@@ -193,27 +247,46 @@ def test_compiler_stops_at_flags_that_change_bits(flags: str, code: Path) -> Non
 
 @pytest.mark.parametrize("flags", FAST_MATH)
 def test_controller_does_not_start_under_flags_that_change_bits(flags: str, code: Path) -> None:
-    """Where no macro tells of them, the test of rise_di_start does, at each optimisation: 0.3 is not rounded to 0 then."""
+    """Where no macro tells of them, the test of rise_di_start does, at each optimisation: 0.3 is
+    not rounded to 0 then.
+    """
     for level in ("-O1", "-O3"):
         assert started(code, ["gcc"], [level, *flags.split(), *WITHOUT_MACROS]) == 1
 
 
 def test_calls_before_the_start_are_refused(code: Path) -> None:
     """In memory of zeros, as of a static controller."""
-    (code / "early.c").write_text(STARTER.replace("rise_di_start(&controller, &parameters)", "(int)parameters.sign < 0"))
-    build(["gcc", *FLAGS, "-fsanitize=address,undefined", "-o", "early", "early.c", "rise_di.c"], code)
+    (code / "early.c").write_text(
+        STARTER.replace("rise_di_start(&controller, &parameters)", "(int)parameters.sign < 0")
+    )
+    build(
+        ["gcc", *FLAGS, "-fsanitize=address,undefined", "-o", "early", "early.c", "rise_di.c"], code
+    )
     assert subprocess.run(["./early"], cwd=code, check=False).returncode == 1
 
 
-def test_wrong_samples_are_lost_as_by_controller(c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    """A spike, a jump that stays, noise that grows, y_m beyond its bound: the same samples are lost, u has the same bits."""
+def test_wrong_samples_are_lost_as_by_controller(
+    c_controller: Callable[[RiseDiConfig], CController],
+) -> None:
+    """A spike, a jump that stays, noise that grows, y_m beyond its bound: the same samples are
+    lost, u has the same bits.
+    """
     config, rng = exportable(find_scenario("osprey_observer").controller), np.random.default_rng(4)
     python, c, lost = Controller(config), c_controller(config), 0
     for k in range(700):
         now_ns = k * NANOSECONDS // 100
-        y, y_m = (0.1 * np.sin(0.01 * k + np.arange(8.0)) + 0.002 * rng.normal(size=8)).reshape(2, 4)
-        y = y + {150: 35.0, 160: 1e3, 170: 1e6, 180: 1e308, 190: -3.0}.get(k, 0.0) * np.eye(4)[k % 3]
-        y = y + (5.0 if 200 <= k < 300 else 0.0) + (5.0 * rng.normal(size=4) if 400 <= k < 450 else 0.0)
+        y, y_m = (0.1 * np.sin(0.01 * k + np.arange(8.0)) + 0.002 * rng.normal(size=8)).reshape(
+            2, 4
+        )
+        y = (
+            y
+            + {150: 35.0, 160: 1e3, 170: 1e6, 180: 1e308, 190: -3.0}.get(k, 0.0) * np.eye(4)[k % 3]
+        )
+        y = (
+            y
+            + (5.0 if 200 <= k < 300 else 0.0)
+            + (5.0 * rng.normal(size=4) if 400 <= k < 450 else 0.0)
+        )
         y_m = y_m + (1e9 if k == 350 else 0.0)
         for sentence, status in (
             (python.take_y_m(StampedVector(now_ns, y_m), now_ns), c.take_y_m(now_ns, y_m, now_ns)),

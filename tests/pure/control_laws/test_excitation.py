@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The excitation of an identification: doublets and a multisine on one input after another, by closed forms."""
+"""The excitation of an identification: doublets and a multisine on one input after another, by
+closed forms.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -32,8 +34,23 @@ DT = 1e-3  # s
 
 def controller(**changes: Any) -> ExcitationConfig:
     servo = find_scenario("osprey_servo").controller
-    common = ("rate", "outputs", "inputs", "D", "input_scale", "lag", "delay", "max_age", "hold", "ramp", "lower", "upper")
-    values = {key: getattr(servo, key) for key in common} | {"law": "excitation"} | TIMETABLE | changes
+    common = (
+        "rate",
+        "outputs",
+        "inputs",
+        "D",
+        "input_scale",
+        "lag",
+        "delay",
+        "max_age",
+        "hold",
+        "ramp",
+        "lower",
+        "upper",
+    )
+    values = (
+        {key: getattr(servo, key) for key in common} | {"law": "excitation"} | TIMETABLE | changes
+    )
     return ExcitationConfig.validate_mapping(values, "controller")
 
 
@@ -45,7 +62,9 @@ def excited(params: ExcitationConfig) -> FloatArray:
 
 def flight(**changes: Any) -> Scenario:
     calm = find_scenario("osprey_servo").vary(
-        aircraft={"gusts": {}}, reference_model={"pulses": {}, "coordinated_turn": None}, flight={"duration": 12.0}
+        aircraft={"gusts": {}},
+        reference_model={"pulses": {}, "coordinated_turn": None},
+        flight={"duration": 12.0},
     )
     return replace(calm, controller=controller(**changes))
 
@@ -63,12 +82,14 @@ def test_inputs_are_excited_in_turn() -> None:
 
 
 def test_excitation_lasts_as_long_as_parameters_say() -> None:
-    # a pause, then for each input 8 widths, a period and a pause: 1.5 + 3 (2 + 6 + 1.5) + 8 + 10 + 1.5
+    # a pause, then for each input 8 widths, a period and a pause: 1.5 + 3 (2 + 6 + 1.5) + 8 + 10 +
+    # 1.5
     assert controller().duration == pytest.approx(49.5)
 
 
 def test_doublets_and_multisine_have_no_mean() -> None:
-    # The second integral of the doublets alone is -3 w^2: 1 of the first, -4 of the second, which is twice as wide.
+    # The second integral of the doublets alone is -3 w^2: 1 of the first, -4 of the second, which
+    # is twice as wide.
     u = excited(controller())[:, 0]
     assert abs(u.sum() * DT) < 2.0 * DT
     doublets = u[round(1.5 / DT) : round(3.5 / DT)]
@@ -76,7 +97,8 @@ def test_doublets_and_multisine_have_no_mean() -> None:
 
 
 def test_multisine_has_band_alone_and_low_peak() -> None:
-    # Schroeder's phases keep the crest factor of a flat band near 1.7; that of cosines in phase would be sqrt(2 h) = 5.8.
+    # Schroeder's phases keep the crest factor of a flat band near 1.7; that of cosines in phase
+    # would be sqrt(2 h) = 5.8.
     harmonic, phase, part = multisine(6.0, 0.3, 3.0)
     assert harmonic[0] / 6.0 == pytest.approx(0.3, abs=1.0 / 12.0)
     assert harmonic[-1] / 6.0 == pytest.approx(3.0, abs=1.0 / 6.0)
@@ -97,7 +119,9 @@ def test_flight_commands_timetable_whatever_y_does() -> None:
     order = [u.names.index(name) for name in controller().inputs]
     expected = np.array([params.amplitude * excitation.signal(instant, params) for instant in t])
     off = np.abs(u.values[:, order] - expected) > 1e-9
-    assert off.any(axis=1).mean() < 0.01  # only at an edge, where the law's sum of periods rounds to the other side
+    assert (
+        off.any(axis=1).mean() < 0.01
+    )  # only at an edge, where the law's sum of periods rounds to the other side
     assert np.abs(tape["y"]["q"]).max() > 0.02  # rad/s: the aircraft answers
 
 
@@ -115,7 +139,10 @@ def test_limits_act_on_the_excitation() -> None:
             {"amplitude": [0.9, 0.02, 0.02, 0.06]},
             "controller.amplitude[0]: found 0.9, expected at most 0.523599, the limits of",
         ),
-        ({"lowest": [4.0, 0.3, 0.3, 0.1]}, "controller.lowest[0]: found 4.0, expected at most highest[0] = 3 Hz"),
+        (
+            {"lowest": [4.0, 0.3, 0.3, 0.1]},
+            "controller.lowest[0]: found 4.0, expected at most highest[0] = 3 Hz",
+        ),
         (
             {"highest": [60.0, 3.0, 3.0, 0.8]},
             "controller.highest[0]: found 60.0, expected below half the rate of the law, 50 Hz",

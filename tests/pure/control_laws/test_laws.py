@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller through their one protocol: engagement, limits, retuning, replay, observer, refusals."""
+"""The control laws of the controller through their one protocol: engagement, limits, retuning,
+replay, observer, refusals.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -39,7 +41,11 @@ from rise_di_controller.saturation import Limits
 AIRFRAME = load_airframe("osprey")
 SERVO = PROTOTYPE_SERVO.vary(
     flight={"duration": 2.0},
-    aircraft={"rate": 100.0, "step": 0.005, "gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}},
+    aircraft={
+        "rate": 100.0,
+        "step": 0.005,
+        "gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}},
+    },
     reference_model={"rate": 100.0, "pulses": BUSY},
 )
 MS, DT = 1_000_000, 0.01  # ns; s, the period of the controller
@@ -54,7 +60,9 @@ def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @cache
 def sections() -> dict[str, dict[str, Any]]:
-    """Sections of a controller by a name; "observer" in it: the observer for osprey_servo by rule, with 20 ms of margin."""
+    """Sections of a controller by a name; "observer" in it: the observer for osprey_servo by rule,
+    with 20 ms of margin.
+    """
     rise = SERVO.rise_di()
     leading = with_feedforward(rise, AIRFRAME).model_dump()
     gains = gains_by_rule(model_for(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
@@ -80,7 +88,11 @@ EVERY_LAW = pytest.mark.parametrize("name", [*NAMES, *OBSERVED])
 
 
 def controller(name: str, **changes: Any) -> ControllerConfig:
-    return AnyLaw.validate_mapping(sections()[name] | changes, "controller") if changes else valid(name)
+    return (
+        AnyLaw.validate_mapping(sections()[name] | changes, "controller")
+        if changes
+        else valid(name)
+    )
 
 
 @cache
@@ -104,9 +116,13 @@ def sample(ms: float, value: Any) -> StampedVector:
     return StampedVector(round(ms * MS), value + np.zeros(4))
 
 
-def tick(parameters: ControllerConfig, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0) -> ControllerState:
+def tick(
+    parameters: ControllerConfig, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0
+) -> ControllerState:
     """The state after a tick with fresh y and y_m."""
-    return guard.tick(state, round(ms * MS), sample(ms, y), [sample(ms, y_m)], *prepared(parameters))[0]
+    return guard.tick(
+        state, round(ms * MS), sample(ms, y), [sample(ms, y_m)], *prepared(parameters)
+    )[0]
 
 
 def random_flight(law: TunedLaw, size: float, ticks: int = 20) -> tuple[Any, Measurements]:
@@ -130,16 +146,27 @@ def bits(state: Any) -> dict[str, bytes]:
 
 
 def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> FloatArray:
-    """The largest change of u in the first tick after an engagement at a constant error, by the gains alone."""
+    """The largest change of u in the first tick after an engagement at a constant error, by the
+    gains alone.
+    """
     law = name.partition(",")[0]
     if law == "lqg":
         return np.zeros(4)
     scale = np.array(parameters.input_scale)
-    if law == "l1":  # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
-        passed, Omega = 1.0 - np.exp(-np.array(parameters.bandwidth) * DT), np.reshape(parameters.Omega, (4, 4))
+    if (
+        law == "l1"
+    ):  # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
+        passed, Omega = (
+            1.0 - np.exp(-np.array(parameters.bandwidth) * DT),
+            np.reshape(parameters.Omega, (4, 4)),
+        )
         moved = np.array(parameters.K) * np.abs(e) + DT / 2.0 * (np.abs(Omega) @ np.abs(u))
         return np.asarray(np.abs(np.linalg.inv(Omega)) @ (passed * moved))
-    K = gain(np.array(parameters.k_g), np.array(parameters.k_d)) if law == "rise_di" else np.array(parameters.K)
+    K = (
+        gain(np.array(parameters.k_g), np.array(parameters.k_d))
+        if law == "rise_di"
+        else np.array(parameters.K)
+    )
     sign = DT * np.array(parameters.beta) if law == "rise_di" else 0.0
     return np.asarray(scale * (K * np.array(parameters.Lambda) * np.abs(e) * DT + sign))
 
@@ -164,7 +191,9 @@ def test_limits_that_are_not_reached_change_no_bit(name: str) -> None:
     state, measured = random_flight(law, 0.05)
     wide = Limits(np.full(4, -1e3), np.full(4, 1e3), np.full(4, 1e3 / DT))
     after, u = law.control_law.step(state, measured, np.float64(DT), law.params)
-    limited, u_free, u_limited = law.control_law.limited(state, measured, np.float64(DT), law.params, wide)
+    limited, u_free, u_limited = law.control_law.limited(
+        state, measured, np.float64(DT), law.params, wide
+    )
     assert u.tobytes() == u_free.tobytes() == u_limited.tobytes()
     assert bits(after) == bits(limited)
 
@@ -176,12 +205,19 @@ def test_limits_hold_for_any_error(name: str) -> None:
     # u_o of lqg is 0.6 of the limits within 0.1 s: 0.09 /s
     generator, state, us = np.random.default_rng(1), guard.initial_state(4), [np.zeros(4)]
     for k in range(300):
-        state = tick(parameters, state, 10 * k, generator.standard_normal(4) * 10.0 ** generator.integers(-3, 2))
+        state = tick(
+            parameters,
+            state,
+            10 * k,
+            generator.standard_normal(4) * 10.0 ** generator.integers(-3, 2),
+        )
         us.append(state.u)
     u = np.array(us)
     assert u.min() >= -0.02
     assert u.max() <= 0.01
-    assert np.abs(np.diff(u, axis=0)).max() == pytest.approx(0.05 * DT, rel=1e-12)  # reached, and kept
+    assert np.abs(np.diff(u, axis=0)).max() == pytest.approx(
+        0.05 * DT, rel=1e-12
+    )  # reached, and kept
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -194,17 +230,30 @@ def test_no_integral_winds_up_in_saturation(name: str) -> None:
     for k in range(500, 1000):
         state = tick(parameters, state, 10 * k, 0.5)
     assert state.u == pytest.approx([-0.02] * 4, rel=1e-12)
-    for group, value in fields(state.law).items():  # the slowest filter is l1's, 4 rad/s: 5 s leave exp(-20) of a change
+    for group, value in fields(
+        state.law
+    ).items():  # the slowest filter is l1's, 4 rad/s: 5 s leave exp(-20) of a change
         np.testing.assert_allclose(value, earlier[group], rtol=1e-7, err_msg=group)
     # so u leaves its limit with the first sample of the other sign, as fast as it may
-    assert tick(parameters, state, 10_000, -0.5).u == pytest.approx([-0.02 + 0.1 * DT] * 4, rel=1e-9)
+    assert tick(parameters, state, 10_000, -0.5).u == pytest.approx(
+        [-0.02 + 0.1 * DT] * 4, rel=1e-9
+    )
 
 
 RETUNED: dict[str, dict[str, Any]] = {
     "rise_di": {"k_g": 2.0, "Lambda": [1.0, 2.0, 3.0, 4.0], "beta": [1.0] * 4, "softening": 4.0},
     "pi": {"K": [1.0, 2.0, 3.0, 4.0], "Lambda": [1.0, 0.0, 3.0, 4.0]},
-    "l1": {"K": [1.0, 2.0, 3.0, 4.0], "bandwidth": [5.0] * 4, "Omega": np.diag([40.0, 60.0, 9.0, 5.0]).ravel().tolist()},
-    "pid": {"K": [1.0, 2.0, 3.0, 4.0], "Lambda": [1.0, 0.0, 3.0, 4.0], "lead": [0.1] * 4, "filter_time": [0.1] * 4},
+    "l1": {
+        "K": [1.0, 2.0, 3.0, 4.0],
+        "bandwidth": [5.0] * 4,
+        "Omega": np.diag([40.0, 60.0, 9.0, 5.0]).ravel().tolist(),
+    },
+    "pid": {
+        "K": [1.0, 2.0, 3.0, 4.0],
+        "Lambda": [1.0, 0.0, 3.0, 4.0],
+        "lead": [0.1] * 4,
+        "filter_time": [0.1] * 4,
+    },
     "lqg": {},
 }
 
@@ -215,7 +264,11 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
     # l1 with another Omega has another u_r: its measurements have y_m_dot = 0
     changes = RETUNED[name.partition(",")[0]]
     if name in OBSERVED:
-        changes = {key: (0.1 * np.array(value)).tolist() for key, value in changes.items() if key in {"K", "Lambda", "beta"}}
+        changes = {
+            key: (0.1 * np.array(value)).tolist()
+            for key, value in changes.items()
+            if key in {"K", "Lambda", "beta"}
+        }
     new = controller(name, **changes).tuned_law()
     state, measured = random_flight(law, 1e-3)
     measured = measured._replace(y_m_dot=np.zeros(4))
@@ -223,7 +276,8 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
         state = state._replace(z=law.params.H.T @ (measured.y - measured.y_m), sigma=np.ones(1))
         state = state._replace(u_o=-law.params.F @ state.z)
     after = law.control_law.retune(state, law.params, new.params)
-    # a tick of no time shows u: its filters and integrals do not move; 1e-12 s moves them by 1e-12 of their rates
+    # a tick of no time shows u: its filters and integrals do not move; 1e-12 s moves them by 1e-12
+    # of their rates
     _, u = law.control_law.step(state, measured, np.float64(1e-12), law.params)
     _, u_new = new.control_law.step(after, measured, np.float64(1e-12), new.params)
     np.testing.assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
@@ -242,14 +296,19 @@ def test_every_law_flies_and_replays(name: str) -> None:
     assert (len(result.number), result.notes) == (201, ())
     log = tape["internals"]
     assert set(log["mode"]) == {Mode.ENGAGED}
-    # the commands are 0.1 rad/s to 0.4 rad/s and 1.5 m/s, the gust is 10 m/s; a lost aircraft has errors of several rad/s
+    # the commands are 0.1 rad/s to 0.4 rad/s and 1.5 m/s, the gust is 10 m/s; a lost aircraft has
+    # errors of several rad/s
     assert (np.abs(log.group("e").values).max(axis=0) < [0.2, 0.2, 0.2, 1.0]).all()
-    of_law = [group for group in field_names(scenario.controller.tuned_law().control_law) if group != "e"]
+    of_law = [
+        group for group in field_names(scenario.controller.tuned_law().control_law) if group != "e"
+    ]
     assert all(log.group(group).values.any() for group in of_law)  # the log holds its state
 
 
 def test_only_gains_change_in_flight() -> None:
-    """Neither the law nor its channels change in flight, and the models of RISE-DI alone, which can be learned."""
+    """Neither the law nor its channels change in flight, and the models of RISE-DI alone, which can
+    be learned.
+    """
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
         assert not controller(name).tunable() & {"law", "outputs", "D", "rate", "learn"}
@@ -260,7 +319,10 @@ def test_only_gains_change_in_flight() -> None:
 def test_another_law_or_observer_refused_in_flight() -> None:
     controller_of_pi = Controller(controller("pi"))
     for name in ("rise_di", "pid", "pi, observer"):
-        expected = r"controller\.law: found \w+, expected the law and the observer that fly: these change at a restart"
+        expected = (
+            r"controller\.law: found \w+, expected the law and the observer that fly: "
+            r"these change at a restart"
+        )
         with pytest.raises(ParameterError, match=expected):
             controller_of_pi.retune(controller(name))
 
@@ -285,19 +347,37 @@ def test_linear_model_predicts_step_of_law(name: str) -> None:
 
 def responses(name: str, parameters: Any, z: complex) -> FloatArray:
     """The transfer matrix from y to u at z, worked out by hand."""
-    T, K = DT, np.array(parameters.K if hasattr(parameters, "K") else gain(np.array(1.0), np.array(parameters.k_d)))
+    T, K = (
+        DT,
+        np.array(
+            parameters.K
+            if hasattr(parameters, "K")
+            else gain(np.array(1.0), np.array(parameters.k_d))
+        ),
+    )
     if name == "l1":
-        Omega, passed = np.reshape(parameters.Omega, (4, 4)), 1.0 - np.exp(-np.array(parameters.bandwidth) * T)
-        low_pass = np.diag(passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0))  # and a pole of 1 1/s in the adaptation
+        Omega, passed = (
+            np.reshape(parameters.Omega, (4, 4)),
+            1.0 - np.exp(-np.array(parameters.bandwidth) * T),
+        )
+        low_pass = np.diag(
+            passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0)
+        )  # and a pole of 1 1/s in the adaptation
         # u = -Omega^-1 (K y + F ((1 - 1/z) y - T / z Omega u))
-        return np.asarray(-np.linalg.solve((np.eye(4) - low_pass * T / z) @ Omega, np.diag(K) + low_pass * (1.0 - 1.0 / z)))
+        return np.asarray(
+            -np.linalg.solve(
+                (np.eye(4) - low_pass * T / z) @ Omega, np.diag(K) + low_pass * (1.0 - 1.0 / z)
+            )
+        )
     series = 1.0 + np.array(parameters.Lambda) * T / 2.0 * (z + 1.0) / (z - 1.0)
     if name == "pid":
         share = 1.0 - np.exp(-T / np.array(parameters.filter_time))
         series = series + np.array(parameters.lead) * share / T * (z - 1.0) / (z - 1.0 + share)
     if name == "rise_di":
         lag = np.array(parameters.lag) + 1.5 * T + parameters.delay
-        series = series + T / (parameters.softening * lag) * z / (z - 1.0)  # beta / (eps K) is 1 / (softening lag)
+        series = series + T / (parameters.softening * lag) * z / (
+            z - 1.0
+        )  # beta / (eps K) is 1 / (softening lag)
     return np.diag(-np.array(parameters.input_scale) * np.array(parameters.D) * K * series)
 
 
@@ -335,20 +415,32 @@ def test_law_is_same_under_jax(name: str) -> None:
 
     params = jax.tree.map(column, law.params)
     generator = np.random.default_rng(1)
-    looks = [Measurements(*(0.05 * generator.standard_normal((4, 3)) for _ in range(5))) for _ in range(5)]
+    looks = [
+        Measurements(*(0.05 * generator.standard_normal((4, 3)) for _ in range(5)))
+        for _ in range(5)
+    ]
     limits = Limits(*(np.full((4, 1), value) for value in (-0.1, 0.1, 1.0)))
     many = law.control_law.engage(looks[0], params)
     compiled = jax.tree.map(jax.numpy.asarray, many)
-    alone = [law.control_law.engage(Measurements(*(signal[:, k] for signal in looks[0][:5])), law.params) for k in range(3)]
-    limited = jax.jit(lambda state, measured: law.control_law.limited(state, measured, DT, params, limits))
+    alone = [
+        law.control_law.engage(Measurements(*(signal[:, k] for signal in looks[0][:5])), law.params)
+        for k in range(3)
+    ]
+    limited = jax.jit(
+        lambda state, measured: law.control_law.limited(state, measured, DT, params, limits)
+    )
     row = Limits(*(limit[:, 0] for limit in limits))
     for measured in looks:
         many, _, u = law.control_law.limited(many, measured, np.float64(DT), params, limits)
         compiled, _, by_jax = limited(compiled, measured)
-        np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)  # the order of additions differs
+        np.testing.assert_allclose(
+            by_jax, u, rtol=1e-9, atol=1e-12
+        )  # the order of additions differs
         for k in range(3):
             one = Measurements(*(value[:, k] for value in measured[:5]))
-            alone[k], _, of_one = law.control_law.limited(alone[k], one, np.float64(DT), law.params, row)
+            alone[k], _, of_one = law.control_law.limited(
+                alone[k], one, np.float64(DT), law.params, row
+            )
             np.testing.assert_allclose(u[:, k], of_one, rtol=1e-9, atol=1e-12)
 
 
@@ -375,9 +467,13 @@ def matrices(parameters: ControllerConfig) -> Matrices:
 def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     generator = np.random.default_rng(1)
     s, m, wide = 6, 2, np.full(2, np.inf)
-    Phi, Gamma, L, F = (0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s)))
+    Phi, Gamma, L, F = (
+        0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s))
+    )
     H = np.eye(m, s)
-    params = ObserverParams(lqg.LqgParams(), Phi, Gamma, H, L, F, Limits(-wide, wide, wide), np.float64(2.0))
+    params = ObserverParams(
+        lqg.LqgParams(), Phi, Gamma, H, L, F, Limits(-wide, wide, wide), np.float64(2.0)
+    )
     law = controller("lqg, observer").tuned_law().control_law
     zero = np.zeros(m)
     e = generator.standard_normal((60, m))
@@ -385,7 +481,9 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     x = np.concatenate([e[0], np.zeros(s - m)])  # the outputs are the first states
     u = zero
     for k, error in enumerate(e):
-        state, commanded = law.step(state, Measurements(error, zero, zero, zero, u), np.float64(DT), params)
+        state, commanded = law.step(
+            state, Measurements(error, zero, zero, zero, u), np.float64(DT), params
+        )
         x = x + L @ (error - H @ x)  # measurement update
         u = -min(1.0, (k + 1) * DT * 2.0) * (F @ x)
         np.testing.assert_allclose(commanded, u, rtol=1e-9, atol=1e-12)
@@ -424,10 +522,12 @@ def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
     assert after.law.z.tolist() == (matrices(new).H.T @ e).tolist()
     assert not after.law.u_o.any()
     assert after.law.sigma.tolist() == [0.0]
-    # the next tick changes u by what the law integrates in a tick and by one hundredth of the new u_o
+    # the next tick changes u by what the law integrates in a tick and by one hundredth of the new
+    # u_o
     next_tick = tick(new, after, 500, e)
     assert (
-        np.abs(next_tick.u - state.u) <= first_change(name, parameters, e, state.u) + np.abs(next_tick.law.u_o) + 1e-12
+        np.abs(next_tick.u - state.u)
+        <= first_change(name, parameters, e, state.u) + np.abs(next_tick.law.u_o) + 1e-12
     ).all()
     assert np.abs(next_tick.law.u_o).max() < 0.02 * np.abs(matrices(new).F @ after.law.z).max()
 
@@ -445,7 +545,11 @@ def refused(sentence: str, values: dict[str, Any]) -> None:
 def test_page_names_every_registered_law_and_parameters() -> None:
     page = (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8")
     for name in laws.names():
-        own = [] if name in {"lqi", "indi"} else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
+        own = (
+            []
+            if name in {"lqi", "indi"}
+            else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
+        )
         for word in (name, *own):
             assert f"`{word}`" in page, word
 
@@ -453,14 +557,23 @@ def test_page_names_every_registered_law_and_parameters() -> None:
 def test_unregistered_law_refused() -> None:
     """The sentence lists the registered laws."""
     registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
-    refused(f"controller.law: found 'adrc', expected a registered law: {registered}", COMMON | {"law": "adrc"})
+    refused(
+        f"controller.law: found 'adrc', expected a registered law: {registered}",
+        COMMON | {"law": "adrc"},
+    )
     refused("controller.law: found ['pi'], expected a registered law", COMMON | {"law": ["pi"]})
 
 
 def test_law_of_more_than_y_refused() -> None:
     topics = "expected a law of y and y_m: the topics have no more"
-    refused(f"controller.law: found 'lqi', which needs the full state, {topics}", COMMON | {"law": "lqi"})
-    refused(f"controller.law: found 'indi', which needs the positions of the actuators, {topics}", COMMON | {"law": "indi"})
+    refused(
+        f"controller.law: found 'lqi', which needs the full state, {topics}",
+        COMMON | {"law": "lqi"},
+    )
+    refused(
+        f"controller.law: found 'indi', which needs the positions of the actuators, {topics}",
+        COMMON | {"law": "indi"},
+    )
 
 
 def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -469,36 +582,56 @@ def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> 
         "function": ["control_laws.pi:params_of"],
         "twice": ["control_laws.pi:PiConfig", "control_laws.l1:L1Config"],
     }
-    entries = EntryPoints(EntryPoint(name, value, laws.GROUP) for name, targets in values.items() for value in targets)
+    entries = EntryPoints(
+        EntryPoint(name, value, laws.GROUP) for name, targets in values.items() for value in targets
+    )
     monkeypatch.setattr(laws, "_registered", lambda: entries)
     for name, sentence in {
-        "absent": "found 'absent', which cannot be loaded (No module named 'absent_package'), expected an installed package",
+        "absent": "found 'absent', which cannot be loaded (No module named 'absent_package'), "
+        "expected an installed package",
         "function": "found 'function', registered as <function params_of",
-        "twice": "found 'twice', registered as control_laws.l1:L1Config and as control_laws.pi:PiConfig, expected one",
+        "twice": "found 'twice', registered as control_laws.l1:L1Config and as "
+        "control_laws.pi:PiConfig, expected one",
     }.items():
         refused(f"controller.law: {sentence}", COMMON | {"law": name})
 
 
 def test_a_parameter_of_another_law_is_refused() -> None:
     pi = sections()["pi"]
-    refused("controller.beta: found a parameter of rise_di, expected those of pi: K, Lambda", pi | {"beta": [1.0] * 4})
+    refused(
+        "controller.beta: found a parameter of rise_di, expected those of pi: K, Lambda",
+        pi | {"beta": [1.0] * 4},
+    )
     refused("controller.K: unknown key", sections()["rise_di"] | {"K": [1.0] * 4})
 
 
 @pytest.mark.parametrize(
     ("name", "changes", "sentence"),
     [
-        ("pi", {"K": [1.0] * 3}, "controller.K: found 3 values, expected 4, one for each of q, p, r, V"),
+        (
+            "pi",
+            {"K": [1.0] * 3},
+            "controller.K: found 3 values, expected 4, one for each of q, p, r, V",
+        ),
         ("l1", {"Omega": [1.0] * 16}, "controller.Omega: found a matrix without a D ("),
-        ("pid", {"filter_time": [0.0] * 4}, "controller.filter_time[0]: found 0.0, expected greater than 0"),
+        (
+            "pid",
+            {"filter_time": [0.0] * 4},
+            "controller.filter_time[0]: found 0.0, expected greater than 0",
+        ),
         (
             "lqg, observer",
             {"observer": None},
-            "controller.observer: found none, expected a section: the observer is the feedback of lqg",
+            (
+                "controller.observer: found none, expected a section: the observer is the feedback "
+                "of lqg"
+            ),
         ),
     ],
 )
-def test_invalid_parameter_of_law_refused(name: str, changes: dict[str, Any], sentence: str) -> None:
+def test_invalid_parameter_of_law_refused(
+    name: str, changes: dict[str, Any], sentence: str
+) -> None:
     refused(sentence, sections()[name] | changes)
 
 
@@ -510,22 +643,43 @@ def test_an_invalid_observer_is_refused() -> None:
     def observed(**changes: Any) -> dict[str, Any]:
         return values | {"observer": observer | changes}
 
-    refused("controller.observer: found no feedforward beside it, expected that section too", values | {"feedforward": None})
-    refused(f"controller.observer.Phi: found {s} values, expected {s * s}: {s} rows of {s}", observed(Phi=[1.0] * s))
+    refused(
+        "controller.observer: found no feedforward beside it, expected that section too",
+        values | {"feedforward": None},
+    )
+    refused(
+        f"controller.observer.Phi: found {s} values, expected {s * s}: {s} rows of {s}",
+        observed(Phi=[1.0] * s),
+    )
     others = [states[1], states[0], *states[2:]]
     refused("controller.observer.states: found x.alpha, x.V, x.q", observed(states=others))
     unstable = np.reshape(observer["Phi"], (s, s)) + 2.0 * np.eye(s)
-    refused("controller.observer.L: found a spectral radius of ", observed(Phi=unstable.ravel().tolist()))
-    refused("controller.observer.F: found a spectral radius of ", observed(F=[-3.0 * gain for gain in observer["F"]]))
-    refused("controller.observer.margin: found a nominal loop that is unstable with u ", observed(margin=0.2))
+    refused(
+        "controller.observer.L: found a spectral radius of ",
+        observed(Phi=unstable.ravel().tolist()),
+    )
+    refused(
+        "controller.observer.F: found a spectral radius of ",
+        observed(F=[-3.0 * gain for gain in observer["F"]]),
+    )
+    refused(
+        "controller.observer.margin: found a nominal loop that is unstable with u ",
+        observed(margin=0.2),
+    )
 
 
 def test_unfit_feedforward_refused() -> None:
-    """A nominal model with a different D is refused, and a model with a zero in the right half plane."""
+    """A nominal model with a different D is refused, and a model with a zero in the right half
+    plane.
+    """
     values = sections()["pi, observer"]
     B = np.reshape(values["feedforward"]["B"], (-1, 4))
     negative = values | {"feedforward": values["feedforward"] | {"B": (-B).ravel().tolist()}}
-    refused("controller.feedforward.B: found a C B with D = [-1, -1, -1, -1], expected D = [1, 1, 1, 1]", negative)
+    refused(
+        "controller.feedforward.B: found a C B with D = [-1, -1, -1, -1], expected D = [1, 1, "
+        "1, 1]",
+        negative,
+    )
     A = np.reshape(values["feedforward"]["A"], (len(B), len(B))).copy()
     hidden = values["feedforward"]["states"].index("alpha")
     A[hidden, hidden] += 20.0  # w diverges by itself

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer: its models against an integrator of scipy, its gains against scipy's Riccati solver."""
+"""Design of the observer: its models against an integrator of scipy, its gains against scipy's
+Riccati solver.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from control_laws.observer_design import ExtendedStateWeights, Names, Weights
 from flight_core.vectors import FloatArray
 
 AIRFRAME = load_airframe("osprey")
-NAMES = Names(tuple(AIRFRAME.states), tuple(AIRFRAME.inputs), AIRFRAME.outputs, tuple(AIRFRAME.gusts))
+NAMES = Names(
+    tuple(AIRFRAME.states), tuple(AIRFRAME.inputs), AIRFRAME.outputs, tuple(AIRFRAME.gusts)
+)
 M = 4
 
 
@@ -42,16 +46,27 @@ def osprey() -> NominalModel:
 
 
 def weights(*batch: int) -> Weights:
-    """Weights around those that a tuning found for the osprey; with leading axes, random ones around these."""
-    middle = Weights(*map(np.array, ([0.05] * M, [0.3] * M, [0.9, 0.4, 0.4], [4.7, 0.6, 1.9], [0.004])))
+    """Weights around those that a tuning found for the osprey; with leading axes, random ones
+    around these.
+    """
+    middle = Weights(
+        *map(np.array, ([0.05] * M, [0.3] * M, [0.9, 0.4, 0.4], [4.7, 0.6, 1.9], [0.004]))
+    )
     generator = np.random.default_rng(1)
     return Weights(
-        *(weight * np.exp(0.3 * generator.standard_normal((*batch, len(weight)))) if batch else weight for weight in middle)
+        *(
+            weight * np.exp(0.3 * generator.standard_normal((*batch, len(weight))))
+            if batch
+            else weight
+            for weight in middle
+        )
     )
 
 
 def extended_weights() -> ExtendedStateWeights:
-    return ExtendedStateWeights(np.full(M, 0.02), np.full(M, 0.3), np.full(M, 10.0), np.full(M, 5.0))
+    return ExtendedStateWeights(
+        np.full(M, 0.02), np.full(M, 0.3), np.full(M, 10.0), np.full(M, 5.0)
+    )
 
 
 def uncertain(count: int) -> NominalModel:
@@ -68,11 +83,15 @@ def test_step_of_aircraft_model_is_motion_of_equations() -> None:
 
     def motion(_: float, z: FloatArray) -> FloatArray:
         x, position, wind, d = np.split(z, [8, 12, 15])
-        x_dot = model.A @ x + model.gravity @ x + model.B @ position + model.wind @ wind + model.C.T @ d
+        x_dot = (
+            model.A @ x + model.gravity @ x + model.B @ position + model.wind @ wind + model.C.T @ d
+        )
         x_dot -= 0.01 * model.kinematic * x
         return np.concatenate([x_dot, (u - position) / model.lag, -wind / wind_time, -0.01 * d])
 
-    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
+        :, -1
+    ]
     np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
@@ -84,9 +103,13 @@ def test_extended_state_step_solves_equations() -> None:
 
     def motion(_: float, z: FloatArray) -> FloatArray:
         _y, position, d, rate = np.split(z, 4)
-        return np.concatenate([model.Omega @ position + d, (u - position) / model.lag, rate - 0.01 * d, -decay * rate])
+        return np.concatenate(
+            [model.Omega @ position + d, (u - position) / model.lag, rate - 0.01 * d, -decay * rate]
+        )
 
-    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
+        :, -1
+    ]
     np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
@@ -103,10 +126,14 @@ def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
         design = observer_design.extended_state_observer(model, NAMES, chosen)
         noise = [np.zeros(M), np.full(M, 1e-6), chosen.drift * size, chosen.rate_drift * size]
     Phi, Gamma, H = design.Phi, design.Gamma, design.H
-    Q, R = H.T @ np.diag(1.0 / size**2) @ H, np.diag((chosen.effort / model.input_scale / size) ** 2)
+    Q, R = (
+        H.T @ np.diag(1.0 / size**2) @ H,
+        np.diag((chosen.effort / model.input_scale / size) ** 2),
+    )
     P = solve_discrete_are(Phi, Gamma, Q, R)
     expected = np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)
-    # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit circle
+    # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit
+    # circle
     np.testing.assert_allclose(design.F, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
     process, measured = np.diag(np.concatenate(noise) ** 2 * model.period), np.diag(model.noise**2)
     S = solve_discrete_are(Phi.T, H.T, process, measured)
@@ -115,7 +142,8 @@ def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
 
 
 def test_extended_state_observer_holds_aircraft_with_unknown_dynamics() -> None:
-    # the osprey under a constant moment and force: the estimate of the disturbance contains them and all of A
+    # the osprey under a constant moment and force: the estimate of the disturbance contains them
+    # and all of A
     model = osprey()
     design = observer_design.extended_state_observer(model, NAMES, extended_weights())
     plant = observer_design.aircraft_model(model, NAMES, np.ones(3))
@@ -128,6 +156,7 @@ def test_extended_state_observer_holds_aircraft_with_unknown_dynamics() -> None:
         u = -design.F @ z
         z, x = design.Phi @ z + design.Gamma @ u, plant.Phi @ x + plant.Gamma @ u
         largest.append(np.abs(y).max())
-    # alone, the moment would turn the aircraft at 0.05 rad/s in 0.1 s and the force accelerate it to 15 m/s in 30 s
+    # alone, the moment would turn the aircraft at 0.05 rad/s in 0.1 s and the force accelerate it
+    # to 15 m/s in 30 s
     assert max(largest) < 0.2
     assert largest[-1] < 0.01

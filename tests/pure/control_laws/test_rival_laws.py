@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each control law against an independent result: a closed form, another recursion, an exact integration of a known plant."""
+"""Each control law against an independent result: a closed form, another recursion, an exact
+integration of a known plant.
+"""
 
 from typing import Any, NamedTuple
 
@@ -70,14 +72,26 @@ class Flight(NamedTuple):
     state: Any
 
 
-def fly(law: ControlLaw, params: Any, ticks: int, y: float, d: Any, model: NominalModel, Omega: float | None = None) -> Flight:
-    """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m = 0, actuators ideal."""
+def fly(
+    law: ControlLaw,
+    params: Any,
+    ticks: int,
+    y: float,
+    d: Any,
+    model: NominalModel,
+    Omega: float | None = None,
+) -> Flight:
+    """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m
+    = 0, actuators ideal.
+    """
     response = model.Omega[0, 0] if Omega is None else Omega
     measured, ys, us = at(y), [], []
     state = law.engage(measured, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
-        state, _, u = law.limited(state, at(y, u_before=u, position=u), np.array(model.period), params, model.limits)
+        state, _, u = law.limited(
+            state, at(y, u_before=u, position=u), np.array(model.period), params, model.limits
+        )
         ys.append(y)
         us.append(u.item())
         y += model.period * (response * u.item() + (d(k) if callable(d) else d))
@@ -95,11 +109,18 @@ def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, A
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8), st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
+@given(
+    st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8),
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
+)
 def test_inversion_cancels_model_and_leaves_error_own_dynamics(
     osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
 ) -> None:
-    x, y_m_dot, K = np.array(x_of)[:, None], np.array(y_m_dot_of)[:, None], np.array([[9.0], [8.0], [4.0], [2.0]])
+    x, y_m_dot, K = (
+        np.array(x_of)[:, None],
+        np.array(y_m_dot_of)[:, None],
+        np.array([[9.0], [8.0], [4.0], [2.0]]),
+    )
     control_law, params = law_of("di", osprey, K=K)
     y = osprey.C @ x
     measured = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
@@ -117,7 +138,9 @@ def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -
     u = {}
     for name in ("di", "di_vanes"):
         control_law, params = law_of(name, osprey, K=np.ones((4, 1)))
-        u[name] = control_law.step(control_law.engage(measured, params), measured, np.array(DT), params)[1]
+        u[name] = control_law.step(
+            control_law.engage(measured, params), measured, np.array(DT), params
+        )[1]
     assert not u["di"].any()
     np.testing.assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
 
@@ -137,9 +160,15 @@ def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
     Q = np.tile(estimator.H.T @ estimator.H, (5, 1, 1))
     R = riccati.diagonal(np.exp(generator.normal(-3.0, 1.0, (4, 5))).T)
     found = riccati.riccati(estimator.Phi, estimator.Gamma, Q, R)
-    for k in range(5):  # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit circle
+    for k in range(
+        5
+        # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the
+        # unit circle
+    ):
         expected = solve_discrete_are(estimator.Phi, estimator.Gamma, Q[k], R[k])
-        np.testing.assert_allclose(found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max()
+        )
 
 
 def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps: int) -> FloatArray:
@@ -153,25 +182,33 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
 
 
 def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
-    size, weights = osprey.C @ osprey.size, gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
+    size, weights = (
+        osprey.C @ osprey.size,
+        gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0),
+    )
     F, G, E = lqi.design(osprey, 4.0)
     found = lqi.lqi_params(weights, osprey).gain[..., 0]
     Q = E.T @ np.diag(np.concatenate([1.0 / size**2, (2.0 / size) ** 2])) @ E
     R = np.diag((0.1 / osprey.input_scale / size) ** 2)
-    # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to end
+    # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to
+    # end
     np.testing.assert_allclose(found, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
     slow = np.sort(np.abs(np.linalg.eigvals(F - G @ found)))
-    # two angles and four references decay with LEAK for any gain; all other modes of the loop are faster than 0.3 1/s
+    # two angles and four references decay with LEAK for any gain; all other modes of the loop are
+    # faster than 0.3 1/s
     assert np.all(slow[-6:] == pytest.approx(np.exp(-lqi.LEAK * osprey.period), abs=1e-6))
     assert slow[-7] < np.exp(-0.3 * osprey.period)
 
 
 def test_the_acceleration_based_law_by_hand() -> None:
     model = integrator(Omega=2.0, period=0.1)
-    control_law, params = law_of("mackunis_ideal", model, K=3.0, Lambda=2.0, beta=5.0, softening=0.24)  # eps = 5 / 3 0.24 = 0.4
+    control_law, params = law_of(
+        "mackunis_ideal", model, K=3.0, Lambda=2.0, beta=5.0, softening=0.24
+    )  # eps = 5 / 3 0.24 = 0.4
     state = control_law.engage(at(0.0), params)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
-    # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2 + 0.02) + 0.125) / 2
+    # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2
+    # + 0.02) + 0.125) / 2
     assert u.item() == pytest.approx(-(0.66 + 0.125) / 2.0, rel=1e-12)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, 9.0)), np.array(0.1), params)
     # r far beyond eps: Pi = 0.125 + 0.5, integral = 0.03
@@ -180,7 +217,9 @@ def test_the_acceleration_based_law_by_hand() -> None:
 
 def test_filtered_difference_of_ramp_converges_to_slope() -> None:
     model = integrator()
-    control_law, params = law_of("mackunis", model, K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6)
+    control_law, params = law_of(
+        "mackunis", model, K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6
+    )
     state = control_law.engage(at(0.0), params)
     for k in range(1, 301):
         state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
@@ -198,8 +237,16 @@ def test_l1_estimates_disturbance_in_one_tick() -> None:
 
 def test_l1_rejects_constant_disturbance_with_wrong_input_gain() -> None:
     model = integrator()
-    flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
-    # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
+    flight = fly(
+        *law_of("l1", model, K=3.0, bandwidth=20.0),
+        1500,
+        0.0,
+        0.7,
+        model,
+        Omega=1.4 * model.Omega[0, 0],
+    )
+    # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the
+    # estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
     assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
 
@@ -211,7 +258,9 @@ def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model with d
     for k in range(500):
-        measured = at(y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_trim=u_ff, u_before=u)
+        measured = at(
+            y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_trim=u_ff, u_before=u
+        )
         state = control_law.engage(measured, params) if state is None else state
         state, u = control_law.step(state, measured, np.array(DT), params)
         y += DT * (model.Omega[0, 0] * u.item() + d)
@@ -221,9 +270,13 @@ def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
 
 def test_weights_of_mrac_converge_to_model_error() -> None:
     model = integrator()
-    flight = fly(*law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model)
+    flight = fly(
+        *law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model
+    )
     assert abs(flight.y[-1]) < 1e-6
-    assert flight.state.W[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
+    assert flight.state.W[0, 1, 0] == pytest.approx(
+        0.7, rel=1e-4
+    )  # the weight of 1 is the disturbance
 
 
 def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
@@ -233,11 +286,14 @@ def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     W, y, u, values, decay = control_law.engage(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
     for _ in range(10_000):
         # the weights to be learned: 0 of x, d of the constant
-        values.append(y**2 / 2.0 + (W.W[0, 0, 0] ** 2 + (W.W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay)
+        values.append(
+            y**2 / 2.0 + (W.W[0, 0, 0] ** 2 + (W.W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay
+        )
         decay += K * y**2 * model.period
         W, u = control_law.step(W, at(y, u_before=u), np.array(model.period), params)
         y += model.period * (2.0 * u.item() + d)
-    # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1 in 1000
+    # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1
+    # in 1000
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
 
 
@@ -258,33 +314,46 @@ def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
     control_law, params = law_of("self_tuner", model, **self_tuner_gains())
     state, u = control_law.engage(at(y), params), np.zeros(COLUMN)
     for k in range(600):
-        state, u = control_law.step(state, at(y, 0.1 * (-1.0) ** (k // 100), u_before=u), np.array(DT), params)
+        state, u = control_law.step(
+            state, at(y, 0.1 * (-1.0) ** (k // 100), u_before=u), np.array(DT), params
+        )
         y += DT * (A * y + Omega * u.item())
     # input scale 1 / 2; the prior is 1e8 times weaker than the signals
     np.testing.assert_allclose(state.theta[0, :, 0], [A, Omega / 2.0, 0.0], atol=1e-4)
 
 
 def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
-    model, a, ticks, memory, deviation = integrator(), 1.0 - np.exp(-10.0 * DT), 40, 0.5, np.array([2.0, 3.0, 5.0])
+    model, a, ticks, memory, deviation = (
+        integrator(),
+        1.0 - np.exp(-10.0 * DT),
+        40,
+        0.5,
+        np.array([2.0, 3.0, 5.0]),
+    )
     own = self_tuner_gains(memory=memory, prior_A=2.0, prior_Omega=3.0, prior_bias=5.0)
     control_law, params = law_of("self_tuner", model, **own)
     y, u = np.random.default_rng(1).normal(0.0, [[1.0], [3.0]], (2, ticks))
     y[0] = u[0] = 0.0
     state = control_law.engage(at(0.0), params)
     for k in range(ticks):
-        state, _ = control_law.step(state, at(y[k], u_before=np.full(COLUMN, u[k])), np.array(DT), params)
+        state, _ = control_law.step(
+            state, at(y[k], u_before=np.full(COLUMN, u[k])), np.array(DT), params
+        )
     y_f, u_f = (lfilter([a], [1.0, a - 1.0], signal) for signal in (y, u))
     before = np.concatenate([[0.0], y_f[:-1]])
     phi = np.stack([before, 2.0 * u_f, np.ones(ticks)], axis=1)
     nominal = np.array([0.0, 1.0, 0.0])
-    # 3 unknowns a tick: theta is a Markov process around the nominal with this deviation, seen with noise of variance 1 / dt
+    # 3 unknowns a tick: theta is a Markov process around the nominal with this deviation, seen with
+    # noise of variance 1 / dt
     kept = np.exp(-DT / memory)
     step = np.eye(3 * ticks) - kept * np.eye(3 * ticks, k=-3)
     of_step = np.tile(1.0 / (deviation * np.sqrt(1.0 - kept**2)), ticks)
     of_step[:3] = 1.0 / deviation
     seen = np.sqrt(DT) * block_diag(*phi[:, None, :])
     residual = np.sqrt(DT) * ((y_f - before) / DT - phi @ nominal)
-    found, *_ = np.linalg.lstsq(np.vstack([seen, of_step[:, None] * step]), np.append(residual, np.zeros(3 * ticks)))
+    found, *_ = np.linalg.lstsq(
+        np.vstack([seen, of_step[:, None] * step]), np.append(residual, np.zeros(3 * ticks))
+    )
     np.testing.assert_allclose(state.theta[0, :, 0], nominal + found[-3:], rtol=1e-8)
 
 
@@ -295,7 +364,9 @@ def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalM
     for _ in range(5):
         before, _ = control_law.step(before, calm, 5.0 * params.memory[0, 0], params)
     # exp(-25) of theta and exp(-50) of P are left; the bias alone is seen in calm
-    np.testing.assert_allclose(before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9)
+    np.testing.assert_allclose(
+        before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9
+    )
     np.testing.assert_allclose(before.P[:-1, :-1], state.P[:-1, :-1], atol=1e-12)
 
 
@@ -306,15 +377,28 @@ def test_self_tuner_keeps_signs_and_least_size_of_effects(osprey: NominalModel) 
     np.testing.assert_allclose(self_tuner.solve(Omega, nu, osprey.D), expected, rtol=1e-12)
     for share in (-1.0, 0.0, 0.1):  # an estimate of the wrong sign, or too small
         wrong = share * np.eye(4)[..., None]
-        np.testing.assert_allclose(self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT)
-    np.testing.assert_allclose(self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT)
+        np.testing.assert_allclose(
+            self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT
+        )
+    np.testing.assert_allclose(
+        self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT
+    )
 
 
 def test_indi_needs_no_model_except_input_gain() -> None:
     model = integrator()
     for Omega in (2.0, 1.4, 2.6):
-        flight = fly(*law_of("indi", model, K=2.0, bandwidth=60.0, share=1.0), 1500, 0.2, 0.7, model, Omega=Omega)
-        assert abs(flight.y[-1]) < 1e-6, Omega  # exp(-2 15) of the start and the disturbance, were it first order
+        flight = fly(
+            *law_of("indi", model, K=2.0, bandwidth=60.0, share=1.0),
+            1500,
+            0.2,
+            0.7,
+            model,
+            Omega=Omega,
+        )
+        assert abs(flight.y[-1]) < 1e-6, (
+            Omega
+        )  # exp(-2 15) of the start and the disturbance, were it first order
         assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
 
 
@@ -327,17 +411,26 @@ def reaching(e_0: float) -> float:
 
 def test_super_twisting_reaching_time() -> None:
     """The reaching time is proportional to the root of the initial error."""
-    # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long from anywhere.
-    # 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some ten steps of 1 s
+    # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long
+    # from anywhere. 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some
+    # ten steps of 1 s
     assert reaching(4.0) == pytest.approx(2.0 * reaching(1.0), rel=0.01)
 
 
 def test_super_twisting_rejects_a_ramp_disturbance() -> None:
     model = integrator(period=2e-4)
-    flight = fly(*law_of("twisting", model, root=4.0, beta=3.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # d_dot = 2 < 3
-    assert np.abs(flight.y[15_000:]).max() < 3e-6  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
-    linear = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)
-    assert np.abs(linear.y[15_000:]).min() > 0.1  # d_dot / (K Lambda) = 0.125: an integral alone follows late
+    flight = fly(
+        *law_of("twisting", model, root=4.0, beta=3.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
+    )  # d_dot = 2 < 3
+    assert (
+        np.abs(flight.y[15_000:]).max() < 3e-6
+    )  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
+    linear = fly(
+        *law_of("di_pi", model, K=8.0, Lambda=2.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
+    )
+    assert (
+        np.abs(linear.y[15_000:]).min() > 0.1
+    )  # d_dot / (K Lambda) = 0.125: an integral alone follows late
 
 
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
@@ -348,12 +441,16 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     for k in range(1, 6):
         state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
-    np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
+    np.testing.assert_allclose(
+        u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12
+    )
 
 
 def test_observer_converges(osprey: NominalModel) -> None:
     """The estimates converge to states, wind and disturbance of the model."""
-    values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}  # s: faster than the 30 s below
+    values = initial_gains(LAWS["lqg"], osprey) | {
+        "wind_time": np.full((3, 1), 0.6)
+    }  # s: faster than the 30 s below
     _, params = law_of("lqg", osprey, **values)
     Phi, Gamma, H, correction = params.Phi[..., 0], params.Gamma, params.H, params.L[..., 0]
     Gamma = Gamma[..., 0] if Gamma.ndim > 2 else Gamma
@@ -363,15 +460,18 @@ def test_observer_converges(osprey: NominalModel) -> None:
         u = 0.01 * generator.standard_normal(4)
         z_hat = z_hat + correction @ (H @ (z - z_hat))
         z, z_hat = Phi @ z + Gamma @ u, Phi @ z_hat + Gamma @ u
-    # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of them is left after 30 s;
-    # the combination that acts on the outputs is observable: compare the prediction of e one second ahead
+    # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of
+    # them is left after 30 s; the combination that acts on the outputs is observable: compare the
+    # prediction of e one second ahead
     assert np.abs(H @ np.linalg.matrix_power(Phi, 100) @ (z - z_hat)).max() < 1e-4
     assert np.abs(np.linalg.eigvals(Phi - Phi @ correction @ H)).max() < 1.0
 
 
 def test_anti_windup_stops_and_releases_integral() -> None:
     """The integral stops in saturation, and moves on the way back."""
-    integral = conditional_integration(np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0]))
+    integral = conditional_integration(
+        np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0])
+    )
     assert integral.tolist() == [0.0, 1.0, 1.0]
 
 
@@ -379,16 +479,38 @@ def test_anti_windup_stops_and_releases_integral() -> None:
 def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
     """A law gives the same under NumPy and JAX, and over a fleet."""
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
-    shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))  # all but the vanes
-    looks = [Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes)) for _ in range(4)]
-    state, single = control_law.engage(looks[0], params), [np.asarray(signal)[..., :1] for signal in looks[0][:9]]
-    compiled, alone = jax.tree.map(jax.numpy.asarray, state), control_law.engage(Measurements(*single), params)
+    shapes = (
+        (4, 3),
+        (4, 1),
+        (4, 1),
+        (4, 1),
+        (4, 3),
+        (4, 3),
+        (8, 3),
+        (8, 3),
+        (4, 3),
+    )  # all but the vanes
+    looks = [
+        Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes))
+        for _ in range(4)
+    ]
+    state, single = (
+        control_law.engage(looks[0], params),
+        [np.asarray(signal)[..., :1] for signal in looks[0][:9]],
+    )
+    compiled, alone = (
+        jax.tree.map(jax.numpy.asarray, state),
+        control_law.engage(Measurements(*single), params),
+    )
     step = jax.jit(control_law.step)
     for measured in looks:
         state, u = control_law.step(state, measured, np.array(DT), params)
         compiled, by_jax = step(compiled, measured, DT, params)
         alone, first = control_law.step(
-            alone, Measurements(*(np.asarray(signal)[..., :1] for signal in measured[:9])), np.array(DT), params
+            alone,
+            Measurements(*(np.asarray(signal)[..., :1] for signal in measured[:9])),
+            np.array(DT),
+            params,
         )
         # nothing but the order of additions differs
         np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)

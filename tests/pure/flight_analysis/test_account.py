@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a flight: every command says what a log lacks, and no figure stands for more than was recorded."""
+"""The account of a flight: every command says what a log lacks, and no figure stands for more than
+was recorded.
+"""
 
 import json
 import shutil
@@ -66,14 +68,34 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return result
 
 
-def test_whole_log_lacks_nothing(whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends included."""
-    assert (figures["outcome"], figures["notes"], figures["account"]["lacks"]) == ("completed", [], [])
+def test_whole_log_lacks_nothing(
+    whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends
+    included.
+    """
+    assert (figures["outcome"], figures["notes"], figures["account"]["lacks"]) == (
+        "completed",
+        [],
+        [],
+    )
     counts = {name: topic["expected"] for name, topic in figures["account"]["topics"].items()}
-    assert counts == {"y": 1001, "y_m": 1001, "truth": 1001, "u": 201, "internals": 201, "pose": 101}
+    assert counts == {
+        "y": 1001,
+        "y_m": 1001,
+        "truth": 1001,
+        "u": 201,
+        "internals": 201,
+        "pose": 101,
+    }
     assert [taken_over(figures, table) for table in TABLES] == ["", "", ""]
     result = replayed(whole, capsys)
-    assert (result["checked"], result["ticks"], result["expected"], result["notes"]) == (201, 201, 201, [])
+    assert (result["checked"], result["ticks"], result["expected"], result["notes"]) == (
+        201,
+        201,
+        201,
+        [],
+    )
 
 
 @pytest.mark.parametrize("since", [0, EPOCH], ids=["flight time", "time of day"])
@@ -88,9 +110,14 @@ def test_every_command_says_what_log_lacks(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    log = damage(whole, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name], from_ns=since)
+    log = damage(
+        whole, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name], from_ns=since
+    )
     if topic in {"y", "y_m"} and name == "stamps are zero":
-        with pytest.raises(ParameterError, match=f"found no sample of {topic} with a stamp, expected a flight with y and y_m"):
+        with pytest.raises(
+            ParameterError,
+            match=f"found no sample of {topic} with a stamp, expected a flight with y and y_m",
+        ):
             read_flight(log)
         return
     summary = read_flight(log).summary
@@ -111,18 +138,25 @@ def test_every_command_says_what_log_lacks(
         assert result["checked"] < result["expected"] == 201
 
 
-def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_prints_part_beside_figures(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
     with pytest.raises(typer.Exit) as end:
         report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
     assert end.value.exit_code == STATUS_INCOMPLETE
     output = " ".join(capsys.readouterr().out.split())
     assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
-    assert "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in output
+    assert (
+        "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of "
+        "2.000 s" in output
+    )
     assert "over 33 % of truth" in (log.parent / "report.html").read_text(encoding="utf-8")
 
 
-def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay_claims_no_tick_without_its_u(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/u", DAMAGES["ends at a third"])
     with pytest.raises(typer.Exit):
         replay(log)
@@ -132,23 +166,37 @@ def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize(
-    ("begin", "outcome"), [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")]
+    ("begin", "outcome"),
+    [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")],
 )
-def test_flight_counts_from_its_first_u(begin: float, outcome: str, tape: Tape, osprey_gust: Scenario) -> None:
+def test_flight_counts_from_its_first_u(
+    begin: float, outcome: str, tape: Tape, osprey_gust: Scenario
+) -> None:
     """As of a controller that takes a y after many that were too old."""
-    late = {name: tape[name] for name in ("y", "y_m", "truth")} | {"u": tape["u"].where(tape.time("u") >= begin)}
-    assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(outcome)
+    late = {name: tape[name] for name in ("y", "y_m", "truth")} | {
+        "u": tape["u"].where(tape.time("u") >= begin)
+    }
+    assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(
+        outcome
+    )
 
 
 @pytest.mark.parametrize(
     ("of_y", "lost", "lacks"),
     [("without", 0, True), ("with", 0, True), ("without", 1, True), ("after", 0, False)],
-    ids=["log ends with y and pose", "pose alone is missing", "messages were lost", "pose goes on after the end"],
+    ids=[
+        "log ends with y and pose",
+        "pose alone is missing",
+        "messages were lost",
+        "pose goes on after the end",
+    ],
 )
 def test_samples_that_busy_host_withheld_are_no_lack_of_log(
     of_y: str, lost: int, lacks: bool, tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the pose was sent."""
+    """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the
+    pose was sent.
+    """
     begin_ns, until = NANOSECONDS * 1_795_000_000, 1.8 if of_y == "after" else 2.0
     withheld = ("y", "truth", "pose") if of_y == "without" else ("pose",)
     signals = {}
@@ -166,13 +214,19 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
     metadata = (run / METADATA).read_text(encoding="utf-8")
     name = bag_files(run)[0].name
     (run / METADATA).write_text(
-        metadata.replace(f"relative_file_paths:\n  - {name}", f"relative_file_paths:\n  - {name}\n  - part_1.mcap"),
+        metadata.replace(
+            f"relative_file_paths:\n  - {name}",
+            f"relative_file_paths:\n  - {name}\n  - part_1.mcap",
+        ),
         encoding="utf-8",
     )
     assert "part_1.mcap" in (run / METADATA).read_text(encoding="utf-8")
     summary = read_flight(run).summary
     assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
-    assert summary["outcome"] == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+    assert (
+        summary["outcome"]
+        == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,7 +238,9 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
         (0, 1, False),
     ],
 )
-def test_one_missing_sample_is_no_lack_of_short_topic(found: int, expected: int, whole: bool) -> None:
+def test_one_missing_sample_is_no_lack_of_short_topic(
+    found: int, expected: int, whole: bool
+) -> None:
     """99 %, or all but one: the last tick of a flight may come after its end."""
     topic = TopicAccount(expected, found, 0.0, 0.97, 0.01, 0.5, 0, 0, 0.0, 0, 0)
     assert topic.holds(found) == whole
@@ -244,20 +300,30 @@ def test_clock_step_is_found_across_batches() -> None:
     assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
 
 
-def test_channel_of_scenario_that_y_does_not_have_is_a_lack(tape: Tape, osprey_gust: Scenario) -> None:
+def test_channel_of_scenario_that_y_does_not_have_is_a_lack(
+    tape: Tape, osprey_gust: Scenario
+) -> None:
     y = tape["y"]
     other = Signal(y.stamp_ns, ("pitch_rate", *y.names[1:]), y.values)
-    assert account(replace(tape, signals={**tape.signals, "y": other}), osprey_gust).lacks == (f"{y.names[0]} of y",)
+    assert account(replace(tape, signals={**tape.signals, "y": other}), osprey_gust).lacks == (
+        f"{y.names[0]} of y",
+    )
 
 
-def test_samples_before_the_flight_stand_for_none_of_the_flight(tape: Tape, osprey_gust: Scenario) -> None:
+def test_samples_before_the_flight_stand_for_none_of_the_flight(
+    tape: Tape, osprey_gust: Scenario
+) -> None:
     early = replace(tape["u"], stamp_ns=tape["u"].stamp_ns - 1000 * NANOSECONDS)
-    of = account(replace(tape, signals={**tape.signals, "u": early}, scenario=osprey_gust), osprey_gust)
+    of = account(
+        replace(tape, signals={**tape.signals, "u": early}, scenario=osprey_gust), osprey_gust
+    )
     assert of.topics["u"].found == 0
 
 
 def test_rms_is_weighted_by_time() -> None:
-    """Of a second with e = 3, nine tenths are missing after a second with e = 1: by hand sqrt((1 + 9) / 2)."""
+    """Of a second with e = 3, nine tenths are missing after a second with e = 1: by hand sqrt((1 +
+    9) / 2).
+    """
     t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
     e = np.where(t < 1.0, 1.0, 3.0)
     times = sample_times(np.round(t * 1e9).astype(np.int64))
@@ -266,9 +332,16 @@ def test_rms_is_weighted_by_time() -> None:
 
 
 def test_process_has_ready_time_of_its_own_start() -> None:
-    """A controller that was killed and started again, of two aircraft, beside a recorder without samples."""
+    """A controller that was killed and started again, of two aircraft, beside a recorder without
+    samples.
+    """
     second = NANOSECONDS
-    ready = [("/recorder", 1), ("/one/controller", 2), ("/controller", 3 * second), ("/controller", 40 * second)]
+    ready = [
+        ("/recorder", 1),
+        ("/one/controller", 2),
+        ("/controller", 3 * second),
+        ("/controller", 40 * second),
+    ]
     spans = {
         "/controller#9": Span(10 * second, 30 * second, 2000),
         "/controller#4": Span(41 * second, 60 * second, 1900),
@@ -286,6 +359,11 @@ def test_process_has_ready_time_of_its_own_start() -> None:
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
     """The first edge of the scenario is at 2.0 s, the end of the flight."""
     edges = pulse_edges(find_scenario("osprey_gust"))
-    assert figures["account"]["commands"] == {"given": len(edges), "flown": 1, "targets": 0, "taken": 0}
+    assert figures["account"]["commands"] == {
+        "given": len(edges),
+        "flown": 1,
+        "targets": 0,
+        "taken": 0,
+    }
     assert command_results(figures) == f"1 of {len(edges)} commands flown"
     assert figures["account"]["processes"] == {}  # of a flight in one process

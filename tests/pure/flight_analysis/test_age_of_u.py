@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft: read from diagnostics of an independent publisher, judged by the delay margin of the gains."""
+"""The age of u at the aircraft: read from diagnostics of an independent publisher, judged by the
+delay margin of the gains.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -21,7 +23,10 @@ def diagnostics(second: int, node: str, **values: str) -> bytes:
     """A message of /diagnostics of a node."""
     types: dict[str, Any] = STORE.types
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](second, 0), "")
-    pairs = [types["diagnostic_msgs/msg/KeyValue"](key.replace("_", " ") + " (s)", value) for key, value in values.items()]
+    pairs = [
+        types["diagnostic_msgs/msg/KeyValue"](key.replace("_", " ") + " (s)", value)
+        for key, value in values.items()
+    ]
     status = types["diagnostic_msgs/msg/DiagnosticStatus"](0, node, "", node, pairs)
     array = "diagnostic_msgs/msg/DiagnosticArray"
     return bytes(STORE.serialize_cdr(types[array](header, [status]), array))
@@ -50,12 +55,24 @@ def margin() -> float:
     return margins(SERVO).delay
 
 
-@pytest.mark.parametrize(("beyond", "verdict"), [(-2.0, ""), (-0.001, "within the margin"), (0.001, "more than the margin")])
-def test_age_of_u_beside_delay_margin_of_gains(beyond: float, verdict: str, tape: Tape, margin: float) -> None:
-    """`beyond` is the age beyond the delay of the gains and their margin, s; an age as planned has no note."""
+@pytest.mark.parametrize(
+    ("beyond", "verdict"),
+    [(-2.0, ""), (-0.001, "within the margin"), (0.001, "more than the margin")],
+)
+def test_age_of_u_beside_delay_margin_of_gains(
+    beyond: float, verdict: str, tape: Tape, margin: float
+) -> None:
+    """`beyond` is the age beyond the delay of the gains and their margin, s; an age as planned has
+    no note.
+    """
     mean = max(SERVO.controller.delay + margin + beyond, 0.0)
-    figures = summarise(replace(tape, signals={**tape.signals, "age_of_u": signal([0, 1], mean=mean, max=1.0)}), SERVO)
+    figures = summarise(
+        replace(tape, signals={**tape.signals, "age_of_u": signal([0, 1], mean=mean, max=1.0)}),
+        SERVO,
+    )
     assert figures["age_of_u"] == {"mean": mean, "max": 1.0}
     notes = [note for note in figures["notes"] if note.startswith("u is ")]
-    assert [note.rpartition(": ")[2].partition(";")[0] for note in notes] == ([verdict] if verdict else [])
+    assert [note.rpartition(": ")[2].partition(";")[0] for note in notes] == (
+        [verdict] if verdict else []
+    )
     assert all(f"delay margin of {1e3 * margin:.1f} ms" in note for note in notes)

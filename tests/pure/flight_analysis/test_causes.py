@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cause that an account names has its evidence in the log: no damage of a log is told as a busy host."""
+"""The cause that an account names has its evidence in the log: no damage of a log is told as a busy
+host.
+"""
 
 import json
 import shutil
@@ -55,7 +57,9 @@ class Messages(list[Sent]):
 
 
 def read_messages(log: Path) -> Messages:
-    """The messages of a log by the time of day, numbered as by its publishers, stored 1 ms after the stamp."""
+    """The messages of a log by the time of day, numbered as by its publishers, stored 1 ms after
+    the stamp.
+    """
     numbers: Counter[str] = Counter()
     messages = []
     with log.open("rb") as stream:
@@ -64,11 +68,15 @@ def read_messages(log: Path) -> Messages:
                 numbers[channel.topic] += 1
                 stamp_ns = EPOCH + stamp_of(message.data)
                 data = restamped(message.data, stamp_ns)
-                messages.append(Sent(channel.topic, stamp_ns + 1_000_000, numbers[channel.topic], data))
+                messages.append(
+                    Sent(channel.topic, stamp_ns + 1_000_000, numbers[channel.topic], data)
+                )
     return Messages(sorted(messages, key=lambda sent: sent.log_ns))
 
 
-def write_messages(log: Path, copy: Path, messages: Sequence[Sent], *, attached: bool = True) -> Path:
+def write_messages(
+    log: Path, copy: Path, messages: Sequence[Sent], *, attached: bool = True
+) -> Path:
     """Write messages with the schemas and the attachments of a log, in small chunks."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:
@@ -76,16 +84,22 @@ def write_messages(log: Path, copy: Path, messages: Sequence[Sent], *, attached:
         writer = Writer(target, chunk_size=30_000)
         writer.start(profile="ros2", library="damaged")
         for stored in reader.iter_attachments() if attached else ():
-            writer.add_attachment(stored.log_time, stored.create_time, stored.name, stored.media_type, stored.data)
+            writer.add_attachment(
+                stored.log_time, stored.create_time, stored.name, stored.media_type, stored.data
+            )
         summary = reader.get_summary()
         assert summary is not None
         channels = {}
         for channel in summary.channels.values():
             schema = summary.schemas[channel.schema_id]
             identity = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, identity)
+            channels[channel.topic] = writer.register_channel(
+                channel.topic, channel.message_encoding, identity
+            )
         for sent in messages:
-            writer.add_message(channels[sent.topic], sent.log_ns, sent.data, sent.log_ns, sent.number)
+            writer.add_message(
+                channels[sent.topic], sent.log_ns, sent.data, sent.log_ns, sent.number
+            )
         writer.finish()  # type: ignore[no-untyped-call]
     return copy
 
@@ -102,7 +116,9 @@ def damaged(messages: list[Sent], kind: str, at: float, size: float, topic: str)
     end_ns = begin_ns + nanoseconds(size)
     leap_ns = nanoseconds(size)
     hit = {topic} if topic else {*STAMPED}
-    stays = dict(zip(messages, np.random.default_rng(1).random(len(messages)) > at / 2.0, strict=True))
+    stays = dict(
+        zip(messages, np.random.default_rng(1).random(len(messages)) > at / 2.0, strict=True)
+    )
 
     def is_hit(sent: Sent) -> bool:
         return sent.topic in hit
@@ -114,11 +130,17 @@ def damaged(messages: list[Sent], kind: str, at: float, size: float, topic: str)
 
     changes: dict[str, Callable[[], list[Sent]]] = {
         "cut": lambda: [sent for sent in messages if not (is_hit(sent) and sent.log_ns > begin_ns)],
-        "begun late": lambda: [sent for sent in messages if not (is_hit(sent) and sent.log_ns < begin_ns)],
-        "hole": lambda: [sent for sent in messages if not (is_hit(sent) and begin_ns < sent.log_ns < end_ns)],
+        "begun late": lambda: [
+            sent for sent in messages if not (is_hit(sent) and sent.log_ns < begin_ns)
+        ],
+        "hole": lambda: [
+            sent for sent in messages if not (is_hit(sent) and begin_ns < sent.log_ns < end_ns)
+        ],
         "thinned": lambda: [sent for sent in messages if not is_hit(sent) or stays[sent]],
         "unset": lambda: [
-            sent._replace(data=restamped(sent.data, 0)) if is_hit(sent) and begin_ns < sent.log_ns < end_ns else sent
+            sent._replace(data=restamped(sent.data, 0))
+            if is_hit(sent) and begin_ns < sent.log_ns < end_ns
+            else sent
             for sent in messages
         ],
         "stamps forth": lambda: [moved(sent, leap_ns, 0) for sent in messages],
@@ -152,15 +174,26 @@ def test_no_damage_of_a_log_is_told_as_a_busy_host(
     topic: str,
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
-    log = write_messages(recorded / "run_0.mcap", folder / "run_0.mcap", damaged(numbered, kind, at, size, topic))
+    log = write_messages(
+        recorded / "run_0.mcap", folder / "run_0.mcap", damaged(numbered, kind, at, size, topic)
+    )
     check(log)
     shutil.rmtree(folder)
 
 
 @few
-@given(at=st.floats(0.02, 0.98), size=st.sampled_from([1, 200, 5000]), kind=st.sampled_from(["cut", "inverted", "removed"]))
+@given(
+    at=st.floats(0.02, 0.98),
+    size=st.sampled_from([1, 200, 5000]),
+    kind=st.sampled_from(["cut", "inverted", "removed"]),
+)
 def test_no_damaged_byte_is_told_as_a_busy_host(
-    numbered: Messages, recorded: Path, tmp_path_factory: pytest.TempPathFactory, at: float, size: int, kind: str
+    numbered: Messages,
+    recorded: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    at: float,
+    size: int,
+    kind: str,
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
     log = write_messages(recorded / "run_0.mcap", folder / "run_0.mcap", numbered)
@@ -169,7 +202,9 @@ def test_no_damaged_byte_is_told_as_a_busy_host(
     middle = content[place : place + size]
     rest = content[place + size :]
     inverted = bytes(byte ^ 0x55 for byte in middle)
-    log.write_bytes(content[:place] + {"cut": b"", "inverted": inverted + rest, "removed": rest}[kind])
+    log.write_bytes(
+        content[:place] + {"cut": b"", "inverted": inverted + rest, "removed": rest}[kind]
+    )
     check(log)
     shutil.rmtree(folder)
 
@@ -201,8 +236,14 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
 ) -> None:
     """The figures of the log without the leap are the right values, to the last digit."""
     messages = [sent for sent in numbered if pose or sent.topic != "/pose"]
-    intact = read_flight(write_messages(recorded / "run_0.mcap", tmp_path / "intact" / "run_0.mcap", messages)).summary
-    log = write_messages(recorded / "run_0.mcap", tmp_path / "leap" / "run_0.mcap", damaged(messages, kind, 0.5, by, ""))
+    intact = read_flight(
+        write_messages(recorded / "run_0.mcap", tmp_path / "intact" / "run_0.mcap", messages)
+    ).summary
+    log = write_messages(
+        recorded / "run_0.mcap",
+        tmp_path / "leap" / "run_0.mcap",
+        damaged(messages, kind, 0.5, by, ""),
+    )
     summary = read_flight(log).summary
     told = f"the clock of all stamps leaps forth by {by:.3f} s at t = 0.998 s"
     assert summary["outcome"] == f"completed, log incomplete: {told}"
@@ -213,9 +254,17 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
     assert result.compared.sum() == len(result.number) == 201
 
 
-def test_pause_of_all_processes_is_no_leap_of_the_clock(numbered: Messages, recorded: Path, tmp_path: Path) -> None:
-    """The flight goes on in the pause, as the flight times of truth tell, and the numbers go on behind the pause."""
-    kept = [sent for sent in numbered if not EPOCH + NANOSECONDS // 2 < sent.log_ns < EPOCH + 17 * NANOSECONDS // 10]
+def test_pause_of_all_processes_is_no_leap_of_the_clock(
+    numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
+    """The flight goes on in the pause, as the flight times of truth tell, and the numbers go on
+    behind the pause.
+    """
+    kept = [
+        sent
+        for sent in numbered
+        if not EPOCH + NANOSECONDS // 2 < sent.log_ns < EPOCH + 17 * NANOSECONDS // 10
+    ]
     counts: Counter[str] = Counter()
     messages = []
     for sent in kept:
@@ -224,31 +273,47 @@ def test_pause_of_all_processes_is_no_leap_of_the_clock(numbered: Messages, reco
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
     summary = read_flight(log).summary
     assert "leaps" not in summary["outcome"]
-    assert "y 401 of 1001 samples, no sample from t = 0.498 to 1.700 s, 600 were never sent" in summary["outcome"]
+    assert (
+        "y 401 of 1001 samples, no sample from t = 0.498 to 1.700 s, 600 were never sent"
+        in summary["outcome"]
+    )
     assert "this host is too busy: 600 of 1001 y were never sent" in summary["notes"][0]
 
 
 def test_rate_of_another_aircraft_is_that_of_its_log(tape: Tape, osprey_gust: Scenario) -> None:
-    """Each fifth sample of 500 Hz, numbered without a gap, beside the processes of a controller and no aircraft."""
+    """Each fifth sample of 500 Hz, numbered without a gap, beside the processes of a controller and
+    no aircraft.
+    """
     signals = {name: tape[name] for name in ("y_m", "u", "internals")}
     every = np.arange(len(tape["y"].stamp_ns)) % 5 == 0
     signals["y"] = tape["y"].where(every)
     shifted = {name: Recording(0, lost=0) for name in signals}
-    moved = {name: type(signal)(signal.stamp_ns + EPOCH, signal.names, signal.values) for name, signal in signals.items()}
+    moved = {
+        name: type(signal)(signal.stamp_ns + EPOCH, signal.names, signal.values)
+        for name, signal in signals.items()
+    }
     processes = {"/controller#7": Process(None, EPOCH, EPOCH, 201)}
-    flight = Tape(moved, tape.start_ns + EPOCH, duration=2.0, recording=shifted, processes=processes)
+    flight = Tape(
+        moved, tape.start_ns + EPOCH, duration=2.0, recording=shifted, processes=processes
+    )
     result = account(flight, osprey_gust)
     assert (result.topics["y"].expected, result.topics["y"].found) == (201, 201)
     assert (result.busy, result.lacks) == ("", ())
 
 
-def test_simulated_flight_without_truth_lacks_it(numbered: Messages, recorded: Path, tmp_path: Path) -> None:
+def test_simulated_flight_without_truth_lacks_it(
+    numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
     messages = [sent for sent in numbered if sent.topic != "/truth"]
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
-    assert read_flight(log).summary["outcome"] == "completed, log incomplete: truth 0 of 1001 samples"
+    assert (
+        read_flight(log).summary["outcome"] == "completed, log incomplete: truth 0 of 1001 samples"
+    )
 
 
-def test_ticks_of_less_than_nine_tenths_are_no_success(numbered: Messages, recorded: Path, tmp_path: Path) -> None:
+def test_ticks_of_less_than_nine_tenths_are_no_success(
+    numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
     """A controller that leaves out each second tick, with numbers that go on."""
     ticks: Counter[str] = Counter()
     messages = []
@@ -271,7 +336,9 @@ def test_ticks_of_less_than_nine_tenths_are_no_success(numbered: Messages, recor
         ([1, 2, 3, 1, 2, 3, 1, 2], [3, 6]),
     ],
 )
-def test_another_controller_begins_where_its_numbers_are_there_again(numbers: list[int], starts: list[int]) -> None:
+def test_another_controller_begins_where_its_numbers_are_there_again(
+    numbers: list[int], starts: list[int]
+) -> None:
     assert controller_starts(np.array(numbers, dtype=float)) == starts
 
 
@@ -285,7 +352,9 @@ def test_two_ticks_stored_in_reverse_replay_as_one_controller(recorded: Path) ->
     values = signal.values[order].copy()
     values[100, ages] = 0.0
     values[101, ages] = 0.0
-    reversed_ticks = type(signal)(np.where(order == 101, signal.stamp_ns[101], signal.stamp_ns[order]), signal.names, values)
+    reversed_ticks = type(signal)(
+        np.where(order == 101, signal.stamp_ns[101], signal.stamp_ns[order]), signal.names, values
+    )
     tape = Tape({**run.tape.signals, "internals": reversed_ticks}, run.tape.start_ns)
     result = replay(run._replace(tape=tape))
     assert result.number.tolist() == list(range(1, 202))
@@ -299,16 +368,23 @@ def test_note_on_another_controller_names_the_process(recorded: Path) -> None:
     column = signal.names.index("number")
     values[100:, column] -= 100.0
     begin_ns = int(signal.stamp_ns[100])
-    processes = {"/controller#4": Process(0, 0, begin_ns - 1, 100), "/controller#9": Process(0, begin_ns, begin_ns + 1, 101)}
+    processes = {
+        "/controller#4": Process(0, 0, begin_ns - 1, 100),
+        "/controller#9": Process(0, begin_ns, begin_ns + 1, 101),
+    }
     ticks = type(signal)(signal.stamp_ns, signal.names, values)
     tape = Tape({**run.tape.signals, "internals": ticks}, run.tape.start_ns, processes=processes)
     notes = replay(run._replace(tape=tape)).notes
     assert "another controller, /controller#9, begins at t = 1.00 s" in notes
 
 
-def test_outcome_in_the_log_is_before_that_of_a_summary_beside(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_outcome_in_the_log_is_before_that_of_a_summary_beside(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
     run = fly_and_report(osprey_gust.vary(flight={"duration": 0.5}), tmp_path).mcap.parent
-    (run / "summary.json").write_text(json.dumps({"outcome": "ended early: another flight"}), encoding="utf-8")
+    (run / "summary.json").write_text(
+        json.dumps({"outcome": "ended early: another flight"}), encoding="utf-8"
+    )
     assert read_run(run).tape.outcome == "completed"
     assert read_flight(run).summary["outcome"] == "completed"
 
@@ -320,8 +396,12 @@ def test_scenario_beside_a_log_without_attachments_is_that_of_the_flight(run: Pa
     attached = read_run(run).scenario_file()
     (run / attached.name).write_bytes(attached.content)
     with path.open("rb") as stream:
-        messages = [(channel.topic, message) for _, channel, message in make_reader(stream).iter_messages()]
-    sent = [Sent(topic, message.log_time, message.sequence, message.data) for topic, message in messages]
+        messages = [
+            (channel.topic, message) for _, channel, message in make_reader(stream).iter_messages()
+        ]
+    sent = [
+        Sent(topic, message.log_time, message.sequence, message.data) for topic, message in messages
+    ]
     write_messages(path, run / "bare", sent, attached=False).replace(path)
     assert read_run(run).scenario == attached
     assert figures(read_flight(run).summary) == figures(intact)

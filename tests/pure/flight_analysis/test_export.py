@@ -27,8 +27,14 @@ def flight(osprey_gust: Scenario) -> RecordedFlight:
 
 
 def test_table_has_row_per_instant_and_null_without_sample() -> None:
-    y = Signal(np.array([EPOCH, EPOCH + 1, EPOCH + 2]), ("q", "V"), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
-    u = Signal(np.array([EPOCH + 1, EPOCH + 3, EPOCH + 3]), ("thrust",), np.array([[0.5], [0.25], [0.75]]))
+    y = Signal(
+        np.array([EPOCH, EPOCH + 1, EPOCH + 2]),
+        ("q", "V"),
+        np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]),
+    )
+    u = Signal(
+        np.array([EPOCH + 1, EPOCH + 3, EPOCH + 3]), ("thrust",), np.array([[0.5], [0.25], [0.75]])
+    )
     assert data_frame(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
         "stamp_ns": [EPOCH, EPOCH + 1, EPOCH + 2, EPOCH + 3],
         "t": [0.0, 1e-9, 2e-9, 3e-9],
@@ -38,7 +44,9 @@ def test_table_has_row_per_instant_and_null_without_sample() -> None:
     }
 
 
-def test_csv_and_parquet_hold_every_sample_to_last_bit(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_csv_and_parquet_hold_every_sample_to_last_bit(
+    flight: RecordedFlight, tmp_path: Path
+) -> None:
     write_csv(tmp_path / "run.csv", [flight])
     write_parquet(tmp_path / "run.parquet", [flight])
     with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as stream:
@@ -49,11 +57,19 @@ def test_csv_and_parquet_hold_every_sample_to_last_bit(flight: RecordedFlight, t
         column, expected = f"{topic}.{name}", flight.tape[topic][name].tolist()
         assert [float(row[column]) for row in rows if row[column]] == expected
         assert read[column].drop_nulls().to_list() == expected
-    assert [row["u.thrust"] != "" for row in rows[:11]] == [True, *[False] * 4, True, *[False] * 4, True]  # 100 Hz of 500
+    assert [row["u.thrust"] != "" for row in rows[:11]] == [
+        True,
+        *[False] * 4,
+        True,
+        *[False] * 4,
+        True,
+    ]  # 100 Hz of 500
 
 
 def test_table_of_several_flights_has_column_run(flight: RecordedFlight, tmp_path: Path) -> None:
-    bare = flight._replace(name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]}))
+    bare = flight._replace(
+        name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]})
+    )
     write_parquet(tmp_path / "both.parquet", [flight, bare])
     both = pl.read_parquet(tmp_path / "both.parquet")
     assert both["run"].value_counts(sort=True).rows() == [("run", 1501), ("bare", 1501)]
@@ -61,7 +77,9 @@ def test_table_of_several_flights_has_column_run(flight: RecordedFlight, tmp_pat
 
 
 def test_one_png_shows_all_flights(flight: RecordedFlight, tmp_path: Path) -> None:
-    bare = flight._replace(name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]}))
+    bare = flight._replace(
+        name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]})
+    )
     for flights in ([flight], [bare], [flight, bare]):
         write_png(tmp_path / "run.png", flights)
         pixels = imread(tmp_path / "run.png")

@@ -7,7 +7,13 @@ import pytest
 
 from flight_analysis.report.account import Account, account_of_json, final_outcome
 from flight_analysis.report.guided import Outside, time_outside
-from flight_core.outcome import COMPLETED, INTERRUPTED, STATUS_INCOMPLETE, STATUS_INTERRUPTED, exit_status
+from flight_core.outcome import (
+    COMPLETED,
+    INTERRUPTED,
+    STATUS_INCOMPLETE,
+    STATUS_INTERRUPTED,
+    exit_status,
+)
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_guidance.guidance_state import LARGEST
@@ -18,7 +24,12 @@ SECTION = GuidanceConfig.validate_mapping(
     {
         "natural_frequency": [4.0, 1.2, 5.0, 4.0],
         "speed": 25.0,
-        "fence": {"field": {"north": [-500.0, 500.0, 500.0, -500.0], "east": [-500.0, -500.0, 500.0, 500.0]}},
+        "fence": {
+            "field": {
+                "north": [-500.0, 500.0, 500.0, -500.0],
+                "east": [-500.0, -500.0, 500.0, 500.0],
+            }
+        },
     },
     "guidance",
 )
@@ -38,7 +49,10 @@ def flown(*north: float, engaged: int = 0) -> Tape:
     [
         ((0.0, 400.0, 0.0), Outside(0.0, 0.0, left=False)),
         ((490.0, 510.0, 520.0, 490.0), LEFT),
-        ((520.0, 510.0, 490.0), Outside(2.0, 20.0, left=False)),  # which begins outside, and comes inside
+        (
+            (520.0, 510.0, 490.0),
+            Outside(2.0, 20.0, left=False),
+        ),  # which begins outside, and comes inside
         ((520.0, 490.0, 500.5, 400.0), Outside(2.0, 20.0, left=True)),  # a second time
         ((520.0, 540.0), Outside(1.0, 40.0, left=True)),  # ends outside
     ],
@@ -48,7 +62,9 @@ def test_time_outside_of_fence(north: tuple[float, ...], outside: Outside) -> No
 
 
 def test_time_outside_counts_while_guidance_flies() -> None:
-    assert time_outside(flown(600.0, 490.0, 480.0, engaged=1), SECTION) == Outside(0.0, 0.0, left=False)
+    assert time_outside(flown(600.0, 490.0, 480.0, engaged=1), SECTION) == Outside(
+        0.0, 0.0, left=False
+    )
     assert time_outside(flown(600.0, 490.0), SECTION.model_copy(update={"fence": {}})) is None
     assert time_outside(Tape({}, 0), SECTION) is None
 

@@ -33,7 +33,9 @@ SPEED = 40.0  # m/s, trim
 
 
 def log(**channels: ArrayLike) -> Tape:
-    """A guided flight of 40 s to the north in steady level flight, except for these channels; `_` stands for a dot."""
+    """A guided flight of 40 s to the north in steady level flight, except for these channels; `_`
+    stands for a dot.
+    """
     given = {name.replace("__", "."): value for name, value in channels.items()}
     level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {
         "mode": Mode.ENGAGED, "mode.lateral": Lateral.HEADING, "mode.vertical": Vertical.ALTITUDE,
@@ -54,7 +56,9 @@ def after(instant: float, value: float) -> FloatArray:
 
 def test_segment_ends_where_mode_command_or_leg_changes() -> None:
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
-    found = segments(log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0)))
+    found = segments(
+        log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0))
+    )
     assert [(segment.start, segment.stop) for segment in found] == [
         near(0.0, 10.0),
         near(10.0, 20.0),
@@ -62,7 +66,12 @@ def test_segment_ends_where_mode_command_or_leg_changes() -> None:
         near(30.0, 39.98),
     ]
     assert [segment.leg for segment in found] == [None, 0, 1, 1]
-    assert [segment.lateral.quantity for segment in found] == ["heading", "xtrack", "xtrack", "xtrack"]
+    assert [segment.lateral.quantity for segment in found] == [
+        "heading",
+        "xtrack",
+        "xtrack",
+        "xtrack",
+    ]
 
 
 def test_commands_less_than_second_apart_begin_one_segment() -> None:
@@ -70,8 +79,8 @@ def test_commands_less_than_second_apart_begin_one_segment() -> None:
 
 
 def test_a_step_has_overshoot_and_settling() -> None:
-    # 100 (1 - exp(-t/4) cos(t)) has its first maximum where tan(t) = -1/4, t = pi - atan(1/4) = 2.897 s. It is
-    # 100 exp(-0.724) cos(2.897) = -47.0 beyond the command.
+    # 100 (1 - exp(-t/4) cos(t)) has its first maximum where tan(t) = -1/4, t = pi - atan(1/4) =
+    # 2.897 s. It is 100 exp(-0.724) cos(2.897) = -47.0 beyond the command.
     t = np.maximum(T - 5.0, 0.0)
     altitude = 100.0 * (1.0 - np.exp(-t / 4.0) * np.cos(t))
     step = segments(log(target__altitude=after(5.0, 100.0), pose__altitude=altitude))[1].vertical
@@ -89,12 +98,16 @@ def test_what_begins_within_band_has_no_step() -> None:
 
 
 def test_heading_error_is_that_of_shorter_side() -> None:
-    held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[0].lateral
+    held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[
+        0
+    ].lateral
     assert held.max == pytest.approx(math.radians(2.0))
 
 
 def test_summary_names_bank_age_and_limited_commands() -> None:
-    tape = log(pose__phi=after(10.0, -0.4), age__pose=after(39.0, 0.3), limited__bank=after(30.0, 1.0))
+    tape = log(
+        pose__phi=after(10.0, -0.4), age__pose=after(39.0, 0.3), limited__bank=after(30.0, 1.0)
+    )
     summary = guidance_summary(tape)
     assert summary is not None
     assert (summary["bank"], summary["age_pose"]) == (0.4, 0.3)
@@ -105,12 +118,20 @@ def test_summary_names_bank_age_and_limited_commands() -> None:
 
 
 def test_wind_follows_from_velocities_over_ground_and_through_air() -> None:
-    # To the east at 40 m/s through the air, climbing at 4 m/s, 3 m/s faster than trim, in a wind to (1, -6).
+    # To the east at 40 m/s through the air, climbing at 4 m/s, 3 m/s faster than trim, in a wind to
+    # (1, -6).
     level = math.sqrt(43.0**2 - 4.0**2)
     tape = log(
-        pose__psi=1.4, pose__beta=math.pi / 2.0 - 1.4, y__V=3.0, pose__climb=4.0, pose__v_north=1.0, pose__v_east=level - 6.0
+        pose__psi=1.4,
+        pose__beta=math.pi / 2.0 - 1.4,
+        y__V=3.0,
+        pose__climb=4.0,
+        pose__v_north=1.0,
+        pose__v_east=level - 6.0,
     )
-    assert guided_figures.mean_wind(tape, SPEED, parts=2) == pytest.approx(np.array([[1.0, -6.0]] * 2), abs=1e-9)
+    assert guided_figures.mean_wind(tape, SPEED, parts=2) == pytest.approx(
+        np.array([[1.0, -6.0]] * 2), abs=1e-9
+    )
 
 
 @pytest.fixture(scope="module")
@@ -127,18 +148,35 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     assert isinstance(route.legs[1], Arc)
     bounds = guided_figures.bounds_of(flight.scenario)
     assert bounds["V"] == (0.8 * 25.0, 1.4 * 25.0)  # by rule, without a stall speed and a limit
-    assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
+    assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(
+        np.array([[3.0, 0.0]] * 8), abs=1.0
+    )  # less turbulence
 
 
-def test_report_opens_with_track_of_numbered_legs_and_fence(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_report_opens_with_track_of_numbered_legs_and_fence(
+    flight: RecordedFlight, tmp_path: Path
+) -> None:
     write_page(tmp_path / "page.html", [flight])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.index("<h2>Ground track</h2>") < page.index("<table>")
-    fence = Fence((Zone((0.0, 900.0, 900.0), (0.0, 0.0, 900.0)), Zone((400.0,), (200.0,), 50.0, exclude=True)), (300.0, 100.0))
+    fence = Fence(
+        (
+            Zone((0.0, 900.0, 900.0), (0.0, 0.0, 900.0)),
+            Zone((400.0,), (200.0,), 50.0, exclude=True),
+        ),
+        (300.0, 100.0),
+    )
     routes = guided_figures.flown_routes(flight.scenario, flight.tape)
-    traces = {trace.name: trace for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data}
+    traces = {
+        trace.name: trace
+        for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data
+    }
     assert list(traces["legs"].text) == ["0", "2", "4", "6", "7"]  # the fillets are 1, 3, 5
-    assert (traces["start and end"].y[0], traces["start and end"].x[0]) == pytest.approx((0.0, 0.0), abs=1.0)
+    assert (traces["start and end"].y[0], traces["start and end"].x[0]) == pytest.approx(
+        (0.0, 0.0), abs=1.0
+    )
     assert np.asarray(traces["fence"].y).tolist() == [0.0, 900.0, 900.0, 0.0]
-    assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == pytest.approx(np.full(73, 50.0))
+    assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == pytest.approx(
+        np.full(73, 50.0)
+    )
     assert (traces["home"].y[0], traces["home"].x[0]) == (300.0, 100.0)

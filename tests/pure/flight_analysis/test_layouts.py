@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts of `rise-di layouts` for Foxglove and PlotJuggler: format, arrangement, and channels of a run.
+"""The layouts of `rise-di layouts` for Foxglove and PlotJuggler: format, arrangement, and channels
+of a run.
 
 The formats follow the sources of the two programs. Neither program runs here.
 """
@@ -33,7 +34,14 @@ CURVES = {
     *(f"internals {name}" for name in ("mode", "late", "age", "dt")),
     *(f"truth gust.{axis}" for axis in ("longitudinal", "lateral", "vertical")),
 }
-TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}  # title: number of plots
+TABS = {
+    "tracking": 4,
+    "error": 4,
+    "input": 4,
+    "integrals": 8,
+    "controller": 4,
+    "wind": 3,
+}  # title: number of plots
 """The fixed part of a Plot panel of Foxglove."""
 
 
@@ -44,7 +52,9 @@ def tape(request: pytest.FixtureRequest) -> Tape:
 
 
 def leaves(tree: Any) -> Iterator[str]:
-    """Panels of a tree of splits (react-mosaic): a name, or a direction with a first and a second part."""
+    """Panels of a tree of splits (react-mosaic): a name, or a direction with a first and a second
+    part.
+    """
     if isinstance(tree, str):
         yield tree
         return
@@ -56,7 +66,9 @@ def leaves(tree: Any) -> Iterator[str]:
 
 
 def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
-    result = CliRunner().invoke(application(["layouts"]), ["layouts", "osprey_gust", "--folder", str(tmp_path / "new")])
+    result = CliRunner().invoke(
+        application(["layouts"]), ["layouts", "osprey_gust", "--folder", str(tmp_path / "new")]
+    )
     assert result.exit_code == 0, result.output
     files = {path.name: path.read_text(encoding="utf-8") for path in (tmp_path / "new").iterdir()}
     assert files == {"osprey_gust.foxglove.json": JSON, "osprey_gust.plotjuggler.xml": XML}
@@ -77,8 +89,18 @@ def test_every_path_of_foxglove_leads_to_channel_that_label_names(tape: Tape) ->
 
 def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
     layout = json.loads(JSON)
-    assert layout.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
-    assert (layout["globalVariables"], layout["userNodes"], layout["playbackConfig"]) == ({}, {}, {"speed": 1})
+    assert layout.keys() == {
+        "configById",
+        "globalVariables",
+        "userNodes",
+        "playbackConfig",
+        "layout",
+    }
+    assert (layout["globalVariables"], layout["userNodes"], layout["playbackConfig"]) == (
+        {},
+        {},
+        {"speed": 1},
+    )
     assert layout["layout"] == "Tab!rise_di"
     tab_panel = layout["configById"]["Tab!rise_di"]
     assert tab_panel.keys() == {"activeTabIdx", "tabs"}
@@ -105,23 +127,47 @@ def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
 def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
     """RViz shows each aircraft at the frame that guidance publishes, after REP 105."""
     fleet = tmp_path / "fleet.yaml"
-    fleet.write_text("aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}", encoding="utf-8")
-    result = CliRunner().invoke(application(["layouts"]), ["layouts", str(fleet), "--folder", str(tmp_path)])
+    fleet.write_text(
+        "aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}", encoding="utf-8"
+    )
+    result = CliRunner().invoke(
+        application(["layouts"]), ["layouts", str(fleet), "--folder", str(tmp_path)]
+    )
     assert result.exit_code == 0, result.output
-    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text(encoding="utf-8"))["configById"]
-    assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == ["map", "uav1", "uav2", "uav3"]
-    assert set(panels["3D!map"]["topics"]) == {f"/{name}/{topic}" for name in ("uav1", "uav3") for topic in MAP_TOPICS}
+    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text(encoding="utf-8"))[
+        "configById"
+    ]
+    assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == [
+        "map",
+        "uav1",
+        "uav2",
+        "uav3",
+    ]
+    assert set(panels["3D!map"]["topics"]) == {
+        f"/{name}/{topic}" for name in ("uav1", "uav3") for topic in MAP_TOPICS
+    }
     (tracking,) = (tab for tab in panels["Tab!uav2"]["tabs"] if tab["title"] == "tracking")
     first = panels[next(leaves(tracking["layout"]))]["paths"][0]
-    assert (first["value"], first["label"]) == (f"/uav2/y.position[{CHANNELS['y'].index('q')}]", "y: q")
-    tabs = [tab.attrib["tab_name"] for tab in ElementTree.parse(tmp_path / "fleet.plotjuggler.xml").iter("Tab")]
+    assert (first["value"], first["label"]) == (
+        f"/uav2/y.position[{CHANNELS['y'].index('q')}]",
+        "y: q",
+    )
+    tabs = [
+        tab.attrib["tab_name"]
+        for tab in ElementTree.parse(tmp_path / "fleet.plotjuggler.xml").iter("Tab")
+    ]
     assert tabs[len(TABS) + 1 :][: len(TABS)] == [f"uav2 {title}" for title in TABS]
-    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text(encoding="utf-8"))[
+        "Visualization Manager"
+    ]
     models = [display for display in shown["Displays"] if display["Class"].endswith("/RobotModel")]
     assert [(model["TF Prefix"], Path(model["Description File"])) for model in models] == [
         (name, tmp_path / "aircraft.urdf") for name in ("uav1", "uav3")
     ]
-    assert (shown["Global Options"]["Fixed Frame"], shown["Views"]["Current"]["Target Frame"]) == ("map", "uav1/base_link")
+    assert (shown["Global Options"]["Fixed Frame"], shown["Views"]["Current"]["Target Frame"]) == (
+        "map",
+        "uav1/base_link",
+    )
     (link,) = ElementTree.parse(tmp_path / "aircraft.urdf").iter("link")
     widths = [float(box.attrib["size"].split()[1]) for box in link.iter("box")]
     assert (link.attrib["name"], max(widths)) == ("base_link", 3.0)  # m, the span

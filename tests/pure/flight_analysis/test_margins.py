@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the sampled loop: closed forms, python-control as an independent program, worst of uncertain aircraft."""
+"""Margins of the sampled loop: closed forms, python-control as an independent program, worst of
+uncertain aircraft.
+"""
 
 import math
 
@@ -47,13 +49,15 @@ def plant_of(scenario: Scenario) -> LinearPlant:
 def margins_of(scenario: Scenario) -> Margins:
     controller = scenario.controller
     loop = loop_of(controller)
-    return loop_margins(plant_of(scenario), linear_law(controller.tuned_law(), len(loop.lag), loop.period), loop)
+    return loop_margins(
+        plant_of(scenario), linear_law(controller.tuned_law(), len(loop.lag), loop.period), loop
+    )
 
 
 @pytest.mark.parametrize("k", [5.0, 60.0, 150.0])
 def test_integrator_has_its_closed_forms(k: float) -> None:
-    # L = kT / (z - 1): abs(L) = 1 at 2 sin(wT/2) = kT, angle -(pi/2 + wT/2); L(-1) = -kT/2; S(-1) = 1 / (1 - kT/2);
-    # S - 1/2 = (z - 1 - kT) / (2 (z - 1 + kT)), largest at z = -1
+    # L = kT / (z - 1): abs(L) = 1 at 2 sin(wT/2) = kT, angle -(pi/2 + wT/2); L(-1) = -kT/2; S(-1) =
+    # 1 / (1 - kT/2); S - 1/2 = (z - 1 - kT) / (2 (z - 1 + kT)), largest at z = -1
     kT = k * NO_LAG.period
     found = loop_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
     assert found.stable
@@ -64,7 +68,9 @@ def test_integrator_has_its_closed_forms(k: float) -> None:
     assert found.gain[0] == pytest.approx(2.0 / kT)
     assert found.sensitivity[0] == pytest.approx(1.0 / (1.0 - kT / 2.0))
     assert found.disk[0] == pytest.approx(2.0 * (2.0 - kT) / (2.0 + kT))
-    assert [found.sensitivity_all, found.disk_all] == pytest.approx([found.sensitivity[0], found.disk[0]])
+    assert [found.sensitivity_all, found.disk_all] == pytest.approx(
+        [found.sensitivity[0], found.disk[0]]
+    )
     assert found.damping == 1.0  # its pole 1 - kT is real
 
 
@@ -72,7 +78,9 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
     plant, k = LinearPlant(np.eye(1), np.eye(1), np.eye(1)), 4.0
     found = loop_margins(plant, proportional(np.array([[k]])), NO_LAG)
-    assert found.gain_decrease[0] == pytest.approx(1.0 / k, rel=1e-3)  # at w = 0, seen at the lowest frequency
+    assert found.gain_decrease[0] == pytest.approx(
+        1.0 / k, rel=1e-3
+    )  # at w = 0, seen at the lowest frequency
     growth = math.exp(NO_LAG.period)
     assert found.gain_increase[0] == pytest.approx((growth + 1.0) / (growth - 1.0) / k)
     assert found.gain[0] == pytest.approx(k, rel=1e-3)
@@ -92,34 +100,47 @@ def test_no_feedback_has_infinite_margins() -> None:
 
 
 def test_second_order_loop_has_its_damping() -> None:
-    # y_dot = u through a lag tau under u = -k y: tau s^2 + s + k. 0.1 ms a tick: the hold costs 1 % of the damping
+    # y_dot = u through a lag tau under u = -k y: tau s^2 + s + k. 0.1 ms a tick: the hold costs 1 %
+    # of the damping
     tau, k = 0.2, 20.0
     loop = Loop(np.array([tau]), 0.0, 1e-4)
     modes = slow_modes(INTEGRATOR, proportional(np.array([[k]])), loop)
     natural = math.sqrt(k / tau)
     assert modes.frequency == pytest.approx([natural], rel=1e-2)
     assert modes.damping == pytest.approx([1.0 / (2.0 * tau * natural)], rel=1e-2)
-    assert loop_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == pytest.approx(modes.damping[0])
+    assert loop_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == pytest.approx(
+        modes.damping[0]
+    )
 
 
 def test_disk_margin_of_the_spinning_satellite() -> None:
-    # P = [[s - a^2, a (s + 1)], [-a (s + 1), s - a^2]] / (s^2 + a^2), u = -y, a = 10: S = [[s, -a], [a, s]] / (s + 1).
-    # Seiler, Packard, Gahinet (2020): one loop at a time 2, both 0.0997, since max norm(S - I/2)^2 is the eigenvalue below.
+    # P = [[s - a^2, a (s + 1)], [-a (s + 1), s - a^2]] / (s^2 + a^2), u = -y, a = 10: S = [[s, -a],
+    # [a, s]] / (s + 1). Seiler, Packard, Gahinet (2020): one loop at a time 2, both 0.0997, since
+    # max norm(S - I/2)^2 is the eigenvalue below.
     a = 10.0
     A, C = np.array([[0.0, a], [-a, 0.0]]), np.array([[1.0, a], [-a, 1.0]])
-    found = loop_margins(LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3))
+    found = loop_margins(
+        LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3)
+    )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
     assert expected == pytest.approx(0.0997, abs=1e-4)
-    assert found.disk_all == pytest.approx(expected, rel=0.02)  # the hold, and frequencies from 1e-5 pi / T on
+    assert found.disk_all == pytest.approx(
+        expected, rel=0.02
+    )  # the hold, and frequencies from 1e-5 pi / T on
     assert found.disk == pytest.approx([2.0, 2.0], rel=0.02)
-    assert math.degrees(disk_phase(found.disk_all)) == pytest.approx(5.7, abs=0.1)  # 2 atan(alpha / 2)
+    assert math.degrees(disk_phase(found.disk_all)) == pytest.approx(
+        5.7, abs=0.1
+    )  # 2 atan(alpha / 2)
     assert disk_gain(np.array(1.0)) == 3.0
 
 
 def test_scaled_norm_of_product_is_sum_of_diagonal() -> None:
-    # mu of u v' with independent complex scalars is sum abs(u_i v_i), which the scaling reaches (Packard, Doyle 1993)
+    # mu of u v' with independent complex scalars is sum abs(u_i v_i), which the scaling reaches
+    # (Packard, Doyle 1993)
     random = np.random.default_rng(1)
-    u, v = (random.normal(size=(20, 4)) * 10.0 ** random.uniform(-3.0, 3.0, (20, 4)) for _ in range(2))
+    u, v = (
+        random.normal(size=(20, 4)) * 10.0 ** random.uniform(-3.0, 3.0, (20, 4)) for _ in range(2)
+    )
     matrices = (u[:, :, None] * v[:, None]).astype(complex)
     np.testing.assert_allclose(scaled_norm(matrices), np.abs(u * v).sum(axis=1), rtol=1e-3)
 
@@ -130,19 +151,33 @@ def test_scaled_norm_of_triangle_is_diagonal() -> None:
 
 
 def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
-    """K(z) of RISE-DI inside its softened sign, from (20) to (22): a trapezoid and backward Euler; u = -K e."""
+    """K(z) of RISE-DI inside its softened sign, from (20) to (22): a trapezoid and backward Euler;
+    u = -K e.
+    """
     params, T = scenario.rise_di().law_params(), 1.0 / scenario.controller.rate
     z = control.tf([1.0, 0.0], [1.0], T)
     slope = params.beta / params.eps
     entries = [
-        control.ss(control.tf(D * scale * (K * (1 + Lambda * T / 2.0 * (z + 1) / (z - 1)) + rate * T * z / (z - 1))))
-        for K, Lambda, D, scale, rate in zip(params.K, params.Lambda, params.D, params.input_scale, slope, strict=True)
+        control.ss(
+            control.tf(
+                D
+                * scale
+                * (K * (1 + Lambda * T / 2.0 * (z + 1) / (z - 1)) + rate * T * z / (z - 1))
+            )
+        )
+        for K, Lambda, D, scale, rate in zip(
+            params.K, params.Lambda, params.D, params.input_scale, slope, strict=True
+        )
     ]
     return control.append(*entries)
 
 
-def loops_of_python_control(scenario: Scenario) -> tuple[list[control.StateSpace], control.StateSpace]:
-    """L_i with the other inputs closed, and the closed loop, in python-control; delay 0 or one period."""
+def loops_of_python_control(
+    scenario: Scenario,
+) -> tuple[list[control.StateSpace], control.StateSpace]:
+    """L_i with the other inputs closed, and the closed loop, in python-control; delay 0 or one
+    period.
+    """
     plant, controller = plant_of(scenario), scenario.controller
     T, m = 1.0 / controller.rate, len(controller.inputs)
     lags = control.append(*(control.ss(control.tf([1.0], [lag, 1.0])) for lag in controller.lag))
@@ -152,7 +187,9 @@ def loops_of_python_control(scenario: Scenario) -> tuple[list[control.StateSpace
     L = pi_of_python_control(scenario) * P
     each = []
     for i in range(m):
-        closed = control.feedback(L, control.ss([], [], [], np.diag((np.arange(m) != i).astype(float)), T))
+        closed = control.feedback(
+            L, control.ss([], [], [], np.diag((np.arange(m) != i).astype(float)), T)
+        )
         each.append(closed[i, i])
     return each, control.feedback(L, control.ss([], [], [], np.eye(m), T))
 
@@ -165,35 +202,50 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
     w = np.geomspace(0.1, math.pi * scenario.controller.rate * (1.0 - 1e-9), 4000)
     for i, L in enumerate(loops):
         response = control.frequency_response(L, w)
-        gain, phase, sensitivity, _, crossover, _ = control.stability_margins(control.frd(L, w, smooth=True))
-        assert math.degrees(found.phase[i]) == pytest.approx(phase, abs=0.1)  # they agree far below 1 deg and 2 %
+        gain, phase, sensitivity, _, crossover, _ = control.stability_margins(
+            control.frd(L, w, smooth=True)
+        )
+        assert math.degrees(found.phase[i]) == pytest.approx(
+            phase, abs=0.1
+        )  # they agree far below 1 deg and 2 %
         assert found.crossover[i] == pytest.approx(crossover, rel=1e-3)
         assert found.gain_increase[i] == pytest.approx(gain, rel=1e-3)
         assert found.sensitivity[i] == pytest.approx(1.0 / sensitivity, rel=5e-3)
         disk, *_ = control.disk_margins(L, w)
         assert found.disk[i] == pytest.approx(float(disk), rel=5e-3)
         np.testing.assert_allclose(
-            loop_transfer(plant_of(scenario), law_of(scenario), loop_of(scenario.controller), w[::400])[:, i],
+            loop_transfer(
+                plant_of(scenario), law_of(scenario), loop_of(scenario.controller), w[::400]
+            )[:, i],
             response.complex[::400],
             rtol=1e-6,
         )
     modes = slow_modes(plant_of(scenario), law_of(scenario), loop_of(scenario.controller))
     natural, damping, _ = control.damp(closed, doprint=False)
     slow = {
-        (round(w, 3), round(zeta, 3)) for w, zeta in zip(natural, damping, strict=True) if 1e-3 < w < 157.0 and zeta < 0.9999
+        (round(w, 3), round(zeta, 3))
+        for w, zeta in zip(natural, damping, strict=True)
+        if 1e-3 < w < 157.0 and zeta < 0.9999
     }
-    assert slow == {(round(w, 3), round(zeta, 3)) for w, zeta in zip(*modes, strict=True) if zeta < 0.9999}
+    assert slow == {
+        (round(w, 3), round(zeta, 3)) for w, zeta in zip(*modes, strict=True) if zeta < 0.9999
+    }
     assert found.damping == pytest.approx(min(zeta for _, zeta in slow), abs=1e-3)
 
 
 def law_of(scenario: Scenario) -> LinearLaw:
-    return linear_law(scenario.controller.tuned_law(), len(scenario.controller.inputs), 1.0 / scenario.controller.rate)
+    return linear_law(
+        scenario.controller.tuned_law(),
+        len(scenario.controller.inputs),
+        1.0 / scenario.controller.rate,
+    )
 
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
 def test_phase_margin_over_crossover_is_delay_margin(name: str) -> None:
-    # delay_margin bisects the eigenvalues of the delayed loop; a delay costs w tau of phase at the crossover. The two differ
-    # by the sampled delay, 0.1 ms of bisection and a further crossover: 3 %
+    # delay_margin bisects the eigenvalues of the delayed loop; a delay costs w tau of phase at the
+    # crossover. The two differ by the sampled delay, 0.1 ms of bisection and a further crossover: 3
+    # %
     scenario = find_scenario(name)
     found, plant, loop = margins_of(scenario), plant_of(scenario), loop_of(scenario.controller)
     for i, tolerated in enumerate(found.phase / found.crossover):

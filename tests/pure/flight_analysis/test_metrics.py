@@ -41,7 +41,13 @@ def test_y_outside_the_reference_is_left_out() -> None:
 
 
 def test_a_span_extends_beyond_its_end() -> None:
-    assert metrics.in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
+    assert metrics.in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_each_instant_belongs_to_one_part_of_flight() -> None:
@@ -51,7 +57,10 @@ def test_each_instant_belongs_to_one_part_of_flight() -> None:
         Transient("gust", "vertical", 3.5, 4.0),
     ]
     t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
-    masks = {part: t[mask].tolist() for part, mask in metrics.part_masks(t, transients, settle=1.0).items()}
+    masks = {
+        part: t[mask].tolist()
+        for part, mask in metrics.part_masks(t, transients, settle=1.0).items()
+    }
     assert masks == {
         "whole": t.tolist(),
         "calm": [1.5, 5.5],  # 0 and 0.5 belong to the engagement
@@ -61,17 +70,35 @@ def test_each_instant_belongs_to_one_part_of_flight() -> None:
 
 
 def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
-    transients = [Transient("capture", "", 1.0, 2.0), Transient("turn", "", 2.5, 3.0), Transient("gust", "vertical", 3.5, 4.0)]
+    transients = [
+        Transient("capture", "", 1.0, 2.0),
+        Transient("turn", "", 2.5, 3.0),
+        Transient("gust", "vertical", 3.5, 4.0),
+    ]
     t = np.array([0.5, 1.5, 2.2, 2.9, 3.8, 6.0])
-    masks = {part: t[mask].tolist() for part, mask in metrics.part_masks(t, transients, settle=1.0).items()}
-    assert masks == {"whole": t.tolist(), "calm": [0.5, 6.0], "capture": [1.5, 2.2], "turn": [2.9], "gust": [3.8]}
+    masks = {
+        part: t[mask].tolist()
+        for part, mask in metrics.part_masks(t, transients, settle=1.0).items()
+    }
+    assert masks == {
+        "whole": t.tolist(),
+        "calm": [0.5, 6.0],
+        "capture": [1.5, 2.2],
+        "turn": [2.9],
+        "gust": [3.8],
+    }
 
 
 def guided(**channels: Any) -> list[Any]:
-    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s, with these channels from 5 to 8 s."""
+    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s, with these channels
+    from 5 to 8 s.
+    """
     t = np.arange(0.0, 20_000.0, 20.0)
     level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}
-    changed = {name: np.where((t >= 5_000) & (t < 8_000), value, level[name]) for name, value in channels.items()}
+    changed = {
+        name: np.where((t >= 5_000) & (t < 8_000), value, level[name])
+        for name, value in channels.items()
+    }
     found = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changed)))
     return [(transient.kind, transient.start, transient.stop) for transient in found]
 
@@ -90,7 +117,9 @@ def guided(**channels: Any) -> list[Any]:
     ],
 )
 def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expected: Any) -> None:
-    assert guided(**channels) == [(kind, pytest.approx(start), pytest.approx(stop)) for kind, start, stop in expected]
+    assert guided(**channels) == [
+        (kind, pytest.approx(start), pytest.approx(stop)) for kind, start, stop in expected
+    ]
 
 
 def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() -> None:
@@ -116,7 +145,8 @@ def test_settling_time_ends_where_error_begins_to_stay_in_band() -> None:
 
 
 def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None:
-    # Second differences of +-1 are +-4: the floor is 4 / (0.6745 sqrt(6)). Four floors exceed 1 % of a reference of 10.
+    # Second differences of +-1 are +-4: the floor is 4 / (0.6745 sqrt(6)). Four floors exceed 1 %
+    # of a reference of 10.
     stamps = [10.0 * k for k in range(100)]
     noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=10.0)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
@@ -126,7 +156,8 @@ def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None
 
 
 def test_settling_measured_up_to_next_transient_of_channel() -> None:
-    # q leaves the band at 1 s and at 5 s, each time for 0.2 s; its reference of 1 makes it 0.01 wide.
+    # q leaves the band at 1 s and at 5 s, each time for 0.2 s; its reference of 1 makes it 0.01
+    # wide.
     stamps = [100.0 * k for k in range(81)]
     t = np.array(stamps) / 1000.0
     error = np.where(((t > 0.95) & (t < 1.15)) | ((t > 4.95) & (t < 5.15)), 0.5, 0.0)
@@ -146,12 +177,15 @@ def test_settling_measured_up_to_next_transient_of_channel() -> None:
 
 
 def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
-    # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
+    # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) =
+    # sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
     whole = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
     assert tuple(whole) == pytest.approx((math.sqrt(3.0), 2.0, 20.0))
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
-    parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
+    parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)[
+        "elevator"
+    ]
     assert tuple(parts["gust"]) == pytest.approx((2.0, 2.0, 20.0))
     assert parts["calm"].rate == pytest.approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
@@ -162,23 +196,30 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
 def test_saturated_ticks_are_counted_by_kind() -> None:
     kinds = [Saturation.NO, Saturation.MAGNITUDE, Saturation.RATE, Saturation.RATE]
     internals = signal([0, 10, 20, 30], **{"limited.thrust": kinds})
-    assert metrics.saturation_shares(tape(internals=internals)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
+    assert metrics.saturation_shares(tape(internals=internals)) == {
+        "thrust": {"magnitude": 0.25, "rate": 0.5}
+    }
     assert metrics.saturation_shares(tape()) == {}
 
 
 def test_sign_switches_counted_on_increments_of_pi() -> None:
     # Increments +, 0, +, -, -, +: two changes in 0.06 s; an increment of 0 is no direction.
-    internals = signal([10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]})
+    internals = signal(
+        [10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]}
+    )
     assert metrics.sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
 
 
 def test_the_noise_floor_is_the_recorded_noise() -> None:
-    flight = tape(y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]}))
+    flight = tape(
+        y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]})
+    )
     assert metrics.noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
 
 
 def test_noise_floor_estimated_from_y_without_truth() -> None:
-    # Normal noise of rms 0.02 on a slow sine of 1; with 20 000 samples the estimate is within some per cent.
+    # Normal noise of rms 0.02 on a slow sine of 1; with 20 000 samples the estimate is within some
+    # per cent.
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     flight = tape(y=Signal(EPOCH + k * 2 * MS, ("q",), y[:, None]))
@@ -188,16 +229,24 @@ def test_noise_floor_estimated_from_y_without_truth() -> None:
 def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
     # 5 Hz of amplitude 2: variance 2, the integral of the squared density over all frequencies.
     k = np.arange(6000)
-    u = Signal(EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None])
+    u = Signal(
+        EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None]
+    )
     frequency, density = metrics.spectra(u, 10 * MS)
     assert frequency[np.argmax(density["elevator"])] == pytest.approx(5.0, abs=0.1)
-    assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(2.0, rel=0.01)
+    assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(
+        2.0, rel=0.01
+    )
 
 
-@pytest.mark.parametrize("samples", [300, 2560, 6005])  # a window of the whole, an even and an odd one
+@pytest.mark.parametrize(
+    "samples", [300, 2560, 6005]
+)  # a window of the whole, an even and an odd one
 def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
     values = np.random.default_rng(1).standard_normal((samples, 2)).cumsum(axis=0)
-    frequency, density = metrics.spectra(Signal(EPOCH + np.arange(samples) * 10 * MS, ("a", "b"), values), 10 * MS)
+    frequency, density = metrics.spectra(
+        Signal(EPOCH + np.arange(samples) * 10 * MS, ("a", "b"), values), 10 * MS
+    )
     expected, power = welch(values, fs=100.0, nperseg=max(samples // 10, min(samples, 256)), axis=0)
     assert frequency == pytest.approx(expected[1:], rel=1e-12)
     for name, column in zip(("a", "b"), power[1:].T, strict=True):
@@ -206,7 +255,9 @@ def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
 
 def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
-    frequency, density = metrics.spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
+    frequency, density = metrics.spectra(
+        Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS
+    )
     assert frequency[-1] == 50.0
     assert np.all(density["u"] < 1e-12)  # constant, for gaps repeat the sample before
 
@@ -216,6 +267,11 @@ def test_periods_without_a_tick_are_counted() -> None:
     internals = signal([-1, 9, 19, 39], late=[0.0, 1e-4, 0.0, 3e-4], age=1e-3)
     result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
     assert result is not None
-    assert (result.ticks, result.without_new_y, result.period_max, result.late_max) == (4, 1, 0.02, 3e-4)
+    assert (result.ticks, result.without_new_y, result.period_max, result.late_max) == (
+        4,
+        1,
+        0.02,
+        3e-4,
+    )
     assert result.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
     assert result.jitter == 0.0  # the last took two whole periods

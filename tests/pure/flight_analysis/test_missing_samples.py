@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which missing samples of a log are a lack: a topic alone is excused by what its own sensor drops, and a silence is named."""
+"""Which missing samples of a log are a lack: a topic alone is excused by what its own sensor drops,
+and a silence is named.
+"""
 
 from collections.abc import Mapping
 
@@ -22,16 +24,24 @@ Kept = NDArray[np.bool_]
 def scenario(**aircraft: object) -> Scenario:
     """The default scenario at 100 Hz, whose pose is at 50 Hz, with these values of the aircraft."""
     return find_scenario("osprey_gust").vary(
-        aircraft={"rate": 100.0, "step": 0.01, **aircraft}, reference_model={"rate": 100.0}, controller={"rate": 100.0}
+        aircraft={"rate": 100.0, "step": 0.01, **aircraft},
+        reference_model={"rate": 100.0},
+        controller={"rate": 100.0},
     )
 
 
 def lacks(flown: Scenario, duration: int, kept: Mapping[str, Kept]) -> tuple[str, ...]:
-    """What the log of a flight of whole seconds lacks; `kept`: which samples of a topic it has, (N,), all of the others."""
+    """What the log of a flight of whole seconds lacks; `kept`: which samples of a topic it has,
+    (N,), all of the others.
+    """
     signals = {}
     for name, rate in RATES.items():
         stamp_ns = np.arange(duration * rate + 1) * (NANOSECONDS // rate)
-        names = {"y": flown.controller.outputs, "y_m": flown.controller.outputs, "u": flown.controller.inputs}.get(name, ("a",))
+        names = {
+            "y": flown.controller.outputs,
+            "y_m": flown.controller.outputs,
+            "u": flown.controller.inputs,
+        }.get(name, ("a",))
         signal = Signal(stamp_ns, tuple(names), np.zeros((len(stamp_ns), len(names))))
         signals[name] = signal.where(kept[name]) if name in kept else signal
     return account(Tape(signals, duration=float(duration)), flown).lacks
@@ -94,7 +104,9 @@ def test_delay_of_a_sensor_excuses_the_end_of_its_topic_alone(name: str, late: s
 @pytest.mark.parametrize("length", [1.1, 19.0])
 @pytest.mark.parametrize("duration", [60, 600], ids=["short flight", "long flight"])
 @pytest.mark.parametrize("name", OF_AIRCRAFT)
-def test_silence_of_a_steady_topic_is_named_by_its_times(name: str, duration: int, length: float) -> None:
+def test_silence_of_a_steady_topic_is_named_by_its_times(
+    name: str, duration: int, length: float
+) -> None:
     """Of the long flight also a silence that leaves more than 99 % of the samples."""
     found = lacks(scenario(), duration, {name: silent(name, duration, 30.0, 30.0 + length)})
     assert len(found) == 1
@@ -107,4 +119,6 @@ def test_silence_of_a_steady_topic_is_named_by_its_times(name: str, duration: in
 def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: bool) -> None:
     """Of a long flight, where the share of the missing samples is below a hundredth."""
     found = lacks(scenario(), 600, {name: silent(name, 600, end, 601.0)})
-    assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in found] == [True] * named
+    assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in found] == [
+        True
+    ] * named

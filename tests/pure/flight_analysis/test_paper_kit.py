@@ -29,7 +29,9 @@ def flight(osprey_gust: Scenario) -> RecordedFlight:
 
 
 def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -> None:
-    """88 mm are 249.4 points of 1/72 inch. Paths are operators l and S in the stream; there is no image, no Type 3 font."""
+    """88 mm are 249.4 points of 1/72 inch. Paths are operators l and S in the stream; there is no
+    image, no Type 3 font.
+    """
     write_figure(tmp_path / "fig.pdf", [flight], "88mm", "q,V")
     content = (tmp_path / "fig.pdf").read_bytes()
     assert content.startswith(b"%PDF-")
@@ -37,7 +39,10 @@ def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -
     assert box is not None
     assert float(box[1]) == pytest.approx(88.0 / 25.4 * 72.0, abs=0.1)
     streams = [
-        zlib.decompress(part) for part in re.findall(rb"/FlateDecode.*?stream\r?\n(.*?)\r?\nendstream", content, re.DOTALL)
+        zlib.decompress(part)
+        for part in re.findall(
+            rb"/FlateDecode.*?stream\r?\n(.*?)\r?\nendstream", content, re.DOTALL
+        )
     ]
     assert max(stream.count(b" l\n") for stream in streams) > 100
     assert b"/Subtype /Image" not in content
@@ -47,8 +52,12 @@ def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -
 def test_svg_keeps_text_and_rows(flight: RecordedFlight, tmp_path: Path) -> None:
     write_figure(tmp_path / "fig.svg", [flight], "180mm", ["V", "e.q", "elevator"])
     root = ET.parse(tmp_path / "fig.svg").getroot()
-    text = " ".join("".join(node.itertext()) for node in root.iter("{http://www.w3.org/2000/svg}text"))
-    assert float(root.attrib["width"].removesuffix("pt")) == pytest.approx(180.0 / 25.4 * 72.0, abs=0.1)
+    text = " ".join(
+        "".join(node.itertext()) for node in root.iter("{http://www.w3.org/2000/svg}text")
+    )
+    assert float(root.attrib["width"].removesuffix("pt")) == pytest.approx(
+        180.0 / 25.4 * 72.0, abs=0.1
+    )
     for label in ("V (m/s)", "e of q (mrad/s)", "elevator (deg)", "t (s)", "y_m"):
         assert label in text
     first = (tmp_path / "fig.svg").read_bytes()
@@ -64,7 +73,9 @@ def test_svg_keeps_text_and_rows(flight: RecordedFlight, tmp_path: Path) -> None
         ("fig.pdf", "88mm", "q,alfa", "channels: found 'alfa'"),
     ],
 )
-def test_wrong_figure_is_told(flight: RecordedFlight, tmp_path: Path, name: str, width: str, channels: str, words: str) -> None:
+def test_wrong_figure_is_told(
+    flight: RecordedFlight, tmp_path: Path, name: str, width: str, channels: str, words: str
+) -> None:
     with pytest.raises(ParameterError, match=re.escape(words)):
         write_figure(tmp_path / name, [flight], width, channels)
     assert not list(tmp_path.iterdir())
@@ -102,6 +113,10 @@ def test_citation_names_the_paper_and_invents_nothing() -> None:
     citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
     (paper,) = citation["references"]
     assert paper["title"].startswith("A Robust Dynamic Inversion Technique")
-    assert [author["family-names"] for author in paper["authors"]] == ["Tanyer", "Tatlicioglu", "Zergeroglu"]
+    assert [author["family-names"] for author in paper["authors"]] == [
+        "Tanyer",
+        "Tatlicioglu",
+        "Zergeroglu",
+    ]
     assert "doi" not in paper
     assert "take them from your copy" in (REPOSITORY / "README.md").read_text(encoding="utf-8")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of recorded flights: equal to the last bit through failsafes and lost samples, and a single changed bit is found."""
+"""Replay of recorded flights: equal to the last bit through failsafes and lost samples, and a
+single changed bit is found.
+"""
 
 import contextlib
 import csv
@@ -43,20 +45,28 @@ pytestmark = pytest.mark.slow
 
 app = application([*COMMANDS])
 GUST = find_scenario("osprey_gust").vary(
-    flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
+    flight={"duration": 4.0},
+    aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}},
 )
 SERVO = find_scenario("osprey_servo").vary(flight={"duration": 4.0})
 LEADING = with_feedforward(SERVO.controller, load_airframe("osprey"))
-LOST = {"rate": 100.0, "sensors": {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3}}
+LOST = {
+    "rate": 100.0,
+    "sensors": {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3},
+}
 SHORT = {"max_age": 0.025, "hold": 0.01, "ramp": 0.03}
 SCENARIOS = {
     "osprey_gust": GUST,
     "osprey_servo": SERVO,
     "literal sign": GUST.vary(controller={"sign": "literal"}),
     "feedforward": SERVO.vary(controller=LEADING.model_dump()),
-    "all limits reached": GUST.vary(controller={"lower": [-0.01] * 4, "upper": [0.002] * 4, "slew": [0.05, 0.05, 0.05, 0.02]}),
+    "all limits reached": GUST.vary(
+        controller={"lower": [-0.01] * 4, "upper": [0.002] * 4, "slew": [0.05, 0.05, 0.05, 0.02]}
+    ),
     "samples late and lost": SERVO.vary(aircraft=LOST, controller=SHORT),
-    "feedforward, samples late and lost": SERVO.vary(aircraft=LOST, controller=LEADING.model_dump() | SHORT),
+    "feedforward, samples late and lost": SERVO.vary(
+        aircraft=LOST, controller=LEADING.model_dump() | SHORT
+    ),
 }
 
 
@@ -99,12 +109,17 @@ def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = 
     rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
     for k, tick in enumerate(ticks):
         now_ns = start_ns + k * controller.period_ns + tick.late * 1000
-        for name, age, take in (("y", tick.y_age, controller.take_y), ("y_m", tick.y_m_age, controller.take_y_m)):
+        for name, age, take in (
+            ("y", tick.y_age, controller.take_y),
+            ("y_m", tick.y_m_age, controller.take_y_m),
+        ):
             if age is None:
                 continue
             t = k / parameters.rate - age / 1e3
             phase = 1.0 if name == "y" else 0.9
-            sample = StampedVector(now_ns - age * MS, 0.05 * np.sin(7.0 * t * phase + np.arange(len(outputs))))
+            sample = StampedVector(
+                now_ns - age * MS, 0.05 * np.sin(7.0 * t * phase + np.arange(len(outputs)))
+            )
             rows[name].append((sample.stamp_ns, sample.value))
             with contextlib.suppress(ChannelError):  # out of order
                 take(sample, now_ns)
@@ -116,11 +131,15 @@ def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = 
             parameters = vary(parameters, change)
             controller.retune(parameters)
         output = controller.tick(now_ns, tick.late * 1000, active=tick.active)
-        if output is not None and controller.has_internals:  # else u is at trim before the first engagement
+        if (
+            output is not None and controller.has_internals
+        ):  # else u is at trim before the first engagement
             rows["u"].append((output.stamp_ns, output.u))
             rows["internals"].append((output.stamp_ns, output.internals))
     names = {"y": outputs, "y_m": outputs, "u": parameters.inputs, "internals": controller.names}
-    return Tape({name: signal(names[name], samples) for name, samples in rows.items() if samples}, start_ns)
+    return Tape(
+        {name: signal(names[name], samples) for name, samples in rows.items() if samples}, start_ns
+    )
 
 
 def signal(names: Sequence[str], samples: Sequence[tuple[int, FloatArray]]) -> Signal:
@@ -134,14 +153,18 @@ FLY, LOST_Y, LOST_Y_M, OFF = Tick(), Tick(y_age=None), Tick(y_m_age=None), Tick(
 AGES = st.one_of(st.none(), st.integers(0, 30))
 EVENTS = st.sampled_from(["", "", "", "", "configured", "replaced"])
 ACTIVE = st.sampled_from([True, True, True, False])
-TICKS = st.lists(st.builds(Tick, AGES, AGES, st.integers(0, 9000), ACTIVE, EVENTS, st.just(())), min_size=2)
+TICKS = st.lists(
+    st.builds(Tick, AGES, AGES, st.integers(0, 9000), ACTIVE, EVENTS, st.just(())), min_size=2
+)
 QUICK = {"max_age": 0.03, "hold": 0.02, "ramp": 0.03}
 PATIENT = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
 
 
 @settings(deadline=None)
 @given(ticks=TICKS, hold=st.booleans(), with_feedforward=st.booleans())
-def test_replay_equals_flight_with_late_and_lost_samples(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
+def test_replay_equals_flight_with_late_and_lost_samples(
+    ticks: list[Tick], hold: bool, with_feedforward: bool
+) -> None:
     changes = QUICK | {"on_deactivate": "hold" if hold else "trim", "slew": [0.3] * 4}
     parameters = vary(LEADING if with_feedforward else GUST.controller, changes)
     result = replay(driven(parameters, [FLY, FLY, *ticks]), parameters)
@@ -149,7 +172,10 @@ def test_replay_equals_flight_with_late_and_lost_samples(ticks: list[Tick], hold
 
 
 MODES: dict[str, tuple[list[Tick], list[Mode]]] = {
-    "y lost": ([LOST_Y] * 40 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED]),
+    "y lost": (
+        [LOST_Y] * 40 + [FLY] * 3,
+        [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED],
+    ),
     # y is fresh but unused
     "y_m lost": ([LOST_Y_M] * 12 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),
     "deactivated": ([OFF] * 4 + [FLY] * 3, [Mode.ENGAGED, Mode.INACTIVE, Mode.ENGAGED]),
@@ -158,7 +184,10 @@ MODES: dict[str, tuple[list[Tick], list[Mode]]] = {
         [Mode.ENGAGED, Mode.INACTIVE, Mode.HOLD, Mode.ENGAGED],
     ),
     # its stamp is older
-    "engaged by a late y": ([LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED]),
+    "engaged by a late y": (
+        [LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3,
+        [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED],
+    ),
     "configured again": ([Tick(event="configured")] + [FLY] * 3, [Mode.ENGAGED]),
     "late": ([Tick(late=8000), LOST_Y, LOST_Y, FLY], [Mode.ENGAGED]),  # dt of 38 ms
 }
@@ -190,7 +219,9 @@ def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
         replay(tape, scenario.controller, vary(scenario.controller, {"Lambda": gains})),
     ):
         assert not result.equal()
-        assert result.other_parameters.all()  # from the first tick on, even where rounding hides the bit in all of u
+        assert (
+            result.other_parameters.all()
+        )  # from the first tick on, even where rounding hides the bit in all of u
         first = result.first()
         if scenario.controller.outputs[channel] == "V":
             continue  # Lambda e is 1e-3 of u there, and its last bit may change no u
@@ -212,7 +243,20 @@ BUSY = {
 @pytest.mark.parametrize(
     ("topic", "channels"),
     [
-        ("internals", ["dt", "u.rudder", "u_free.rudder", "u_trim.rudder", "Pi.r", "integral_e.r", "e.r", "e_0.r", "y.r"]),
+        (
+            "internals",
+            [
+                "dt",
+                "u.rudder",
+                "u_free.rudder",
+                "u_trim.rudder",
+                "Pi.r",
+                "integral_e.r",
+                "e.r",
+                "e_0.r",
+                "y.r",
+            ],
+        ),
         ("u", ["rudder"]),
         ("y", ["r"]),
     ],
@@ -224,7 +268,9 @@ def test_one_bit_of_one_sample_found_and_only_there(topic: str, channels: list[s
         values = tape[topic].values.copy()
         column = tape[topic].names.index(channel)
         values[row, column] = flipped(values[row, column])
-        damaged = replace(tape, signals={**tape.signals, topic: replace(tape[topic], values=values)})
+        damaged = replace(
+            tape, signals={**tape.signals, topic: replace(tape[topic], values=values)}
+        )
         result = replay(damaged, GUST.controller)
         first = result.first()
         assert first is not None
@@ -235,11 +281,18 @@ def test_one_bit_of_one_sample_found_and_only_there(topic: str, channels: list[s
 
 
 def test_differences_counted_in_units_in_last_place() -> None:
-    cases = ((1.0, math.nextafter(1.0, 2), 1), (-5e-324, 5e-324, 2), (0.0, -0.0, 0), (1.0, math.nan, None))
+    cases = (
+        (1.0, math.nextafter(1.0, 2), 1),
+        (-5e-324, 5e-324, 2),
+        (0.0, -0.0, 0),
+        (1.0, math.nan, None),
+    )
     for recorded, computed, ulps in cases:
         yes = np.ones(1, dtype=bool)
         pair = np.array([[recorded]]), np.array([[computed]])
-        result = ReplayResult(("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ())
+        result = ReplayResult(
+            ("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ()
+        )
         first = result.first()
         assert first is not None  # zeros of different sign differ
         assert first.ulps == ulps
@@ -249,7 +302,10 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
     """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
     pair = {name: tape[name] for name in ("internals", "u")}
-    cut = {name: Signal(signal.stamp_ns[kept], signal.names, signal.values[kept]) for name, signal in pair.items()}
+    cut = {
+        name: Signal(signal.stamp_ns[kept], signal.names, signal.values[kept])
+        for name, signal in pair.items()
+    }
     return replace(tape, signals={**tape.signals, **cut})
 
 
@@ -267,9 +323,13 @@ def test_log_without_beginning_checked_after_first_tick(name: str) -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(ticks=TICKS, lost=st.sets(st.integers(1, 60)), leading=st.booleans())
-def test_lost_samples_of_log_cause_no_differences(ticks: list[Tick], lost: set[int], leading: bool) -> None:
+def test_lost_samples_of_log_cause_no_differences(
+    ticks: list[Tick], lost: set[int], leading: bool
+) -> None:
     parameters = vary(LEADING if leading else GUST.controller, QUICK)
-    tape = without(driven(parameters, [FLY, FLY, *ticks]), lambda number: ~np.isin(number, list(lost)))
+    tape = without(
+        driven(parameters, [FLY, FLY, *ticks]), lambda number: ~np.isin(number, list(lost))
+    )
     if len(tape["internals"].stamp_ns):
         assert replay(tape, parameters).first() is None
 
@@ -291,7 +351,12 @@ def test_gains_changed_in_flight_differ_from_tick_of_change() -> None:
 def test_replay_applies_successive_gain_changes_one_by_one() -> None:
     changes: list[dict[str, Any]] = [{"k_g": 2.0}, {"Lambda": [3.0, 4.0, 2.0, 1.0]}]
     changes += [{"k_g": 3.3}, {"slew": [0.2] * 4}, {"k_g": 1.0}]
-    ticks = [FLY] * 30 + [Tick(changes=(*changes[:3],))] + [FLY] * 10 + [Tick(changes=(change,)) for change in changes[3:]]
+    ticks = (
+        [FLY] * 30
+        + [Tick(changes=(*changes[:3],))]
+        + [FLY] * 10
+        + [Tick(changes=(change,)) for change in changes[3:]]
+    )
     result = replay(driven(GUST.controller, ticks + [FLY] * 5), GUST.controller, changes=changes)
     assert equal(result), result.first()
     assert [note.split(": ")[1] for note in result.notes] == ["Lambda, k_g", "slew", "k_g"]
@@ -302,32 +367,52 @@ def test_replay_applies_successive_gain_changes_one_by_one() -> None:
 
 
 def test_open_loop_equals_controller_on_recorded_inputs() -> None:
-    others = vary(GUST.controller, {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4})
+    others = vary(
+        GUST.controller,
+        {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4},
+    )
     tape = simulate(GUST)
     controller, us = Controller(others), []
-    for number, (stamp_ns, y) in enumerate(zip(tape["y"].stamp_ns.tolist(), tape["y"].values, strict=True)):
+    for number, (stamp_ns, y) in enumerate(
+        zip(tape["y"].stamp_ns.tolist(), tape["y"].values, strict=True)
+    ):
         order = [tape["y"].names.index(name) for name in others.outputs]
         controller.take_y(StampedVector(stamp_ns, y[order]), stamp_ns)
         controller.take_y_m(StampedVector(stamp_ns, tape["y_m"].values[number][order]), stamp_ns)
-        if stamp_ns % controller.period_ns == 0 and (output := controller.tick(stamp_ns)) is not None:
+        if (
+            stamp_ns % controller.period_ns == 0
+            and (output := controller.tick(stamp_ns)) is not None
+        ):
             us.append(output.u)
     result = replay(tape, GUST.controller, others)
     assert result.group(result.computed, "u").values.tobytes() == np.array(us).tobytes()
     assert result.notes == (OPEN_LOOP,)
-    assert np.abs(result.group(result.computed, "u").values - result.group(result.recorded, "u").values).max() > 1e-3
+    assert (
+        np.abs(
+            result.group(result.computed, "u").values - result.group(result.recorded, "u").values
+        ).max()
+        > 1e-3
+    )
 
 
 def test_a_log_of_other_channels_is_refused() -> None:
     tape = simulate(GUST.vary(flight={"duration": 0.1}))
     log = tape["internals"]
-    less = replace(tape, signals={"internals": Signal(log.stamp_ns, ("mood", *log.names[1:]), log.values)})
-    sentence = "internals: found no mode, also mood, expected the channels of the scenario in the log"
+    less = replace(
+        tape, signals={"internals": Signal(log.stamp_ns, ("mood", *log.names[1:]), log.values)}
+    )
+    sentence = (
+        "internals: found no mode, also mood, expected the channels of the scenario in the log"
+    )
     with pytest.raises(ParameterError, match=sentence):
         replay(less, GUST.controller)
     with pytest.raises(ParameterError, match="the log: found no sample of internals"):
         replay(Tape({"y": tape["y"]}), GUST.controller)
     other = vary(GUST.controller, {"outputs": ["p", "q", "r", "V"]})
-    with pytest.raises(ParameterError, match=r"controller.outputs: found p, q, r, V, expected q, p, r, V, as recorded"):
+    with pytest.raises(
+        ParameterError,
+        match=r"controller.outputs: found p, q, r, V, expected q, p, r, V, as recorded",
+    ):
         replay(tape, GUST.controller, other)
 
 
@@ -342,7 +427,9 @@ def busy_scenario(folder: Path, **controller: object) -> Path:
     """The default scenario with changes to the controller and commands on all channels, 2 s."""
     flight, reference_model = {"duration": 2.0}, {"pulses": BUSY}
     path = folder / "busy.yaml"
-    return scenario_file(path, GUST.path, flight=flight, reference_model=reference_model, controller=controller)
+    return scenario_file(
+        path, GUST.path, flight=flight, reference_model=reference_model, controller=controller
+    )
 
 
 @pytest.fixture(scope="module")
@@ -366,15 +453,22 @@ def test_the_command_counts_the_ticks(run: Path) -> None:
 
 def test_command_finds_one_bit_of_one_gain_in_scenario_of_log(tape: Tape, tmp_path: Path) -> None:
     gains = [flipped(5.0), 5.0, 3.0, 0.5]
-    run = write_run(tape, tmp_path / "run", LogAttachments(busy_scenario(tmp_path, Lambda=gains))).parent
+    run = write_run(
+        tape, tmp_path / "run", LogAttachments(busy_scenario(tmp_path, Lambda=gains))
+    ).parent
     result = command(str(run))
     assert result.exit_code == 1
     first, count, note = result.stdout.splitlines()
-    number = re.match(r"tick (\d+) differs first, at t = .* s: u.elevator recorded .*, computed .*, [1-9]\d* ULP$", first)
+    number = re.match(
+        r"tick (\d+) differs first, at t = .* s: u.elevator recorded .*, computed .*, [1-9]\d* "
+        r"ULP$",
+        first,
+    )
     assert number is not None
     assert re.match(r"201 ticks, \d+ differ, the last at t = .* s; u_free in \d+, u in \d+", count)
     assert note.startswith(
-        "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log holds: changed in"
+        "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log "
+        "holds: changed in"
     )
     # the same by --set, on the log with the right ones, and as JSON
     right = write_run(tape, tmp_path / "right", LogAttachments(busy_scenario(tmp_path))).parent
@@ -394,7 +488,10 @@ def test_log_cut_short_checked_as_far_as_it_goes(run: Path) -> None:
 
 
 def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
-    csv_file, gains = tmp_path / "u.csv", ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]")
+    csv_file, gains = (
+        tmp_path / "u.csv",
+        ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]"),
+    )
     result = command(str(run), *gains, "--csv", str(csv_file))
     assert result.exit_code == 1
     assert result.stdout.count(OPEN_LOOP) == 1  # in the notes
@@ -410,7 +507,10 @@ def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -
     ("setting", "sentence"),
     [
         ("controller.k_g=-1", "controller.k_g: found -1, expected greater than 0"),
-        ("aircraft.rate=1", "--set: found 'aircraft.rate=1', expected a parameter of the controller and its value"),
+        (
+            "aircraft.rate=1",
+            "--set: found 'aircraft.rate=1', expected a parameter of the controller and its value",
+        ),
     ],
 )
 def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Path) -> None:
@@ -425,7 +525,13 @@ def test_changes_of_parameters_read_from_log(tmp_path: Path) -> None:
     events = [
         parameter_event("/one/controller", {"Lambda": [1.0, 2.0], **clock}, stamp_ns=2000 * MS),
         # not in the order of their stamps
-        parameter_event("/controller", {"sign": "soft"}, new={"k_g": 2.5}, deleted={"upper": None}, stamp_ns=1000 * MS + 5),
+        parameter_event(
+            "/controller",
+            {"sign": "soft"},
+            new={"k_g": 2.5},
+            deleted={"upper": None},
+            stamp_ns=1000 * MS + 5,
+        ),
         parameter_event("/controller", {"upper": [1.0, 2.0]}, stamp_ns=1000 * MS),
         parameter_event("/aircraft", {"k_g": 9.0}, stamp_ns=1),
         parameter_event("/controller", {}, new=clock, stamp_ns=2),

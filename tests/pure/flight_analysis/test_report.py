@@ -31,7 +31,10 @@ from rise_di_controller.internals import Saturation
 pytestmark = pytest.mark.slow
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
-OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")  # headings on every page with a linear loop
+OF_LOOP = (
+    "Bode plot of the loop",
+    "Nyquist plot of the loop",
+)  # headings on every page with a linear loop
 DEG = np.pi / 180.0
 
 
@@ -42,14 +45,27 @@ def servo() -> Scenario:
 
 def held(count: int = 101, /, **channels: Any) -> Signal:
     """Channels at 100 Hz, of which most hold a value; `__` in a name stands for a dot."""
-    return signal([10.0 * k for k in range(count)], **{name.replace("__", "."): value for name, value in channels.items()})
+    return signal(
+        [10.0 * k for k in range(count)],
+        **{name.replace("__", "."): value for name, value in channels.items()},
+    )
 
 
 def ticks(count: int = 101, /, **channels: Any) -> Signal:
-    """Internals of a controller at 100 Hz that was on time and never saturated, except in the channels given."""
+    """Internals of a controller at 100 Hz that was on time and never saturated, except in the
+    channels given.
+    """
     limited = {f"limited.{name}": Saturation.NO for name in INPUTS}
     integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
-    return held(count, **({"mode": Mode.ENGAGED, "dt": 0.01, "late": 0.0, "age": 0.0} | limited | integrals | channels))
+    return held(
+        count,
+        **(
+            {"mode": Mode.ENGAGED, "dt": 0.01, "late": 0.0, "age": 0.0}
+            | limited
+            | integrals
+            | channels
+        ),
+    )
 
 
 def flight(count: int = 101, **signals: Signal) -> Tape:
@@ -93,7 +109,9 @@ def headings(page: str) -> list[str]:
     return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
 
 
-def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+def test_a_simulated_flight_has_every_figure(
+    tmp_path: Path, servo: Scenario, complete: Tape
+) -> None:
     assert headings(page_of(tmp_path, servo, complete)) == [
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
@@ -110,12 +128,17 @@ def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, co
 
 
 def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> None:
-    one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
-    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(OF_LOOP)  # y, e, u, states, integrals: no wind, no late tick
+    one = flight(
+        1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0)
+    )
+    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(
+        OF_LOOP
+    )  # y, e, u, states, integrals: no wind, no late tick
 
 
 def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
-    # White noise on all channels at the rates of the scenario hardly compresses. plotly itself takes 0.5 MB. Measured 4.2 MB.
+    # White noise on all channels at the rates of the scenario hardly compresses. plotly itself
+    # takes 0.5 MB. Measured 4.2 MB.
     random = np.random.default_rng(1)
 
     def noise(rate: int, *names: str) -> Signal:
@@ -125,7 +148,9 @@ def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: 
     states = ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"]
     groups = {"x": states, "gust": ["a", "b", "c"], "actuator": INPUTS, "noise": OUTPUTS}
     signals = {"y": noise(500, *OUTPUTS), "y_m": noise(500, *OUTPUTS), "u": noise(100, *INPUTS)}
-    signals["truth"] = noise(500, *(f"{group}.{name}" for group, names in groups.items() for name in names))
+    signals["truth"] = noise(
+        500, *(f"{group}.{name}" for group, names in groups.items() for name in names)
+    )
     page = page_of(tmp_path, servo, Tape(signals, EPOCH))
     assert len(page) < 5e6
     assert 'src="http' not in page
@@ -137,22 +162,41 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
     assert "<script>alert" not in page
 
 
-def test_every_colour_of_page_has_dark_counterpart(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+def test_every_colour_of_page_has_dark_counterpart(
+    tmp_path: Path, servo: Scenario, complete: Tape
+) -> None:
     # Colours of modes, saturations and gusts serve light and dark pages alike.
     shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
-    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete))
+    specifications = re.findall(
+        r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete)
+    )
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
     assert used - shared <= set(plotting.DARK | figures.DARK | comparison.DARK)
     assert len(used) > 5
 
 
 def test_each_event_listed_once_in_order_of_start() -> None:
-    modes = ((20, "ENGAGED"), (10, "HOLD"), (20, "ENGAGED"), (5, "HOLD"), (5, "RAMP"), (41, "ENGAGED"))
+    modes = (
+        (20, "ENGAGED"),
+        (10, "HOLD"),
+        (20, "ENGAGED"),
+        (5, "HOLD"),
+        (5, "RAMP"),
+        (41, "ENGAGED"),
+    )
     mode = [Mode[name] for count, name in modes for _ in range(count)]
-    rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
+    rate = (
+        [Saturation.NO] * 2
+        + [Saturation.RATE] * 3
+        + [Saturation.NO] * 90
+        + [Saturation.RATE]
+        + [Saturation.NO] * 5
+    )
     tape = flight(internals=ticks(mode=mode, limited__thrust=rate))
     listed = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
-    assert [(event.name, round(event.start, 3), round(event.stop, 3), event.extent) for event in listed] == [
+    assert [
+        (event.name, round(event.start, 3), round(event.stop, 3), event.extent) for event in listed
+    ] == [
         ("thrust saturated: rate", 0.02, 0.95, "4 of 101 ticks"),
         ("hold", 0.2, 0.55, "0.15 s, 2 times"),  # 0.2 s to 0.3 s and 0.5 s to 0.55 s
         ("ramp", 0.55, 0.6, "0.05 s"),
@@ -165,8 +209,10 @@ def test_every_mode_but_engaged_is_interval_with_name() -> None:
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
     modes = [mode for mode in Mode for _ in range(10)]
     intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
-    assert {interval.label: (round(interval.start, 3), round(interval.stop, 3)) for interval in intervals} == {
-        "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
+    assert {interval.label: (round(interval.start, 3),
+    round(interval.stop, 3)) for interval in intervals} == {
+        "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5),
+        "inactive": (0.5, 0.59),
     }  # fmt: skip
 
 
@@ -177,7 +223,10 @@ def test_spectrum_of_commanded_sine_has_peak_there() -> None:
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     elevator = drawn(figure).data[0]
     assert elevator.x[np.argmax(elevator.y)] == pytest.approx(5.0, abs=0.2)
-    assert figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {}) is None  # eleven samples
+    assert (
+        figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {})
+        is None
+    )  # eleven samples
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +239,10 @@ def pair(servo: Scenario) -> list[RecordedFlight]:
 
 
 def test_metrics_of_several_flights_compared_by_channel_name(pair: list[RecordedFlight]) -> None:
-    compared = {table.caption: {row.name: row for row in table.rows} for table in comparison.error_tables(pair)}
+    compared = {
+        table.caption: {row.name: row for row in table.rows}
+        for table in comparison.error_tables(pair)
+    }
     assert list(compared) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
     whole = compared["q (mrad/s)"]["rms whole"]
     assert whole.texts == ("200", "100")
@@ -205,7 +257,11 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
     page = (tmp_path / "comparison.html").read_text(encoding="utf-8")
     assert "2 flights compared" in page
     assert '<td class="better">&times;0.500</td>' in page
-    assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
+    assert headings(page) == [
+        "Tracking error",
+        "Output y over the reference y_m",
+        "Tracking error e = y - y_m",
+    ]
 
 
 def test_curve_is_broken_at_gap_and_u_held() -> None:
@@ -227,8 +283,13 @@ def test_all_samples_of_long_curves_stored_once() -> None:
     count = 5000
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
     y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
-    shared = context(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
-    found = [*drawn(figures.tracking_figure(shared)).data, *drawn(figures.error_figure(shared)).data]
+    shared = context(
+        Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7)
+    )
+    found = [
+        *drawn(figures.tracking_figure(shared)).data,
+        *drawn(figures.error_figure(shared)).data,
+    ]
     q = [trace for trace in found if trace.yaxis == "y"]
     assert [trace.y for trace in q] == [None] * 3
     instants = np.cumsum(unpacked(shared.samples.packed[q[1].meta["t"]], "<f8"))
@@ -246,7 +307,10 @@ def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.Monkey
     stamps = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100, 101], dtype=np.int64)
     values = np.array([1.0, 5.0, 0.0, 2.0, 7.0, 9.0, 8.0, 6.0, 3.0, 4.0, 5.0])
     shared = PlotContext(Tape({}), {}, [], 1.0, SampleStore())
-    t, v = (shared.samples.packed[name] for name in plotting.stored(shared, Signal(stamps, ("q",), values[:, None]), "q", 1.0))
+    t, v = (
+        shared.samples.packed[name]
+        for name in plotting.stored(shared, Signal(stamps, ("q",), values[:, None]), "q", 1.0)
+    )
     assert np.cumsum(unpacked(t, "<f8")).tolist() == [0, 2, 4, 6, 8, 100]
     drawn = np.cumsum(unpacked(v, "<u4"), dtype=np.uint32).view(np.float32)
     np.testing.assert_array_equal(drawn, [5.0, 0.0, 9.0, 6.0, 3.0, np.nan])

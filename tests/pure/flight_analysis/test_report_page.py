@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report page in a browser: it draws without errors, in light and dark, and a zoom shows all samples."""
+"""The report page in a browser: it draws without errors, in light and dark, and a zoom shows all
+samples.
+"""
 
 import base64
 import json
@@ -35,7 +37,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def servo() -> RecordedFlight:
-    """Seven seconds with noise and commands from 2 s on: more samples than are drawn before a zoom."""
+    """Seven seconds with noise and commands from 2 s on: more samples than are drawn before a
+    zoom.
+    """
     scenario = find_scenario("osprey_servo").vary(flight={"duration": 7.0})
     return recorded("servo", scenario, simulate(scenario))
 
@@ -52,7 +56,9 @@ def recorded(name: str, scenario: Scenario | None, tape: Tape) -> RecordedFlight
 
 
 def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:
-    browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    browser.call(
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}]
+    )
     browser.open(path)
     browser.wait_for(f"{DRAWN} === 1")
 
@@ -60,14 +66,19 @@ def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:
 def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
     """Zoom one figure, as a drag of the mouse does, and wait for all figures."""
     before = browser.run(DRAWN)
-    browser.run(f"Plotly.relayout({PLOTS}[{plot}], {{'xaxis.range': [{start}, {stop}]}}).then(() => 0)")
+    browser.run(
+        f"Plotly.relayout({PLOTS}[{plot}], {{'xaxis.range': [{start}, {stop}]}}).then(() => 0)"
+    )
     browser.wait_for(f"{DRAWN} > {before}")
 
 
 def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[float], list[float]]:
     """Instants and values of a drawn curve."""
     axis = "y" if row == 1 else f"y{row}"
-    found = f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis === '{axis}')"
+    found = (
+        f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis "
+        f"=== '{axis}')"
+    )
     x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({found})")
     return x, y
 
@@ -75,10 +86,16 @@ def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[fl
 def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path) -> None:
     open_page(browser, page)
     assert browser.console == []
-    headings = browser.run("[...document.querySelectorAll('section h2')].map(heading => heading.textContent)")
-    drawn = browser.run(f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer .trace').length)")
+    headings = browser.run(
+        "[...document.querySelectorAll('section h2')].map(heading => heading.textContent)"
+    )
+    drawn = browser.run(
+        f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer "
+        ".trace').length)"
+    )
     curves = dict(zip(headings, drawn, strict=True))
-    # For each of four channels: y over y_m; two errors and the noise floor; command, actuator and limits.
+    # For each of four channels: y over y_m; two errors and the noise floor; command, actuator and
+    # limits.
     assert curves["Output y over the reference y_m"] == 8
     assert curves["Tracking error e = y - y_m"] == 12
     assert curves["Input u and the actuators"] >= 8
@@ -88,7 +105,9 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     assert all(count > 0 for count in drawn)
 
 
-def test_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+def test_zoom_shows_every_sample_in_all_figures(
+    browser: Browser, page: Path, servo: RecordedFlight
+) -> None:
     open_page(browser, page)
     y = servo.tape["y"]
     whole, _ = curve(browser, 0, "y")
@@ -100,8 +119,13 @@ def test_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, se
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
     t = servo.tape.time("y")
     x, values = curve(browser, 0, "y", row=2)
-    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=2.0**-15.9)  # plotting.MANTISSA, and float32
-    assert browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)") == [[2.0, 2.1]] * 3
+    assert values == pytest.approx(
+        np.interp(x, t, y["V"]), rel=2.0**-15.9
+    )  # plotting.MANTISSA, and float32
+    assert (
+        browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)")
+        == [[2.0, 2.1]] * 3
+    )
     zoom(browser, 0.0, 7.0, plot=2)
     again, _ = curve(browser, 0, "y")
     assert len(again) < len(t)
@@ -109,7 +133,9 @@ def test_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, se
     assert browser.console == []
 
 
-def test_replay_shows_pose_and_surfaces_of_flight(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+def test_replay_shows_pose_and_surfaces_of_flight(
+    browser: Browser, page: Path, servo: RecordedFlight
+) -> None:
     open_page(browser, page)
     browser.wait_for("document.getElementById('replay').dataset.drawn === '0'")
     place = "document.getElementById('replay-time')"
@@ -117,29 +143,40 @@ def test_replay_shows_pose_and_surfaces_of_flight(browser: Browser, page: Path, 
     def seek(t: float) -> bytes:
         browser.run(f"void ({place}.value = {t}, {place}.dispatchEvent(new Event('input')))")
         browser.wait_for(f"Number(document.getElementById('replay').dataset.drawn) === {t}")
-        return base64.b64decode(browser.run("document.getElementById('replay-horizon').toDataURL()").partition(",")[2])
+        return base64.b64decode(
+            browser.run("document.getElementById('replay-horizon').toDataURL()").partition(",")[2]
+        )
 
     assert seek(0.5) != seek(5.0)  # level, then in a roll
     assert "ENGAGED" in browser.run("document.getElementById('replay-now').textContent")
     assert "grid" in browser.run("document.getElementById('replay-legend').textContent")
     stored = page.read_text(encoding="utf-8")
-    topics, info = json.loads(stored.partition('id="replay-data">')[2].partition("</script>")[0]).values()
+    topics, info = json.loads(
+        stored.partition('id="replay-data">')[2].partition("</script>")[0]
+    ).values()
     assert info["positive"]["rudder"] == "nose right"
     figures = stored.partition('id="replay-data">')[0] + stored.partition("replay-code")[2]
-    assert all(f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values())  # stored once, for the figure
+    assert all(
+        f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values()
+    )  # stored once, for the figure
     browser.run("void document.getElementById('replay-play').click()")
     browser.wait_for("Number(document.getElementById('replay').dataset.drawn) > 5.2")
     assert browser.console == []
 
 
-def test_zoom_keeps_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
+def test_zoom_keeps_peaks_of_each_pixel(
+    browser: Browser, tmp_path: Path, servo: RecordedFlight
+) -> None:
     count = 40_000
     values = np.zeros((count, 4))
     values[30_001, 0], values[31_003, 0] = 5.0, -4.0  # one sample each, between 60 s and 62.1 s
     stamps = np.arange(count, dtype=np.int64) * 2_000_000
     zero = Signal(stamps, servo.tape["y"].names, np.zeros((count, 4)))
     path = tmp_path / "peaks.html"
-    write_page(path, [recorded("peaks", servo.scenario, Tape({"y": replace(zero, values=values), "y_m": zero}))])
+    write_page(
+        path,
+        [recorded("peaks", servo.scenario, Tape({"y": replace(zero, values=values), "y_m": zero}))],
+    )
     open_page(browser, path)
     for start, stop in ((0.0, 80.0), (50.0, 70.0), (60.0, 60.01)):
         zoom(browser, start, stop)
@@ -149,12 +186,19 @@ def test_zoom_keeps_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo:
 
 
 def test_dark_page_has_own_colours_and_follows_scheme(browser: Browser, page: Path) -> None:
-    look = f"[getComputedStyle(document.body).backgroundColor, {PLOTS}[0].data[1].line.color, {PLOTS}[0].layout.font.color]"
+    look = (
+        f"[getComputedStyle(document.body).backgroundColor, {PLOTS}[0].data[1].line.color, "
+        f"{PLOTS}[0].layout.font.color]"
+    )
     open_page(browser, page, "dark")
     dark = browser.run(look)
-    browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+    browser.call(
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}]
+    )
     browser.wait_for(f"{DRAWN} === 2")
     light = browser.run(look)
     assert light[0] == "rgb(255, 255, 255)"
-    assert all(dark_color != light_color for dark_color, light_color in zip(dark, light, strict=True))
+    assert all(
+        dark_color != light_color for dark_color, light_color in zip(dark, light, strict=True)
+    )
     assert browser.console == []

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The osprey with servos agrees with a prototype of this law, another program with the same equations, to 10 %.
+"""The osprey with servos agrees with a prototype of this law, another program with the same
+equations, to 10 %.
 
-y, y_m and the law share 100 Hz, topics take no time, and the softened sign is three total lags wide. The prototype's figures
-have two or three digits, so rounding takes up to 5 % of the 10 %. Errors are true errors over 60 s, q, V, p, r in mrad/s, m/s.
+y, y_m and the law share 100 Hz, topics take no time, and the softened sign is three total lags
+wide. The prototype's figures have two or three digits, so rounding takes up to 5 % of the 10 %.
+Errors are true errors over 60 s, q, V, p, r in mrad/s, m/s.
 """
 
 from typing import Any
@@ -19,11 +21,15 @@ from flight_analysis.metrics import error_metrics
 
 pytestmark = pytest.mark.slow
 
-NO_SIGN = {"beta": [1e-9 * beta for beta in PROTOTYPE_SERVO.rise_di().beta]}  # the law is then a PI controller
+NO_SIGN = {
+    "beta": [1e-9 * beta for beta in PROTOTYPE_SERVO.rise_di().beta]
+}  # the law is then a PI controller
 LITERAL = {"sign": "literal"}
 CALM: dict[str, Any] = {"gusts": {}}
 GYRO = {"sensors": {"noise": [0.02, 0.0, 0.02, 0.02]}}  # rad/s rms per sample
-FINE = {"step": 0.0005}  # actuators lead by half an integration step, which changes the size of a limit cycle
+FINE = {
+    "step": 0.0005
+}  # actuators lead by half an integration step, which changes the size of a limit cycle
 
 
 def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scenario:
@@ -40,7 +46,9 @@ def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scen
     [
         pytest.param({}, {}, (7.6, 0.088, 9.9, 6.4), id="soft, gusts"),
         pytest.param({}, NO_SIGN, (13.7, 0.178, 22.2, 14.0), id="PI, gusts"),
-        pytest.param(CALM | FINE, LITERAL, (13.0, 0.179, 16.8, 18.4), id="literal, calm: a limit cycle"),
+        pytest.param(
+            CALM | FINE, LITERAL, (13.0, 0.179, 16.8, 18.4), id="literal, calm: a limit cycle"
+        ),
         pytest.param(CALM | GYRO, {}, (7.2,), id="soft, noisy gyros"),
         pytest.param(CALM | GYRO, NO_SIGN, (7.2,), id="PI, noisy gyros"),
     ],
@@ -50,18 +58,26 @@ def test_a_flight_agrees_with_the_prototype(
 ) -> None:
     flown = error(simulate(servo_scenario(aircraft, controller)))
     units = (1e3, 1.0, 1e3, 1e3)
-    measured = [unit * error_metrics(flown[name]).rms for unit, name in zip(units, ("q", "V", "p", "r"), strict=True)]
+    measured = [
+        unit * error_metrics(flown[name]).rms
+        for unit, name in zip(units, ("q", "V", "p", "r"), strict=True)
+    ]
     assert measured[: len(rms)] == pytest.approx(rms, rel=0.1)
 
 
 def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> None:
-    # Thrust +-15 %, V +4 m/s from 10 s to 30 s as in the manoeuvre of the scenario. The prototype: 677 % commanded, undershoot
-    # 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; with anti-windup (conditional integration) 60 %, 0.00, 4.1, 0.44.
-    # Measured 681, 1.41, 12.5, 0.946 and 60.6, 0.001, 4.08, 0.438.
+    # Thrust +-15 %, V +4 m/s from 10 s to 30 s as in the manoeuvre of the scenario. The prototype:
+    # 677 % commanded, undershoot 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; with anti-windup
+    # (conditional integration) 60 %, 0.00, 4.1, 0.44. Measured 681, 1.41, 12.5, 0.946 and 60.6,
+    # 0.001, 4.08, 0.438.
     back, metrics = 30.0, {}
     for guarded in (False, True):
         held = with_stops("thrust", 0.15, guarded=guarded)
-        tape = simulate(held.vary(flight={"duration": 60.0}, reference_model={"pulses": {"V": pulse(10.0, back, 4.0)}}))
+        tape = simulate(
+            held.vary(
+                flight={"duration": 60.0}, reference_model={"pulses": {"V": pulse(10.0, back, 4.0)}}
+            )
+        )
         e, t = error(tape)["V"], tape.time("truth")
         metrics[guarded] = [
             100.0 * np.abs(tape["internals"]["u_free.thrust"]).max(),

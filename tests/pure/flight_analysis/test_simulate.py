@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process: its tracking error, and the order of the error in the sampling period."""
+"""The closed loop in one process: its tracking error, and the order of the error in the sampling
+period.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -21,7 +23,12 @@ from flight_log.tape_writer import TapeWriter, write_run
 pytestmark = pytest.mark.slow
 
 DISPLAY_FACTORS = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
-ABOVE_SLEW = [29.4, 22.5, 10.2, 7.8]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
+ABOVE_SLEW = [
+    29.4,
+    22.5,
+    10.2,
+    7.8,
+]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
 BELOW_SLEW = [14.7, 22.5, 6.8, 3.6]  # 15 deg/s, 15, 40, 60 %/s: below it
 Rms = Callable[..., FloatArray]
 
@@ -30,7 +37,8 @@ Rms = Callable[..., FloatArray]
 def rms(osprey_gust: Scenario) -> Rms:
     """Root mean square error over the whole flight by channel q, V, p, r.
 
-    The aircraft is sampled at 200 Hz, twice the rate of the controller; at 400 Hz the orders in dt are measured.
+    The aircraft is sampled at 200 Hz, twice the rate of the controller; at 400 Hz the orders in dt
+    are measured.
     """
 
     @cache
@@ -45,7 +53,11 @@ def rms(osprey_gust: Scenario) -> Rms:
     ) -> FloatArray:
         scenario = osprey_gust.vary(
             flight={"duration": duration},
-            controller={"rate": rate, "sign": sign, "beta": BELOW_SLEW if below_slew else ABOVE_SLEW},
+            controller={
+                "rate": rate,
+                "sign": sign,
+                "beta": BELOW_SLEW if below_slew else ABOVE_SLEW,
+            },
             reference_model={"rate": aircraft},
             aircraft={"rate": aircraft, "step": 1.0 / aircraft} | ({} if gusts else {"gusts": {}}),
         )
@@ -83,7 +95,8 @@ def test_literal_sign_halving_dt_halves_the_error(rms: Rms) -> None:
     coarse = calm(sign="literal", rate=200.0, duration=20.0)
     fine = calm(sign="literal", rate=400.0, duration=20.0)
     assert coarse / fine == pytest.approx(2.0, rel=0.3)
-    # The error is far above that of the implicit sign, which only needs the size of Omega's diagonal.
+    # The error is far above that of the implicit sign, which only needs the size of Omega's
+    # diagonal.
     assert (coarse[[0, 3]] > 20 * calm(rate=200.0, duration=30.0)[[0, 3]]).all()
 
 
@@ -95,7 +108,9 @@ def test_flight_records_one_second_at_a_time(osprey_gust: Scenario) -> None:
     assert max(len(part["y"].stamp_ns) for part in parts) <= scenario.aircraft.rate + 1
     tape = simulate(scenario)
     for topic, signal in tape.signals.items():
-        assert sum(len(part[topic].stamp_ns) for part in parts if topic in part) == len(signal.stamp_ns)
+        assert sum(len(part[topic].stamp_ns) for part in parts if topic in part) == len(
+            signal.stamp_ns
+        )
         assert (np.diff(signal.stamp_ns) > 0).all()
 
 

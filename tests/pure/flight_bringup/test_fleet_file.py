@@ -33,17 +33,26 @@ def fleet_file(folder: Path, text: str) -> Path:
 
 
 def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Path) -> None:
-    (tmp_path / "there.yaml").write_text("route: [[0, 400, 10], [400, 400, 10]]\n", encoding="utf-8")
+    (tmp_path / "there.yaml").write_text(
+        "route: [[0, 400, 10], [400, 400, 10]]\n", encoding="utf-8"
+    )
     first, second, third = read_fleet(fleet_file(tmp_path, FLEET)).members
     for member in (first, second, third):
         assert member.scenario.aircraft.wind == (2.0, -1.0)
         assert member.scenario.aircraft.turbulence is not None
-        assert (member.scenario.aircraft.turbulence.seed, member.scenario.aircraft.turbulence.wind) == (
+        assert (
+            member.scenario.aircraft.turbulence.seed,
+            member.scenario.aircraft.turbulence.wind,
+        ) == (
             7,
             7.7,
         )  # of osprey_route
         assert member.scenario.flight.duration == 3.0
-    assert (second.delay, second.scenario.aircraft.start.north, second.scenario.aircraft.start.heading) == (1.5, 50.0, 0.5)
+    assert (
+        second.delay,
+        second.scenario.aircraft.start.north,
+        second.scenario.aircraft.start.heading,
+    ) == (1.5, 50.0, 0.5)
     assert first.scenario.rise_di().k_g != second.scenario.rise_di().k_g == 2.5
     assert third.scenario.guidance is not None
     assert third.scenario.guidance.route is not None
@@ -56,8 +65,12 @@ def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
         return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
 
     own, blue = "/red/controller#1", of("/blue/controller#2")
-    assert fleet.foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
-    assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
+    assert fleet.foreign_samples({"red": of(own), "blue": blue}) == [
+        "samples from outside of the aircraft: 0 of 6"
+    ]
+    assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == [
+        "red: 3 samples from outside of /red"
+    ]
 
 
 @pytest.fixture
@@ -68,7 +81,9 @@ def without_ros(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 
 @pytest.mark.parametrize("words", [["fly"], ["fly", "osprey_gust", "--in-process"]])
-def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_interrupt_before_flight_leaves_no_folder(
+    words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def interrupted(*runs: Path, **options: Any) -> NoReturn:
         assert all(run.is_dir() for run in runs)
         raise KeyboardInterrupt
@@ -80,16 +95,26 @@ def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros:
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def test_interrupt_of_reports_shows_what_was_flown(without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_interrupt_of_reports_shows_what_was_flown(
+    without_ros: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[Flown]:
-        return [Flown(member, run, "completed") for member, run in zip(of.members, runs, strict=True)]
+        return [
+            Flown(member, run, "completed") for member, run in zip(of.members, runs, strict=True)
+        ]
 
     def reported(run: Path, outcome: str) -> NoReturn:
         raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt
 
     without_ros.setattr(fleet, "fly_fleet", flown)
     without_ros.setattr(fleet, "write_report", reported)
-    arguments = ["fly", str(fleet_file(tmp_path, FLEET_OF_TWO)), "--set", f"runs={tmp_path / 'runs'}", "--json"]
+    arguments = [
+        "fly",
+        str(fleet_file(tmp_path, FLEET_OF_TWO)),
+        "--set",
+        f"runs={tmp_path / 'runs'}",
+        "--json",
+    ]
     result = CliRunner().invoke(application(["fly"]), arguments)
     assert result.exit_code == 130
     outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files with a stand-in for `launch` (tests/launch_stand_in.py).
 
-Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
+Checked: the arguments, the start order of the processes by their `node_state`, their parameters,
+and the effect of their end.
 """
 
 import runpy
@@ -20,7 +21,14 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import KeyValue
 from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
-from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
+from tests.launch_stand_in import (
+    ExecuteProcess,
+    LaunchContext,
+    Node,
+    OpaqueFunction,
+    ProcessExited,
+    TimerAction,
+)
 from tests.maps import MAP_FILES
 
 from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
@@ -39,7 +47,9 @@ from flight_ros.transport import DISCOVERY_VARIABLE
 app = application([*COMMANDS])
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"
-NODES: dict[str, type[Config]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
+NODES: dict[str, type[Config]] = {
+    name: schema for name, schema in SCHEMAS.items() if name != "flight"
+}
 NODES["bridge"] = BridgeConfig
 SHARED = "flight_bringup.launch.stages"
 PID = 0  # of a process of this launch
@@ -76,9 +86,14 @@ def described(name: str) -> Sequence[Any]:
 
 
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
-    """The actions of a launch with arguments, and its context. `pushed` is the namespace of a launch file that includes it."""
+    """The actions of a launch with arguments, and its context. `pushed` is the namespace of a
+    launch file that includes it.
+    """
     entities = described(name)
-    declared = {argument.name: argument.default_value for argument in every(stand_in.DeclareLaunchArgument, entities)}
+    declared = {
+        argument.name: argument.default_value
+        for argument in every(stand_in.DeclareLaunchArgument, entities)
+    }
     assert given.keys() <= declared.keys()
     context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
@@ -100,7 +115,11 @@ def overrides(node: Node) -> dict[str, Any]:
 
 
 def publish(
-    actions: Sequence[Any], context: LaunchContext, key: str, state: str = "ready", topic: str = "/node_state"
+    actions: Sequence[Any],
+    context: LaunchContext,
+    key: str,
+    state: str = "ready",
+    topic: str = "/node_state",
 ) -> list[Any]:
     """The actions that follow a message on `node_state`."""
     context.ros_node.subscriptions[topic](KeyValue(key=key, value=state))
@@ -142,7 +161,12 @@ CASES: tuple[tuple[str, dict[str, str], tuple[str, ...], tuple[str, ...]], ...] 
     ("replay", {}, ("controller",), ()),
     ("replay", {"recorder": "true", "lockstep": "true"}, ("recorder", "controller"), ()),
     ("replay", {"controller": "false", "aircraft": "true"}, ("aircraft",), ()),
-    ("replay", {"map": "ardupilot", "reference_model": "true"}, ("controller", "reference_model", "bridge"), ()),
+    (
+        "replay",
+        {"map": "ardupilot", "reference_model": "true"},
+        ("controller", "reference_model", "bridge"),
+        (),
+    ),
 )
 
 
@@ -150,12 +174,16 @@ def test_every_launch_file_installed_and_tested_here() -> None:
     names = [path.name.removesuffix(".launch.py") for path in FILES]
     assert set(names) == {"fleet", *(name for name, *_ in CASES)}
     for path in FILES:
-        assert (INSTALLED / "flight_bringup" / "share" / "flight_bringup" / "launch" / path.name).is_file()
+        assert (
+            INSTALLED / "flight_bringup" / "share" / "flight_bringup" / "launch" / path.name
+        ).is_file()
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> None:
-    arguments = every(stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py")))
+    arguments = every(
+        stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py"))
+    )
     assert len({argument.name for argument in arguments}) == len(arguments) > 2
     for argument in arguments:
         assert argument.description, argument.name
@@ -169,7 +197,15 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text("{composed: true, aircraft: {uav1: {}}}", encoding="utf-8")
     (fleet,), context = started("fleet", fleet=file, duration="3.0", watch="true")
-    assert [str(word) for word in fleet.cmd[1:]] == ["fly", str(file), "--set", "runs=runs", "--duration", "3.0", "--watch"]
+    assert [str(word) for word in fleet.cmd[1:]] == [
+        "fly",
+        str(file),
+        "--set",
+        "runs=runs",
+        "--duration",
+        "3.0",
+        "--watch",
+    ]
     assert ends(fleet.on_exit(ProcessExited("fleet", 0), context))
     with pytest.raises(RuntimeError, match="the fleet ended with status 3"):
         fleet.on_exit(ProcessExited("fleet", 3), context)
@@ -180,7 +216,9 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
 def case(request: pytest.FixtureRequest, short: Path, tmp_path: Path) -> Case:
-    """A launch: its actions, its context, and the nodes expected in its first and its second stage."""
+    """A launch: its actions, its context, and the nodes expected in its first and its second
+    stage.
+    """
     name, given, first, then = request.param
     log = {"run": str(short)} if name == "replay" else {}
     return (*started(name, **given, **log, runs=tmp_path / "runs"), first, then)
@@ -197,7 +235,11 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         assert node.namespace == stand_in.LaunchConfiguration("namespace")
         assert node.exec_name == executable
         file, given_to_node = node.parameters
-        section = {} if executable == "bridge" else parse_scenario_sections(Path(file).read_bytes(), Path(file))[executable]
+        section = (
+            {}
+            if executable == "bridge"
+            else parse_scenario_sections(Path(file).read_bytes(), Path(file))[executable]
+        )
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
@@ -213,7 +255,9 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
                 node.on_exit(ProcessExited(f"{executable}-1", status), context)
             if "recorder" in first:
                 assert (
-                    next(tmp_path.glob("runs/*/outcome")).read_text(encoding="utf-8").startswith(f"{executable}-1 ended before")
+                    next(tmp_path.glob("runs/*/outcome"))
+                    .read_text(encoding="utf-8")
+                    .startswith(f"{executable}-1 ended before")
                 )
             context.is_shutdown = True
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
@@ -229,13 +273,17 @@ def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_pat
     with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
         require_ready.function(context)
     left = [file.read_text(encoding="utf-8") for file in tmp_path.glob("runs/*/outcome")]
-    assert left == ([f"never flew: {first[-1]} not ready after 20 s"] if "recorder" in first else [])
+    assert left == (
+        [f"never flew: {first[-1]} not ready after 20 s"] if "recorder" in first else []
+    )
     publish(actions, context, f"/{first[-1]}#{PID}")
     assert require_ready.function(context) is None
 
 
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
-    """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
+    """The actions that follow when the log holds y, y_m and u up to an instant, s of the system
+    clock.
+    """
     sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)
     context.ros_node.subscriptions["/recorded"](Time(sec=sec, nanosec=nanosec))
     return context.handle(actions)
@@ -244,11 +292,19 @@ def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> 
 FLYING = ("recorder", "controller", "aircraft", "reference_model")
 
 
-def all_matched(follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING) -> list[Any]:
-    """The actions once these nodes are matched; a node may be flying before this launch has discovered it."""
+def all_matched(
+    follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING
+) -> list[Any]:
+    """The actions once these nodes are matched; a node may be flying before this launch has
+    discovered it.
+    """
     states = {"aircraft": NodeState.FLYING}
     return [
-        action for name in names for action in publish(follow, context, f"/{name}#{PID}", states.get(name, NodeState.MATCHED))
+        action
+        for name in names
+        for action in publish(
+            follow, context, f"/{name}#{PID}", states.get(name, NodeState.MATCHED)
+        )
     ]
 
 
@@ -264,16 +320,22 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     ((topic, message),) = context.ros_node.published
     start = stamp_of(message) / NANOSECONDS
     assert topic == "/start"
-    assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # half a second in which `start` reaches the nodes
+    assert start == pytest.approx(
+        time.time() + 0.5, abs=0.4
+    )  # half a second in which `start` reaches the nodes
     assert not flown_to(context, follow, start + 4.9)
     (give_up,) = every(OpaqueFunction, timers[-1].actions)
-    with pytest.raises(RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"):
+    with pytest.raises(
+        RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"
+    ):
         give_up.function(context)
     flown = flown_to(context, follow, start + 5.0)
     assert ends(flown)
     (leave,) = every(OpaqueFunction, flown)
     leave.function(context)
-    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8") == "completed"
+    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(
+        encoding="utf-8"
+    ) == "completed"
 
 
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:
@@ -291,7 +353,15 @@ def test_bridge_is_dry_run_by_default_and_topics_recorded(tmp_path: Path) -> Non
     assert "bridge/would_send" in recorder["topics"]
     assert bridge["map"] in recorder["attach"]
     slow = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
-    follow = all_ready(*started("bridge", map=str(MAP_FILES["ardupilot_2024"]), scenario=slow, dry_run="false", runs=tmp_path))
+    follow = all_ready(
+        *started(
+            "bridge",
+            map=str(MAP_FILES["ardupilot_2024"]),
+            scenario=slow,
+            dry_run="false",
+            runs=tmp_path,
+        )
+    )
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not every(TimerAction, follow)  # until Ctrl-C
 
@@ -307,8 +377,13 @@ def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path)
 
 def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
     """The bridge clips u, which the anti-windup of the law does not know."""
-    scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"  # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
-    sentence = r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of thrust in the map ardupilot"
+    scenario = (
+        REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
+    )  # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
+    sentence = (
+        r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of "
+        r"thrust in the map ardupilot"
+    )
     with pytest.raises(ParameterError, match=sentence):
         started("bridge", map="ardupilot", scenario=scenario, dry_run="false", runs=tmp_path)
     with pytest.raises(ParameterError, match=r"osprey_servo: controller\.lower: found -0\.5"):
@@ -325,7 +400,9 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
     """The options of `rise-di play` on its command line."""
     executable, command, *words = process.cmd
     assert executable == stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di")
-    assert (INSTALLED / executable.package / "lib" / executable.package / executable.executable).is_file()
+    assert (
+        INSTALLED / executable.package / "lib" / executable.package / executable.executable
+    ).is_file()
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
     with group.commands[command].make_context(command, [*words]) as context:
@@ -342,14 +419,24 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
     ],
     ids=str,
 )
-def test_topics_without_a_publisher_are_played(given: dict[str, str], topics: str, short: Path, osprey_gust: Scenario) -> None:
+def test_topics_without_a_publisher_are_played(
+    given: dict[str, str], topics: str, short: Path, osprey_gust: Scenario
+) -> None:
     actions, context = started("replay", run=short, scenario=osprey_gust.path, **given)
     values = options(player(all_ready(actions, context, "/one" if "namespace" in given else "")))
     assert values["topics"] == topics
     assert values["run"] == short
-    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (1.0, 0.0, False, "now")
+    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (
+        1.0,
+        0.0,
+        False,
+        "now",
+    )
 
 
 def test_lockstep_is_for_the_controller_alone(short: Path) -> None:
-    with pytest.raises(ParameterError, match="lockstep: found true with aircraft, expected controller and recorder alone"):
+    with pytest.raises(
+        ParameterError,
+        match="lockstep: found true with aircraft, expected controller and recorder alone",
+    ):
         started("replay", run=short, lockstep="true", aircraft="true")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of scenarios that ship and of examples: behind servos the requirement holds, or the first line says why not."""
+"""Margins of scenarios that ship and of examples: behind servos the requirement holds, or the first
+line says why not.
+"""
 
 import math
 from collections.abc import Iterator
@@ -19,10 +21,22 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 pytestmark = pytest.mark.slow
 
 CONTROLLER = "/**/controller"
-EXAMPLES = [path for path in sorted(REPOSITORY.glob("examples/*/*.yaml")) if CONTROLLER in path.read_text(encoding="utf-8")]
+EXAMPLES = [
+    path
+    for path in sorted(REPOSITORY.glob("examples/*/*.yaml"))
+    if CONTROLLER in path.read_text(encoding="utf-8")
+]
 FILES = [*sorted(LIBRARY.glob("*.yaml")), *EXAMPLES]
-STATED = ("An ideal loop", "Margins below the requirement")  # how a first line names a loop without the margins
-NOMINAL, OBSERVED, WORST, SENSITIVITY = 40.0, 35.0, 30.0, 2.0  # deg, deg with an observer, deg of the worst of 200, 1
+STATED = (
+    "An ideal loop",
+    "Margins below the requirement",
+)  # how a first line names a loop without the margins
+NOMINAL, OBSERVED, WORST, SENSITIVITY = (
+    40.0,
+    35.0,
+    30.0,
+    2.0,
+)  # deg, deg with an observer, deg of the worst of 200, 1
 AIRCRAFT, UNCERTAINTY = 200, 0.3
 
 
@@ -45,7 +59,9 @@ def has_softened_loop(scenario: Scenario) -> bool:
 
 
 def test_every_file_is_found() -> None:
-    assert {"osprey_servo", "osprey_observer", "jsbsim_f16", "scenario", "osprey_pid"} <= {path.stem for path in FILES}
+    assert {"osprey_servo", "osprey_observer", "jsbsim_f16", "scenario", "osprey_pid"} <= {
+        path.stem for path in FILES
+    }
 
 
 @pytest.mark.parametrize("path", FILES, ids=[f"{path.parent.name}_{path.stem}" for path in FILES])

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The public benchmark: frozen sets, entries of all kinds, the file of scores, a second plant written from the equations."""
+"""The public benchmark: frozen sets, entries of all kinds, the file of scores, a second plant
+written from the equations.
+"""
 
 import hashlib
 import json
@@ -35,7 +37,9 @@ pytestmark = pytest.mark.slow
 PI = {"law": "pi", "K": [18.0, 18.0, 9.0, 2.0], "Lambda": [5.0, 5.0, 3.0, 0.5]}
 LATE = (1, 0)  # the first aircraft of the second set of `brief`
 GUST = {"vertical": {"start": 6.0, "speed": 10.12, "length": 15.24}}
-OSPREY = REPOSITORY / "ros_ws" / "src" / "aircraft_sim" / "aircraft_sim" / "airframes" / "osprey.yaml"
+OSPREY = (
+    REPOSITORY / "ros_ws" / "src" / "aircraft_sim" / "aircraft_sim" / "airframes" / "osprey.yaml"
+)
 
 
 def entry(enter: Enter) -> BenchmarkEntry:
@@ -74,20 +78,27 @@ def _law(section: Mapping[str, Any]) -> tuple[ControlLaw, Any, Limits]:
 
 
 def test_sets_of_version_are_frozen() -> None:
-    """A change of a scenario, an airframe or a rule needs another VERSION: published scores would mean something else."""
+    """A change of a scenario, an airframe or a rule needs another VERSION: published scores would
+    mean something else.
+    """
     assert VERSION == 1
     sets = Sets({name: find_scenario(name) for name in SCENARIOS})
     assert sets.digest() == "326ec8bceaff4f25d1a4501495846f404d3ab732d60d80df5b368c4472ec479f"
 
 
 def test_seeds_come_from_the_hash_of_a_release() -> None:
-    assert seed_of("gusts", "", "noise") == int(hashlib.sha256(b"rise-di benchmark 1  gusts noise").hexdigest()[:16], 16) >> 1
+    assert (
+        seed_of("gusts", "", "noise")
+        == int(hashlib.sha256(b"rise-di benchmark 1  gusts noise").hexdigest()[:16], 16) >> 1
+    )
     release = hashlib.sha256(f"rise-di benchmark 1 {'a' * 40} gusts noise".encode()).hexdigest()
     assert seed_of("gusts", "a" * 40, "noise") == int(release[:16], 16) >> 1
 
 
 def test_function_scores_as_the_registered_law(brief: Sets) -> None:
-    """Tick by tick with u from outside as in the compiled loop; the order of sums of the compiler differs in last bits."""
+    """Tick by tick with u from outside as in the compiled loop; the order of sums of the compiler
+    differs in last bits.
+    """
     rows = []
     for enter in (own_steps, lambda task: PI):
         flights = Flights(entry(enter), brief)
@@ -99,7 +110,9 @@ def test_function_scores_as_the_registered_law(brief: Sets) -> None:
     np.testing.assert_allclose(function["slew.elevator"], registered["slew.elevator"], rtol=1e-9)
 
 
-def test_entry_of_the_page_flies(brief: Sets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_of_the_page_flies(
+    brief: Sets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = (REPOSITORY / "docs" / "benchmark.md").read_text(encoding="utf-8")
     block = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     assert block is not None
@@ -136,10 +149,19 @@ def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path)
 @pytest.mark.parametrize(
     ("enter", "sentence"),
     [
-        (lambda task: PI | {"rate": 50.0}, "own: controller.rate: found 50.0, expected 100.0, as every law of gusts has it"),
+        (
+            lambda task: PI | {"rate": 50.0},
+            "own: controller.rate: found 50.0, expected 100.0, as every law of gusts has it",
+        ),
         (lambda task: 3, "own: found 3, expected a section"),
-        (lambda task: lambda t, y, y_m: [0.0], r"u in gusts at t = 0 s: found \[0.0\], expected 4 finite numbers: elevator"),
-        (lambda task: lambda t, y, y_m: 1 / 0, "u in gusts at t = 0 s: found ZeroDivisionError: division by zero"),
+        (
+            lambda task: lambda t, y, y_m: [0.0],
+            r"u in gusts at t = 0 s: found \[0.0\], expected 4 finite numbers: elevator",
+        ),
+        (
+            lambda task: lambda t, y, y_m: 1 / 0,
+            "u in gusts at t = 0 s: found ZeroDivisionError: division by zero",
+        ),
     ],
 )
 def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Sets) -> None:
@@ -163,17 +185,23 @@ def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Set
 )
 def test_command_refuses_with_a_sentence(words: list[str], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
-        CliRunner().invoke(application(["benchmark"]), ["benchmark", *words], catch_exceptions=False)
+        CliRunner().invoke(
+            application(["benchmark"]), ["benchmark", *words], catch_exceptions=False
+        )
 
 
 def test_function_flies_an_aircraft_of_jsbsim_as_its_law() -> None:
-    """The law behind its guard and the same equations as a function: the guard adds nothing where no sample is lost."""
+    """The law behind its guard and the same equations as a function: the guard adds nothing where
+    no sample is lost.
+    """
     pytest.importorskip("jsbsim")
     name = "jsbsim_c172p"
     sets = Sets({scenario: find_scenario(scenario, 3.0) for scenario in SCENARIOS})
     task = task_of(name, sets)
     assert (task.airframe, task.inputs[-1]) == ("jsbsim:c172p", "throttle")
-    flights = Flights(entry(lambda task: (lambda t, y, y_m: 0.0 * y) if task.set == name else None), sets)
+    flights = Flights(
+        entry(lambda task: (lambda t, y, y_m: 0.0 * y) if task.set == name else None), sets
+    )
     flights.not_flown()
     row = pl.read_parquet(flights.fly(([*SETS].index(name), 0), 1))
     assert not row["diverged"][0]
@@ -182,15 +210,21 @@ def test_function_flies_an_aircraft_of_jsbsim_as_its_law() -> None:
 
 
 def test_second_plant_agrees_within_2_percent(brief: Sets) -> None:
-    """The plant written again from the equations, with the numbers of the file and noise of its own: the mean score agrees."""
+    """The plant written again from the equations, with the numbers of the file and noise of its
+    own: the mean score agrees.
+    """
     flights = Flights(find_entry(["osprey_servo"], brief, find_scenario), brief)
     flights.not_flown()
     own = pl.read_parquet(flights.fly(LATE, 50))["score"].to_numpy()
-    assert np.mean(second_plant_scores(brief, "late", len(own), 2)) == pytest.approx(np.mean(own), rel=0.02)
+    assert np.mean(second_plant_scores(brief, "late", len(own), 2)) == pytest.approx(
+        np.mean(own), rel=0.02
+    )
 
 
 def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatArray:
-    """Scores of the aircraft of a set: x_dot = A x + gravity + wind + B p, p_dot = (u - p) / lag; Runge-Kutta in 2.5 ms."""
+    """Scores of the aircraft of a set: x_dot = A x + gravity + wind + B p, p_dot = (u - p) / lag;
+    Runge-Kutta in 2.5 ms.
+    """
     scenario = sets.scenario(name)
     published: dict[str, Any] = yaml.safe_load(OSPREY.read_text(encoding="utf-8"))
     states, V0 = list(published["states"]), published["speed"]
@@ -198,14 +232,23 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
     A, B = (
         np.moveaxis(values, 0, -1)
         for values in sampled_matrices(
-            scenario.aircraft.load()[0], UNCERTAINTY, UNCERTAINTY, seed_of(name, "", "aircraft"), 0, count
+            scenario.aircraft.load()[0],
+            UNCERTAINTY,
+            UNCERTAINTY,
+            seed_of(name, "", "aircraft"),
+            0,
+            count,
         )
     )
     wind = np.zeros((8, count))
     for state, effect in published["gusts"]["vertical"].items():
-        wind[states.index(state)] = effect / V0 * A[states.index(state), alpha] / published["A"][states.index(state)][alpha]
+        wind[states.index(state)] = (
+            effect / V0 * A[states.index(state), alpha] / published["A"][states.index(state)][alpha]
+        )
     actuators, rng = scenario.aircraft.actuators, np.random.default_rng(1)
-    lag, stop, fastest = (np.array(values)[:, None] for values in (actuators.lag, actuators.upper, actuators.rate))
+    lag, stop, fastest = (
+        np.array(values)[:, None] for values in (actuators.lag, actuators.upper, actuators.rate)
+    )
 
     def gust(t: float) -> float:
         along = V0 * (t - GUST["vertical"]["start"]) / GUST["vertical"]["length"]
@@ -213,13 +256,19 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
 
     def x_dot(t: float, x: FloatArray, u: FloatArray) -> FloatArray:
         aircraft, position = x[:8], x[8:]
-        change = np.einsum("ijn,jn->in", A, aircraft) + np.einsum("ijn,jn->in", B, position) + wind * gust(t)
+        change = (
+            np.einsum("ijn,jn->in", A, aircraft)
+            + np.einsum("ijn,jn->in", B, position)
+            + wind * gust(t)
+        )
         change[v] -= 9.81 * np.sin(aircraft[theta])
         change[beta] += 0.39 * np.sin(aircraft[phi])
         return np.concatenate([change, np.clip((u - position) / lag, -fastest, fastest)])
 
     law, params, limits = _law(scenario.controller.model_dump())
-    params = type(params)(*(np.asarray(value)[:, None] if np.ndim(value) == 1 else value for value in params))
+    params = type(params)(
+        *(np.asarray(value)[:, None] if np.ndim(value) == 1 else value for value in params)
+    )
     limits = Limits(*(values[:, None] for values in limits))
     y_m, h = build_course(scenario).segments.y_m, 0.0025
     x, u, state, squares = np.zeros((12, count)), np.zeros((4, count)), None, np.zeros((4, count))
@@ -227,7 +276,9 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
     for k, wanted in enumerate(y_m):
         true = x[[q, p, r, v]]
         squares += (true - wanted[:, None]) ** 2
-        y = true + np.array([[0.0017], [0.0017], [0.0017], [0.03]]) * rng.standard_normal((4, count))
+        y = true + np.array([[0.0017], [0.0017], [0.0017], [0.03]]) * rng.standard_normal(
+            (4, count)
+        )
         slope = (wanted - y_m[k - 1])[:, None] / 0.01 if k else 0.0 * wanted[:, None]
         measured = Measurements(y, wanted[:, None], slope, 0.0 * y, u)
         if state is None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order, kill and resume."""
+"""Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order,
+kill and resume.
+"""
 
 import io
 import json
@@ -38,7 +40,15 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import engines, equipment
-from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
+from flight_campaign.campaign import (
+    CHUNKS,
+    Campaign,
+    Definition,
+    Sweep,
+    define,
+    fly_chunk,
+    fly_chunk_figures,
+)
 from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
@@ -69,27 +79,37 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
 @given(VALUES, st.data())
 def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
-    whole, parts = Figure.from_values(values), Figure.from_values(values[:cut]) + Figure.from_values(values[cut:])
+    whole, parts = (
+        Figure.from_values(values),
+        Figure.from_values(values[:cut]) + Figure.from_values(values[cut:]),
+    )
     assert parts.count == len(values)
     assert parts.bins == whole.bins
     assert parts.largest == values.max()
     # Sums in another order: rounding alone.
     assert parts.mean == pytest.approx(float(np.mean(values)), rel=1e-12)
-    assert parts.deviation == pytest.approx(float(np.std(values, ddof=1)) if len(values) > 1 else 0.0, rel=1e-9, abs=1e-9)
+    assert parts.deviation == pytest.approx(
+        float(np.std(values, ddof=1)) if len(values) > 1 else 0.0, rel=1e-9, abs=1e-9
+    )
 
 
 @given(VALUES, st.floats(0.01, 1.0))
 def test_quantile_is_accurate_to_width_of_bin(values: FloatArray, share: float) -> None:
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
-    assert Figure.from_values(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
+    assert Figure.from_values(values).quantile(share) == pytest.approx(
+        exact, rel=10 ** (1 / 100) - 1.0
+    )
 
 
 def test_worst_flights_kept_with_diverged_ones_first() -> None:
     scores = np.arange(30.0)
     diverged = scores == 4.0
     halves = [
-        Tally.from_flights(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)
+        Tally.from_flights(
+            first, diverged[first : first + 15], {"score": scores[first : first + 15]}
+        )
+        for first in (0, 15)
     ]
     total = halves[0] + halves[1]
     assert [flight.number for flight in total.worst] == [4, *range(29, 29 - WORST_KEPT + 1, -1)]
@@ -109,7 +129,10 @@ def test_a_score_counts_errors_in_their_units() -> None:
     rms = np.array([[0.010], [0.020], [0.010], [0.1]])
     units = {"q": "rad/s", "p": "rad/s", "r": "rad/s", "V": "m/s", "theta": "rad"}
     assert score(rms, score_units(("q", "p", "r", "V"), units)) == pytest.approx([4.0])
-    with pytest.raises(ParameterError, match=r"^outputs: found theta in rad, expected rad/s or m/s, or a unit of the score"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^outputs: found theta in rad, expected rad/s or m/s, or a unit of the score",
+    ):
         score_units(("q", "theta"), units)
     assert score_units(("q", "theta"), units, {"theta": 0.05, "q": 0.02}).tolist() == [0.02, 0.05]
 
@@ -118,34 +141,53 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
     campaign = fly_campaign(tmp_path / "one", definition())
     worst = campaign.tally(0).worst[0]
     path = tmp_path / "again.yaml"
-    path.write_text(scenario_yaml(campaign.definition.aircraft_scenario(worst.number)), encoding="utf-8")
+    path.write_text(
+        scenario_yaml(campaign.definition.aircraft_scenario(worst.number)), encoding="utf-8"
+    )
     again = load_scenario(path)
     true, outputs = error(simulate(again)), again.controller.outputs
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
-    assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
+    assert worst.score == pytest.approx(
+        score(rms, unit)[0], rel=1e-3
+    )  # as of single flights: tests of fleets
 
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
-    """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score with a unit of its own."""
-    units, entries = {"V": 0.2}, {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
+    """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score
+    with a unit of its own.
+    """
+    units, entries = (
+        {"V": 0.2},
+        {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035},
+    )
     of = define(SHORT, 4, 0.2, 7, 4, spread=Spread(entries, "corners"), units=units)
     campaign = fly_campaign(tmp_path / "own", of)
     rows = campaign.rows().collect()
     airframe = load_airframe(SHORT.aircraft.airframe)
     thrust = (
-        rows["B[V,thrust]"].to_numpy() / airframe.matrix_b()[airframe.index("V"), list(airframe.inputs).index("thrust")] - 1.0
+        rows["B[V,thrust]"].to_numpy()
+        / airframe.matrix_b()[airframe.index("V"), list(airframe.inputs).index("thrust")]
+        - 1.0
     )
     assert np.abs(thrust) == pytest.approx(0.6)
     assert np.abs(
-        rows["A[q,q]"].to_numpy() / airframe.matrix_a()[airframe.index("q"), airframe.index("q")] - 1.0
+        rows["A[q,q]"].to_numpy() / airframe.matrix_a()[airframe.index("q"), airframe.index("q")]
+        - 1.0
     ) == pytest.approx(0.2)
-    for name, published, part in (("lag[rudder]", 0.02, 0.5), ("lag[thrust]", 0.1, 0.2), ("noise[q]", 0.0017, 0.9)):
+    for name, published, part in (
+        ("lag[rudder]", 0.02, 0.5),
+        ("lag[thrust]", 0.1, 0.2),
+        ("noise[q]", 0.0017, 0.9),
+    ):
         assert np.abs(rows[name].to_numpy() / published - 1.0) == pytest.approx(part)
     worst = campaign.tally(0).worst[0]
     again = campaign.definition.aircraft_scenario(worst.number)
-    assert set(rows["delay"].to_list()) == {0.0, 0.03}  # whole periods; +100 % of the reference is the largest
+    assert set(rows["delay"].to_list()) == {
+        0.0,
+        0.03,
+    }  # whole periods; +100 % of the reference is the largest
     assert 2.0 * equipment.references(SHORT, of.entries)["delay"] == 0.03
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
     assert again.aircraft.actuators.delay == rows["delay"][worst.number] == 0.03
@@ -159,9 +201,15 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"spread": Spread({"A[q,gamma]": 0.5})}, r"entry A\[q,gamma\], expected an entry of the airframe"),
+        (
+            {"spread": Spread({"A[q,gamma]": 0.5})},
+            r"entry A\[q,gamma\], expected an entry of the airframe",
+        ),
         ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
-        ({"spread": Spread({"delay": 0.004})}, "delay 0.004 s, expected at least a period of the controller, 0.01 s"),
+        (
+            {"spread": Spread({"delay": 0.004})},
+            "delay 0.004 s, expected at least a period of the controller, 0.01 s",
+        ),
         ({"units": {"theta": 0.1}}, "expected an output of the controller"),
     ],
 )
@@ -173,20 +221,28 @@ def test_unknown_entry_and_unit_refused(options: dict[str, Any], sentence: str) 
 ROUTE = find_scenario("osprey_route")
 CORNER = ROUTE.vary(
     flight={"duration": 18.0},
-    guidance={"route": {"north": [0.0, 300.0, 300.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0, 5.0, 0.0]}},
+    guidance={
+        "route": {
+            "north": [0.0, 300.0, 300.0],
+            "east": [0.0, 0.0, 300.0],
+            "altitude": [0.0, 5.0, 0.0],
+        }
+    },
 )
 """A corner after 120 m: a change of leg, a bank to the limit, a climb."""
 
 MISSIONS = {
     "turbulence and wind": CORNER,
-    "late and lost y": CORNER.vary(aircraft={"rate": 100.0, "sensors": {"delay": 0.02, "dropout": 0.2, "seed": 3}}),
+    "late and lost y": CORNER.vary(
+        aircraft={"rate": 100.0, "sensors": {"delay": 0.02, "dropout": 0.2, "seed": 3}}
+    ),
 }
 
 
 @pytest.mark.parametrize("name", MISSIONS)
 def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: str) -> None:
-    # As of fleets without guidance: the nonlinear remainder is held over a tick (10 ms). Where u holds a lost y, the node's
-    # extrapolation of y_m differs: 1e-2 there.
+    # As of fleets without guidance: the nonlinear remainder is held over a tick (10 ms). Where u
+    # holds a lost y, the node's extrapolation of y_m differs: 1e-2 there.
     definition, within = define(MISSIONS[name], 2, 0.3, 7, 2), 1e-2 if "lost" in name else 1e-3
     chunk = fly_chunk_figures(definition.model_dump_json(), (0, 0))
     assert not chunk.diverged.any()
@@ -201,7 +257,10 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
         "score": np.abs(xtrack).max() / 12.5,  # half a second of flight at 25 m/s
         "rms.altitude": np.sqrt(np.mean(errors["altitude"] ** 2)),
         "max.phi": np.abs(log["pose.phi"]).max(),
-        **{f"rms.{name}": np.sqrt(np.mean(true[name][true.stamp_ns % 10_000_000 == 0] ** 2)) for name in ("q", "p", "r", "V")},
+        **{
+            f"rms.{name}": np.sqrt(np.mean(true[name][true.stamp_ns % 10_000_000 == 0] ** 2))
+            for name in ("q", "p", "r", "V")
+        },
     }
     assert {key: figures[key] for key in expected} == pytest.approx(expected, rel=within)
     assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
@@ -210,15 +269,25 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
     [
-        (find_scenario("jsbsim_c172p_learn"), r"^airframe: found jsbsim:c172p, expected an airframe with matrices"),
         (
-            replace(find_scenario("osprey_route"), controller=find_scenario("osprey_learn").controller),
+            find_scenario("jsbsim_c172p_learn"),
+            r"^airframe: found jsbsim:c172p, expected an airframe with matrices",
+        ),
+        (
+            replace(
+                find_scenario("osprey_route"), controller=find_scenario("osprey_learn").controller
+            ),
             r"^guidance: found a section beside controller.learn, expected none",
         ),
-        (find_scenario("osprey_servo").vary(aircraft={"sensors": {"delay": 0.004}}), r"^sensors\.delay: found"),
+        (
+            find_scenario("osprey_servo").vary(aircraft={"sensors": {"delay": 0.004}}),
+            r"^sensors\.delay: found",
+        ),
     ],
 )
-def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(scenario: Scenario, sentence: str) -> None:
+def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(
+    scenario: Scenario, sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         define(scenario, 2, 0.3, 7, 2)
 
@@ -233,20 +302,32 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
     model = find_scenario("osprey_observer").rise_di()
 
     def learner(flown: Scenario) -> Learn:
-        proposed = model.model_copy(update={"observer": None}) if flown.aircraft.uncertainty.number else model
-        made = SimpleNamespace(take=lambda *_: None, propose=lambda *_: LearnerResult(proposed, "given"))
+        proposed = (
+            model.model_copy(update={"observer": None})
+            if flown.aircraft.uncertainty.number
+            else model
+        )
+        made = SimpleNamespace(
+            take=lambda *_: None, propose=lambda *_: LearnerResult(proposed, "given")
+        )
         return lambda _: made
 
     (folder := tmp_path / "learn").mkdir()
     campaign = Campaign.begin(folder, define(scenario, 2, 0.3, 7))
     assert list(campaign.fly(engines.threads(1), learner)) == [1, 1]  # each aircraft is a chunk
     rows, tally = campaign.rows().collect(), campaign.tally(0)
-    assert rows.select("first_model", "models", "refused", "fallbacks").rows() == [(1.5, 1, 0, 0), (None, 0, 1, 0)]
+    assert rows.select("first_model", "models", "refused", "fallbacks").rows() == [
+        (1.5, 1, 0, 0),
+        (None, 0, 1, 0),
+    ]
     assert tally.without_model() == 1
     assert figure_rows(tally, {})[-4] == ["first model (s)", *["1.5"] * 5]
     again = campaign.definition.aircraft_scenario(0)
     true = error(simulate(again, learn=learner(again)))
-    assert [rows["rms.q"][0], rows["max.p"][0]] == [np.sqrt(np.mean(true["q"] ** 2)), np.abs(true["p"]).max()]
+    assert [rows["rms.q"][0], rows["max.p"][0]] == [
+        np.sqrt(np.mean(true["q"] ** 2)),
+        np.abs(true["p"]).max(),
+    ]
     assert again.aircraft.sampled_airframe().matrix_b()[2, 0] == rows["B[q,elevator]"][0]
 
 
@@ -259,9 +340,14 @@ def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> 
         "published": define(gusty, 20, 0.5, 7, 20, wind="published"),
         "scenario": define(published, 20, 0.5, 7, 20),
     }
-    tallies = {name: fly_campaign(tmp_path / name, campaign).tally(0) for name, campaign in of.items()}
+    tallies = {
+        name: fly_campaign(tmp_path / name, campaign).tally(0) for name, campaign in of.items()
+    }
     # Half of Z_alpha with the whole force of the gust has a larger error.
-    assert tallies["own"].figures["score"].largest < 0.9 * tallies["published"].figures["score"].largest
+    assert (
+        tallies["own"].figures["score"].largest
+        < 0.9 * tallies["published"].figures["score"].largest
+    )
     assert tallies["scenario"] == tallies["published"]  # its own uncertain aircraft does not fly
     for name, wind in (("own", "air_relative"), ("published", "published")):
         assert of[name].aircraft_scenario(3).aircraft.uncertainty.wind == wind
@@ -271,7 +357,9 @@ def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) ->
     first, second = (fly_campaign(tmp_path / name, definition()) for name in ("first", "second"))
     assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()
 
-    def backwards(work: engines.Work, jobs: Iterable[engines.Job]) -> Iterator[tuple[engines.Job, Any]]:
+    def backwards(
+        work: engines.Work, jobs: Iterable[engines.Job]
+    ) -> Iterator[tuple[engines.Job, Any]]:
         return ((job, work(job)) for job in reversed(list(jobs)))
 
     (tmp_path / "third").mkdir()
@@ -324,18 +412,33 @@ def test_rank_correlations_are_those_of_scipy() -> None:
     rng = np.random.default_rng(1)
     strong, weak = rng.uniform(1.0, 2.0, (2, 50))
     score = np.round(10.0 * strong + weak)  # with ties
-    table = pl.DataFrame({"score": score, "A[q,q]": -weak, "A[q,alpha]": -strong, "B[V,thrust]": np.ones(50)})
-    correlations = rank_correlations(table, {"A[q,q]": -1.5, "A[q,alpha]": -1.5, "B[V,thrust]": 1.0})
-    expected = {name: spearmanr(size, score).statistic for name, size in (("A[q,alpha]", strong), ("A[q,q]", weak))}
-    assert list(correlations) == list(expected)  # the strongest first, without the one that is not uncertain
+    table = pl.DataFrame(
+        {"score": score, "A[q,q]": -weak, "A[q,alpha]": -strong, "B[V,thrust]": np.ones(50)}
+    )
+    correlations = rank_correlations(
+        table, {"A[q,q]": -1.5, "A[q,alpha]": -1.5, "B[V,thrust]": 1.0}
+    )
+    expected = {
+        name: spearmanr(size, score).statistic
+        for name, size in (("A[q,alpha]", strong), ("A[q,q]", weak))
+    }
+    assert list(correlations) == list(
+        expected
+    )  # the strongest first, without the one that is not uncertain
     assert correlations == pytest.approx(expected, rel=1e-12)
-    lost = table.with_columns(pl.when(pl.col("score") < score.max()).then(pl.col("score")).alias("score"))
-    assert rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations  # a diverged aircraft is the worst
+    lost = table.with_columns(
+        pl.when(pl.col("score") < score.max()).then(pl.col("score")).alias("score")
+    )
+    assert (
+        rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations
+    )  # a diverged aircraft is the worst
     assert rank_correlations(table.head(5), {}) == {}
 
 
 def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
-    campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.05, 1.0))))
+    campaign = fly_campaign(
+        tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.05, 1.0)))
+    )
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
     assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
     assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
@@ -353,7 +456,9 @@ def test_sweep_of_channel_multiplies_that_value_alone(channel: str, place: int) 
 
 
 def test_results_have_margins_beside_score(tmp_path: Path) -> None:
-    campaign = fly_campaign(tmp_path / "swept", definition(6, 6, Sweep(parameter="softening", factors=(1.0, 4.0))))
+    campaign = fly_campaign(
+        tmp_path / "swept", definition(6, 6, Sweep(parameter="softening", factors=(1.0, 4.0)))
+    )
     found = [campaign.margins(case) for case in range(2)]
     tallies = [campaign.tally(case) for case in range(2)]
     rows = {name: cells for name, *cells in overview(campaign.definition, tallies, found).rows}
@@ -362,7 +467,10 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
     assert rows["score, mean"] == [f"{tally.figures['score'].mean:.3g}" for tally in tallies]
     flown = [campaign.definition.aircraft_scenario(number, 1) for number in range(6)]
     airframes = [scenario.aircraft.sampled_airframe() for scenario in flown]
-    loops = [linear_loop(flown[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None]) for frame in airframes]
+    loops = [
+        linear_loop(flown[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None])
+        for frame in airframes
+    ]
     phases = [loop_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
     assert found[1] is not None
     assert found[1].worst is not None
@@ -379,7 +487,13 @@ def flown(tmp_path: Path) -> Campaign:
 
 def made_up(score: FloatArray) -> bytes:
     """The rows of a chunk with these scores."""
-    return encode(Chunk(0, np.zeros(len(score)), {"score": score, "rms.q": score}, {"B[p,aileron]": 6.0 - score}), 7, 1.0)
+    return encode(
+        Chunk(
+            0, np.zeros(len(score)), {"score": score, "rms.q": score}, {"B[p,aileron]": 6.0 - score}
+        ),
+        7,
+        1.0,
+    )
 
 
 def refusal(*words: str) -> str:
@@ -402,7 +516,9 @@ def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campa
     words = ["campaign", str(flown.folder)]
     shown = CliRunner().invoke(application(["campaign"]), words).stdout
     assert "B[p,aileron]" in shown
-    ranked = json.loads((flown.folder / SUMMARY).read_text(encoding="utf-8"))["cases"][0]["influence"]
+    ranked = json.loads((flown.folder / SUMMARY).read_text(encoding="utf-8"))["cases"][0][
+        "influence"
+    ]
     published = find_scenario("osprey_servo").aircraft.load()[0].matrix_b()[5, 2]
     assert ranked["entries"] == [
         {
@@ -426,23 +542,42 @@ def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> Non
     path = tmp_path / "rows.parquet"
     words = ["campaign", str(flown.folder), "--rows", str(path), "--json"]
     assert CliRunner().invoke(application(["campaign"]), words).exit_code == 0
-    assert pl.read_parquet(path).equals(CampaignResult(flown.folder, flown.folder / REPORT, {}).rows())
+    assert pl.read_parquet(path).equals(
+        CampaignResult(flown.folder, flown.folder / REPORT, {}).rows()
+    )
     sentence = refusal(str(flown.folder), "--rows", str(tmp_path / "none" / "rows.parquet"))
     assert sentence.startswith("--rows: found ")
 
 
 def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
     sentence = refusal(str(flown.folder), "--aircraft", "1000")
-    assert sentence == "--aircraft: found it beside a folder, expected none: the folder of a campaign holds its definition"
+    assert (
+        sentence
+        == "--aircraft: found it beside a folder, expected none: the folder of a campaign holds "
+        "its definition"
+    )
 
 
 def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
     program = [sys.executable, "-m", "flight_cli.cli", "campaign", *arguments, "--json"]
-    return subprocess.Popen(program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def new(aircraft: int, *more: str) -> tuple[str, ...]:
-    return ("osprey_servo", "--duration", "5", "--aircraft", str(aircraft), "--set", "chunk=20", "--seed", "7", *more)
+    return (
+        "osprey_servo",
+        "--duration",
+        "5",
+        "--aircraft",
+        str(aircraft),
+        "--set",
+        "chunk=20",
+        "--seed",
+        "7",
+        *more,
+    )
 
 
 def figures(process: "subprocess.Popen[str]") -> list[object]:
@@ -468,12 +603,16 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
     return figures(command(*new(200), cwd=tmp_path_factory.mktemp("whole")))
 
 
-def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
+def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
+    whole: list[object], tmp_path: Path
+) -> None:
     stopped = command(*new(200, "--set", "runs=part", "--set", "workers=1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
-    assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10, "the campaign ended before the kill"
+    assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10, (
+        "the campaign ended before the kill"
+    )
     assert figures(command(str(folder), cwd=tmp_path)) == whole
 
 
@@ -494,7 +633,12 @@ def square(job: engines.Job) -> int:
 
 def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
     def cluster(port: int) -> LocalCluster:
-        where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": ":0"}
+        where: dict[str, Any] = {
+            "protocol": "tcp",
+            "host": "127.0.0.1",
+            "scheduler_port": port,
+            "dashboard_address": ":0",
+        }
         return LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **where)
 
     with cluster(0) as first:
@@ -506,18 +650,34 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
     assert sorted(results) == [((k,), k**2) for k in range(20)]
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")])
-def test_chunk_beyond_memory_is_one_sentence(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")],
+)
+def test_chunk_beyond_memory_is_one_sentence(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second is the text of an error of JAX."""
     monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=error))
-    with pytest.raises(ParameterError, match=r"chunk: found 20 aircraft at once, which need more memory .* expected fewer"):
+    with pytest.raises(
+        ParameterError,
+        match=r"chunk: found 20 aircraft at once, which need more memory .* expected fewer",
+    ):
         fly_chunk(definition().model_dump_json(), (0, 0))
 
 
-def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:
-    spread = command(*new(200, "--set", "runs=spread", "--engine", "dask", "--set", "workers=2"), cwd=tmp_path)
+def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(
+    whole: list[object], tmp_path: Path
+) -> None:
+    spread = command(
+        *new(200, "--set", "runs=spread", "--engine", "dask", "--set", "workers=2"), cwd=tmp_path
+    )
     wait_for_chunks(tmp_path / "spread", 2, spread)
-    workers = [process for process in psutil.Process(spread.pid).children(recursive=True) if process.cpu_times().user > 0.5]
+    workers = [
+        process
+        for process in psutil.Process(spread.pid).children(recursive=True)
+        if process.cpu_times().user > 0.5
+    ]
     assert workers, "no worker of dask found"
     workers[0].kill()
     assert figures(spread) == whole

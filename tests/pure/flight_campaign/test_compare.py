@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of control laws: cost and score, repeatable tuning, delayed inputs, the shipped gains, the command."""
+"""Comparison of control laws: cost and score, repeatable tuning, delayed inputs, the shipped gains,
+the command.
+"""
 
 import json
 from dataclasses import replace
@@ -54,7 +56,9 @@ def brief(scenario: Scenario) -> Scenario:
 
 def as_tuned(gains: Gains, **changes: Any) -> TuningResult:
     """A tuning result with these gains."""
-    return TuningResult({name: value[:, 0].tolist() for name, value in gains.items()}, 1.0, 1, [1.0], 0)._replace(**changes)
+    return TuningResult(
+        {name: value[:, 0].tolist() for name, value in gains.items()}, 1.0, 1, [1.0], 0
+    )._replace(**changes)
 
 
 def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
@@ -63,7 +67,11 @@ def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
 
 
 def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark) -> None:
-    law, begin, objective = LAWS["pi"], initial_gains(LAWS["pi"], short.model), OBJECTIVES["gust_turbulence"]
+    law, begin, objective = (
+        LAWS["pi"],
+        initial_gains(LAWS["pi"], short.model),
+        OBJECTIVES["gust_turbulence"],
+    )
     found = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
     assert found[0] == found[1]
     assert found[0].cost == min(found[0].costs)
@@ -84,42 +92,67 @@ def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark)
 
 
 @pytest.mark.parametrize("wind", [GUST, TURBULENCE])
-def test_score_of_campaign_is_that_of_single_process_simulation(wind: str, short: Benchmark) -> None:
+def test_score_of_campaign_is_that_of_single_process_simulation(
+    wind: str, short: Benchmark
+) -> None:
     controller = short.scenario.controller
     gains = {key: np.array([getattr(controller, key)]).T for key in ("Lambda", "beta")}
-    gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.atleast_2d(short.scenario.rise_di().softening).T}
+    gains |= {
+        "K": np.array([controller.law_params().K]).T,
+        "softening": np.atleast_2d(short.scenario.rise_di().softening).T,
+    }
     (found,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
     turbulence = MODERATE | {"seed": tuning.TUNING_TURBULENCE_SEED}
-    flown = short.scenario if wind == GUST else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
+    flown = (
+        short.scenario
+        if wind == GUST
+        else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
+    )
     true = error(simulate(flown))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])
-    # the campaign holds the nonlinear remainder over a tick, the simulation does not: far below the 1 % that a score needs
+    # the campaign holds the nonlinear remainder over a tick, the simulation does not: far below the
+    # 1 % that a score needs
     assert found.scores[wind] == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
     if wind == GUST:
         np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
 
 
 def test_scenario_with_turbulence_is_compared_in_its_own(short: Benchmark) -> None:
-    own = short.scenario.vary(flight={"duration": 0.1}, aircraft={"turbulence": {"altitude": 3000.0, "sigma": 1.5, "seed": 9}})
+    own = short.scenario.vary(
+        flight={"duration": 0.1},
+        aircraft={"turbulence": {"altitude": 3000.0, "sigma": 1.5, "seed": 9}},
+    )
     flown = tuning.build_benchmark(own, 3).scenarios[TURBULENCE].aircraft
     assert flown.turbulence is not None
-    assert (flown.turbulence.altitude, flown.turbulence.sigma, flown.turbulence.seed) == (3000.0, 1.5, 3)
+    assert (flown.turbulence.altitude, flown.turbulence.sigma, flown.turbulence.seed) == (
+        3000.0,
+        1.5,
+        3,
+    )
     assert flown.gusts == {}
 
 
 def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benchmark) -> None:
-    # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2; with 60 ms more it is unstable
+    # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2;
+    # with 60 ms more it is unstable
     fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
-    (found,) = law_comparison.compare(short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6))
+    (found,) = law_comparison.compare(
+        short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6)
+    )
     assert found.lost_late == {0.0: 0.0, 0.06: 1.0}
     assert found.levels[0].scores[GUST].lost == 0.0
 
 
 def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path) -> None:
-    path, found = tmp_path / "one" / "two" / "gains.yaml", TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100)
+    path, found = (
+        tmp_path / "one" / "two" / "gains.yaml",
+        TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100),
+    )
     tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
     assert tuned_gains.load(path) == {"pi": {"gust": found}}
-    with pytest.raises(ParameterError, match=r"cannot be written \(.*\), expected a file of tuned gains that can$"):
+    with pytest.raises(
+        ParameterError, match=r"cannot be written \(.*\), expected a file of tuned gains that can$"
+    ):
         tuned_gains.save(path / "gains.yaml", {"pi": {"gust": found}}, ["gust"], "a command")
 
 
@@ -130,7 +163,9 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
         for result in by_aim.values():
             assert result.cost == min(result.costs) < tuning.MAX_COST
             assert len(result.costs) >= 3  # seeds, so that the spread of the search is known
-            expected = {key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()}
+            expected = {
+                key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()
+            }
             assert {key: len(values) for key, values in result.gains.items()} == expected
             assert all(value > 0.0 for values in result.gains.values() for value in values)
 
@@ -153,7 +188,10 @@ def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
 def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file with gains of three laws."""
     path = tmp_path_factory.mktemp("gains") / "gains.yaml"
-    tuned = {name: {"gust": initial(name, short, cost=7.25, costs=[7.375, 7.25])} for name in ("rise", "l1", "indi")}
+    tuned = {
+        name: {"gust": initial(name, short, cost=7.25, costs=[7.375, 7.25])}
+        for name in ("rise", "l1", "indi")
+    }
     tuned_gains.save(path, tuned, list(OBJECTIVES), "a test")
     return path
 
@@ -167,7 +205,9 @@ def brief_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tmp_path: Path) -> None:
+def test_the_command_writes_what_it_shows(
+    gains_file: Path, brief_file: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "compared.json"
     arguments = [
         "--laws",
@@ -188,7 +228,9 @@ def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tm
     assert found["wind"] == "published"
     assert "effect of wind on x_dot that of the airframe" in result.stdout
     assert [row["law"] for row in found["laws"]] == ["rise", "l1"]
-    assert [row["knows"] for row in found["laws"]] == [LAWS[name].model_data for name in ("rise", "l1")]
+    assert [row["knows"] for row in found["laws"]] == [
+        LAWS[name].model_data for name in ("rise", "l1")
+    ]
     for row in found["laws"]:
         (level,) = row["levels"]
         for wind in (GUST, TURBULENCE):
@@ -196,26 +238,40 @@ def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tm
             assert f"{level[wind]['mean']:.2f} ({level[wind]['worst']:.2f})" in result.stdout
         late = [level[GUST]["lost"], *(delayed["lost"] for delayed in row["late"])]
         assert "/".join(f"{100.0 * share:.3g}" for share in late) in result.stdout
-        assert [delayed["delay"] for delayed in row["late"]] == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.06])
+        assert [delayed["delay"] for delayed in row["late"]] == pytest.approx(
+            [0.01, 0.02, 0.03, 0.04, 0.06]
+        )
         assert (row["cost"], row["spread"]) == (7.25, 0.125)
         assert "7.25 +0.12" in result.stdout
         assert set(row["slew"]) == {"elevator", "thrust", "aileron", "rudder"}
 
 
 def test_registered_law_flies_as_that_of_catalogue(short: Benchmark) -> None:
-    # RISE-DI as a registered law, with the gains of the catalogue's: K = 1 + k_g + k_d is rounded once more
+    # RISE-DI as a registered law, with the gains of the catalogue's: K = 1 + k_g + k_d is rounded
+    # once more
     gains = initial_gains(LAWS["rise"], short.model)
     K, Lambda, beta, softening = (gain[:, 0].tolist() for gain in gains.values())
-    own = {"Lambda": Lambda, "beta": beta, "softening": softening[0], "k_g": K[-1] - 1.0, "k_d": [k - K[-1] for k in K[:-1]]}
+    own = {
+        "Lambda": Lambda,
+        "beta": beta,
+        "softening": softening[0],
+        "k_g": K[-1] - 1.0,
+        "k_d": [k - K[-1] for k in K[:-1]],
+    }
     scale = short.model.input_scale.tolist()
     scenario = short.scenario.vary(controller={**own, "input_scale": scale, "sign": "soft"})
     controllers = registered_laws.find_laws(["rise", "rise_di"], scenario, {})
     laws = registered_laws.entries(controllers)
-    tuned = {"rise": {"gust": as_tuned(gains)}, "rise_di": {"gust": registered_laws.as_tuned(scenario.controller)}}
+    tuned = {
+        "rise": {"gust": as_tuned(gains)},
+        "rise_di": {"gust": registered_laws.as_tuned(scenario.controller)},
+    }
     catalogue, registered = law_comparison.compare(short, tuned, 2, [0.3], 1, delays=(), laws=laws)
     assert registered.costs == []
     assert registered.scores == pytest.approx(catalogue.scores, rel=1e-6)
-    assert registered.levels[0].scores[GUST] == pytest.approx(catalogue.levels[0].scores[GUST], rel=1e-6)
+    assert registered.levels[0].scores[GUST] == pytest.approx(
+        catalogue.levels[0].scores[GUST], rel=1e-6
+    )
 
 
 def test_interrupted_tuning_resumes_with_missing_laws(
@@ -231,7 +287,17 @@ def test_interrupted_tuning_resumes_with_missing_laws(
         return initial(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
-    arguments = ["compare", str(brief_file), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--set", f"gains={path}"]
+    arguments = [
+        "compare",
+        str(brief_file),
+        "--laws",
+        "rise,pi,l1",
+        "--aircraft",
+        "1",
+        "--tune",
+        "--set",
+        f"gains={path}",
+    ]
     CliRunner().invoke(app, arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
     result = CliRunner().invoke(app, arguments)
@@ -241,14 +307,17 @@ def test_interrupted_tuning_resumes_with_missing_laws(
 
 
 def test_margins_of_tuned_gains_are_those_of_the_registered_law(short: Benchmark) -> None:
-    # The catalogue's laws for many sets of gains at once, the registered laws one controller at a time
+    # The catalogue's laws for many sets of gains at once, the registered laws one controller at a
+    # time
     lag, D = short.model.lag.tolist(), [int(sign) for sign in short.model.D]
     scale, Omega = short.model.input_scale.tolist(), short.model.Omega.ravel().tolist()
     for name, own in (("pi", {"input_scale": scale}), ("l1", {"Omega": Omega})):
         gains = initial_gains(LAWS[name], short.model)
         values = {key: gain[:, 0].tolist() for key, gain in gains.items()}
         section = SECTIONS[name] | {"lag": lag, "D": D, "delay": 0.0} | values | own
-        expected = margins(replace(short.scenario, controller=AnyLaw.validate_mapping(section, "controller"))).nominal
+        expected = margins(
+            replace(short.scenario, controller=AnyLaw.validate_mapping(section, "controller"))
+        ).nominal
         wide = {key: np.concatenate([0.9 * gain, gain], axis=1) for key, gain in gains.items()}
         found = nominal_margins(LAWS[name], wide, short.model)
         assert found.phase.shape == (2, 4)
@@ -258,7 +327,10 @@ def test_margins_of_tuned_gains_are_those_of_the_registered_law(short: Benchmark
 
 def test_search_within_margins_has_them(short: Benchmark) -> None:
     law = LAWS["pi"]._replace(
-        initial={"K": np.array([[22.0], [18.0], [13.0], [3.0]]), "Lambda": np.array([[6.0, 11.0, 5.0, 2.0]]).T}
+        initial={
+            "K": np.array([[22.0], [18.0], [13.0], [3.0]]),
+            "Lambda": np.array([[6.0, 11.0, 5.0, 2.0]]).T,
+        }
     )
 
     def least(gains: Gains) -> float:
@@ -275,10 +347,15 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
     result = tuned_gains.load(tuned_gains.TUNED / "osprey_servo.yaml")[name]["gust_turbulence"]
     controller = tuned_controller.tuned_controller(name, result, short)
     text = section_yaml(controller, short.scenario.aircraft.load()[0], None, "by a test", {})
-    read = AnyLaw.validate_mapping(yaml.safe_load(text)["/**/controller"]["ros__parameters"], "controller")
+    read = AnyLaw.validate_mapping(
+        yaml.safe_load(text)["/**/controller"]["ros__parameters"], "controller"
+    )
     assert (read.feedforward is None) == (LAWS[name].feedforward == "none")
     law, params = read.tuned_law()
-    of_catalogue, sets = LAWS[name].control_law(short.model), LAWS[name].params(tuning.as_gains(result), short.model)
+    of_catalogue, sets = (
+        LAWS[name].control_law(short.model),
+        LAWS[name].params(tuning.as_gains(result), short.model),
+    )
     generator, dt = np.random.default_rng(1), np.float64(short.model.period)
     y = np.cumsum(0.002 * generator.standard_normal((60, 4)), axis=0)
     zero, none = np.zeros(4), np.zeros((4, 1))
@@ -287,5 +364,7 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
     u, found = zero, none
     for sample in y[1:]:
         state, u = law.step(state, Measurements(sample, zero, zero, zero, u), dt, params)
-        wide, found = of_catalogue.step(wide, Measurements(sample[:, None], none, none, none, found), dt, sets)
+        wide, found = of_catalogue.step(
+            wide, Measurements(sample[:, None], none, none, none, found), dt, sets
+        )
     np.testing.assert_allclose(u, found[:, 0], rtol=2e-4, atol=1e-7)  # a file has six digits

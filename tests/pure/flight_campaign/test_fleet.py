@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vectorised flights of N aircraft: each is the single-process simulation, independent of the others."""
+"""Vectorised flights of N aircraft: each is the single-process simulation, independent of the
+others.
+"""
 
 from typing import Any, NamedTuple
 
@@ -39,7 +41,9 @@ CONTROL_LAW, PARAMS = SERVO.controller.tuned_law()
 PARAMS = batch.shared(PARAMS)
 
 
-def sampled(part: float, seed: int, count: int, airframe: str = "osprey") -> tuple[FloatArray, FloatArray]:
+def sampled(
+    part: float, seed: int, count: int, airframe: str = "osprey"
+) -> tuple[FloatArray, FloatArray]:
     """A and B of the first aircraft of a seed."""
     return sampled_matrices(load_airframe(airframe), part, part, seed, 0, count)
 
@@ -54,20 +58,28 @@ def fly(
     params: Any = PARAMS,
 ) -> batch.FleetResult:
     course = build_course(scenario)
-    directions = gust_directions(load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind)
-    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
+    directions = gust_directions(
+        load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind
+    )
+    aircraft = batch_matrices.assemble(
+        A, B, scenario.aircraft.plant(), course, wind, late, directions
+    )
     return batch.fly(aircraft, batch.vehicle(scenario), course, control_law, params)
 
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
-    """One of them in the single-process simulation, evaluated at the ticks: figures of `fleet.FleetResult`, (m,)."""
+    """One of them in the single-process simulation, evaluated at the ticks: figures of
+    `fleet.FleetResult`, (m,).
+    """
     effect = scenario.aircraft.uncertainty.wind
     uncertainty = {"A": 0.3, "B": 0.3, "wind": effect, "seed": 5, "number": number}
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertainty}))
     true, period = error(tape), round(1e9 / scenario.controller.rate)
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
     u = np.array([tape["u"][name] for name in scenario.controller.effectors])
-    moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(axis=1)  # a tick without a new y publishes no u
+    moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(
+        axis=1
+    )  # a tick without a new y publishes no u
     slew = moved / scenario.flight.duration
     return {"rms": np.sqrt((e**2).mean(axis=1)), "max": np.abs(e).max(axis=1), "slew": slew}
 
@@ -79,8 +91,13 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "gusts with the published effect": {"aircraft": {"uncertainty": {"wind": "published"}}},
     "products of states": {"aircraft": {"inertial_coupling": 1.0}},
     "nonlinear kinematics": {"aircraft": {"kinematics": "euler"}},
-    "feedforward": {"controller": with_feedforward(SERVO.controller, load_airframe("osprey")).model_dump()},
-    "turbulence": {"aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7}}, "flight": {"duration": 6.0}},
+    "feedforward": {
+        "controller": with_feedforward(SERVO.controller, load_airframe("osprey")).model_dump()
+    },
+    "turbulence": {
+        "aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7}},
+        "flight": {"duration": 6.0},
+    },
     "bias, drift, coarse and late y": {
         "aircraft": {
             "sensors": {
@@ -92,7 +109,9 @@ VARIATIONS: dict[str, dict[str, Any]] = {
             }
         }
     },
-    "dropout of 30 % of y": {"aircraft": {"rate": 100.0, "step": 0.002, "sensors": {"dropout": 0.3, "seed": 3}}},
+    "dropout of 30 % of y": {
+        "aircraft": {"rate": 100.0, "step": 0.002, "sensors": {"dropout": 0.3, "seed": 3}}
+    },
     "limits of u and of the actuators' rates": {
         "controller": {"lower": [-0.05, -0.02, -0.05, -0.1], "upper": [0.05, 0.02, 0.05, 0.1]},
         "aircraft": {"actuators": {"lag": LAG, "rate": [0.4, 0.3, 0.2, 0.2]}},
@@ -115,7 +134,13 @@ VARIATIONS: dict[str, dict[str, Any]] = {
         "flight": {"duration": 8.0},
     },
     "thrust weak": {
-        "aircraft": {"actuators": {"lag": LAG, "weak_at": [np.inf, 2.0, np.inf, np.inf], "weak_effect": [0.3] * 4}},
+        "aircraft": {
+            "actuators": {
+                "lag": LAG,
+                "weak_at": [np.inf, 2.0, np.inf, np.inf],
+                "weak_effect": [0.3] * 4,
+            }
+        },
         "flight": {"duration": 8.0},
     },
     "bias, sines, thrust stuck": {
@@ -130,20 +155,29 @@ VARIATIONS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", VARIATIONS)
 def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(name: str) -> None:
-    # A fleet holds the nonlinear remainder over a tick and the wind over a step of the integration (2 ms); the simulation
-    # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
-    # next step, after which u differs: 2e-2.
+    # A fleet holds the nonlinear remainder over a tick and the wind over a step of the integration
+    # (2 ms); the simulation does not. In the gust the difference is at most 1e-4 of the error; 1e-3
+    # bounds it. A quantised y sometimes rounds to the next step, after which u differs: 2e-2.
     scenario = SERVO.vary(**VARIATIONS[name])
-    within, params = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3, batch.shared(scenario.controller.law_params())
+    within, params = (
+        2e-2 if scenario.aircraft.sensors.quantisation else 1e-3,
+        batch.shared(scenario.controller.law_params()),
+    )
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
-    for number in range(2) if name == "turbulence" else (1,):  # the second one: what would fly as the first differs
+    for number in (
+        range(2) if name == "turbulence" else (1,)
+    ):  # the second one: what would fly as the first differs
         for key, values in alone(scenario, number).items():
-            assert np.asarray(getattr(together, key))[:, number] == pytest.approx(values, rel=within), (number, key)
+            assert np.asarray(getattr(together, key))[:, number] == pytest.approx(
+                values, rel=within
+            ), (number, key)
     assert not np.asarray(together.diverged).any()
 
 
 def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> None:
-    """Limits bind in a tenth of the ticks (p, r) to two fifths (V). The bound is that of the flights above."""
+    """Limits bind in a tenth of the ticks (p, r) to two fifths (V). The bound is that of the
+    flights above.
+    """
     twin = find_scenario("osprey_twin")
     stop = [0.01 if "aileron" in name else 0.5 for name in twin.controller.effectors]
     section = twin.controller.model_dump()["allocation"] | {
@@ -153,7 +187,9 @@ def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> N
     }
     scenario = twin.vary(controller={"allocation": section}, flight={"duration": 6.0})
     law, params = scenario.controller.tuned_law()
-    together = fly(scenario, *sampled(0.3, 5, 2, "osprey_twin"), control_law=law, params=batch.shared(params))
+    together = fly(
+        scenario, *sampled(0.3, 5, 2, "osprey_twin"), control_law=law, params=batch.shared(params)
+    )
     for key, values in alone(scenario, 1).items():
         assert np.asarray(getattr(together, key))[:, 1] == pytest.approx(values, rel=1e-3), key
 
@@ -164,9 +200,13 @@ def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
     effect = generator.normal(size=(4, 7))
     T = stops[:, None] * np.linalg.pinv(effect * stops)
     params = allocation(T, effect, (2, 0, 3, 1), Limits(-stops, stops, np.full(7, 20.0)))
-    of_effectors, before = (stops[:, None] * generator.uniform(-1.0, 1.0, (7, 40)) for _ in range(2))
+    of_effectors, before = (
+        stops[:, None] * generator.uniform(-1.0, 1.0, (7, 40)) for _ in range(2)
+    )
     v = effect @ of_effectors * generator.choice([0.05, 0.9, 3.0, 30.0], 40)
-    u, given = jax.jit(batch_allocation.allocate)(v, before, DT, batch_allocation.with_column_limits(params))
+    u, given = jax.jit(batch_allocation.allocate)(
+        v, before, DT, batch_allocation.with_column_limits(params)
+    )
     for k in range(40):
         alone_u, alone_given = allocate(v[:, k], before[:, k], DT, params)
         assert np.asarray(u)[:, k] == pytest.approx(alone_u, abs=1e-9)  # sums in another order
@@ -177,11 +217,15 @@ def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
     A, B = sampled(0.3, 5, 1)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = PARAMS.beta * np.array([1.0, 1.0, 1.0, 0.5])
-    together = fly(SERVO, np.repeat(A, 4, 0), np.repeat(B, 4, 0), wind, late, params=PARAMS._replace(beta=beta))
+    together = fly(
+        SERVO, np.repeat(A, 4, 0), np.repeat(B, 4, 0), wind, late, params=PARAMS._replace(beta=beta)
+    )
     for k in range(4):
         apart = fly(SERVO, A, B, wind[k], late[k], params=PARAMS._replace(beta=beta[:, k : k + 1]))
         # The same operations; only their order in sums may differ with the vector width of the CPU.
-        assert np.asarray(together.rms)[:, k] == pytest.approx(np.asarray(apart.rms)[:, 0], rel=1e-9)
+        assert np.asarray(together.rms)[:, k] == pytest.approx(
+            np.asarray(apart.rms)[:, 0], rel=1e-9
+        )
     rms = np.asarray(together.rms)
     assert rms[0, 1] < 0.5 * rms[0, 0]  # without the gust q has its largest error no more
     assert not np.allclose(rms[:, 2], rms[:, 0], rtol=1e-3)
@@ -199,10 +243,15 @@ def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
     A, B = sampled(0.3, 5, 2)
     directions = gust_directions(load_airframe("osprey"), A, "air_relative")
     assembled = batch_matrices.assemble(A, B, plant, course, gust_directions=directions)
-    assert [list(load_airframe("osprey").gusts)[axis] for axis in course.axes] == ["vertical", "lateral"]
+    assert [list(load_airframe("osprey").gusts)[axis] for axis in course.axes] == [
+        "vertical",
+        "lateral",
+    ]
     C = plant.aircraft.C[course.order]
     for k in range(2):
-        assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(C @ directions[k][:, course.axes], rel=1e-14)
+        assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(
+            C @ directions[k][:, course.axes], rel=1e-14
+        )
     # Without directions the plant's own act on all.
     shared = np.asarray(batch_matrices.assemble(A, B, plant, course).forced_rate)
     assert (shared == (C @ plant.aircraft.gust_direction[:, course.axes])[..., None]).all()
@@ -214,7 +263,9 @@ def _pulse(delay: int) -> ControlLaw:
     def engage(measured: Measurements, params: Any) -> Ticks:
         return Ticks(0.0 * measured.y[:1] + 1.0)
 
-    def limited(state: Ticks, measured: Measurements, dt: Array, params: Any, limits: Limits) -> tuple[Ticks, Array, Array]:
+    def limited(
+        state: Ticks, measured: Measurements, dt: Array, params: Any, limits: Limits
+    ) -> tuple[Ticks, Array, Array]:
         inside = (state.count >= 10.0 + delay) & (state.count < 30.0 + delay)
         u = 0.0 * measured.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
         return Ticks(state.count + 1.0), u, u
@@ -227,7 +278,9 @@ def test_late_u_acts_that_many_ticks_later() -> None:
     late = fly(undisturbed, *sampled(0.0, 1, 1), late=3, control_law=_pulse(0), params=())
     later = fly(undisturbed, *sampled(0.0, 1, 1), control_law=_pulse(3), params=())
     for name in ("rms", "max"):
-        assert np.asarray(getattr(late, name)) == pytest.approx(np.asarray(getattr(later, name)), rel=1e-12)
+        assert np.asarray(getattr(late, name)) == pytest.approx(
+            np.asarray(getattr(later, name)), rel=1e-12
+        )
     assert np.asarray(late.max)[0, 0] > 0.01  # it did move
 
 
@@ -235,7 +288,9 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
     course, vehicle = build_course(SERVO), batch.vehicle(SERVO)
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
-    vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
+    vehicle = vehicle._replace(
+        actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None)
+    )
     infinite = np.full((4, 1), np.inf)
     vehicle = vehicle._replace(limits=Limits(-infinite, infinite, infinite))
     aircraft = batch_matrices.assemble(A, B, SERVO.aircraft.plant(), course)
@@ -247,9 +302,15 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
     [
-        (SERVO.vary(aircraft={"sensors": {"dropout": 0.1}}), "aircraft.rate: found 500 Hz, expected controller.rate"),
+        (
+            SERVO.vary(aircraft={"sensors": {"dropout": 0.1}}),
+            "aircraft.rate: found 500 Hz, expected controller.rate",
+        ),
         (SERVO.vary(aircraft={"sensors": {"delay": 0.004}}), "sensors.delay: found 0.01 s"),
-        (find_scenario("jsbsim_c172p"), "airframe: found jsbsim:c172p, expected an airframe with matrices"),
+        (
+            find_scenario("jsbsim_c172p"),
+            "airframe: found jsbsim:c172p, expected an airframe with matrices",
+        ),
     ],
 )
 def test_scenario_that_fleet_cannot_fly_refused(scenario: Scenario, sentence: str) -> None:

@@ -32,7 +32,9 @@ def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def flown(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
     where = tmp_path_factory.mktemp("fly")
     return where, rise_di("fly", "osprey_gust", "--in-process", "--duration", "4", cwd=where)
 
@@ -41,12 +43,18 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Co
 def test_full_disk_behind_standard_output_is_one_sentence() -> None:
     with Path("/dev/full").open("w", encoding="utf-8") as full:
         command = [sys.executable, "-m", "flight_cli.cli", "--help"]
-        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    sentence = "error: output: cannot be written (No space left on device), expected a disk with space\n"
+        result = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    sentence = (
+        "error: output: cannot be written (No space left on device), expected a disk with space\n"
+    )
     assert (result.returncode, result.stderr) == (1, sentence)
 
 
-def test_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_flight_ends_with_table_log_and_report(
+    flown: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
     where, shown = flown
     assert shown.returncode == 0, shown.stderr
     run = (where / "runs" / "latest").resolve()
@@ -60,14 +68,22 @@ def test_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.Com
 
 
 def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
-    summary = json.loads((flown[0] / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
-    assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 4.0)
+    summary = json.loads(
+        (flown[0] / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
+    )
+    assert (summary["scenario"], summary["outcome"], summary["duration"]) == (
+        "osprey_gust",
+        "completed",
+        4.0,
+    )
     assert summary["errors"]["q"]["gust"] == {"rms": None, "max": None}  # the gusts come later
     assert 0 < summary["errors"]["q"]["calm"]["rms"] < 1e-3
     assert (summary["ticks"]["ticks"], summary["ticks"]["without_new_y"]) == (401, 0)
 
 
-def test_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_report_is_one_page_that_needs_no_network(
+    flown: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
     page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
     assert 'src="http' not in page
     assert "gust: from the entry of a gust to 1 s after its end" in page
@@ -85,13 +101,24 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
     ("arguments", "sentence"),
     [
         (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
-        (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
-        (["fly", "--set", "wind.sigma=1"], "error: --set: found 'wind.sigma=1', expected a parameter of the scenario and"),
-        (["fly", "--set", "controller.k_g"], "error: --set: found 'controller.k_g', expected a parameter of the scenario and"),
+        (
+            ["fly", "--duration", "-1"],
+            "error: flight.duration: found -1.0, expected greater than 0",
+        ),
+        (
+            ["fly", "--set", "wind.sigma=1"],
+            "error: --set: found 'wind.sigma=1', expected a parameter of the scenario and",
+        ),
+        (
+            ["fly", "--set", "controller.k_g"],
+            "error: --set: found 'controller.k_g', expected a parameter of the scenario and",
+        ),
         (["report", "nowhere"], "error: nowhere: found no such file or folder"),
     ],
 )
-def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+def test_bad_input_is_one_sentence_and_status_2(
+    arguments: list[str], sentence: str, tmp_path: Path
+) -> None:
     shown = rise_di(*arguments, cwd=tmp_path)
     assert shown.returncode == 2
     assert shown.stderr.startswith(sentence)
@@ -100,7 +127,14 @@ def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: 
 
 
 def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
-    settings = ("--set", "controller.k_g=2.5", "--set", "controller.learn.window=40", "--set", "flight.duration=0.2")
+    settings = (
+        "--set",
+        "controller.k_g=2.5",
+        "--set",
+        "controller.learn.window=40",
+        "--set",
+        "flight.duration=0.2",
+    )
     shown = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     flown = recorded_scenario(tmp_path / "runs" / "latest")
@@ -120,7 +154,9 @@ def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diver
     tmp_path: Path, osprey_gust: Scenario
 ) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
-    (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
+    (tmp_path / "mine.yaml").write_text(
+        text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8"
+    )
     flown = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
     assert flown.returncode == 3
     assert "outcome: diverged at t = " in flown.stdout
@@ -128,8 +164,12 @@ def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diver
 
 
 def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
-    (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8")
-    shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)  # -m puts the working folder first
+    (tmp_path / "jax.py").write_text(
+        "raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8"
+    )
+    shown = rise_di(
+        "campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path
+    )  # -m puts the working folder first
     assert shown.returncode == 2
     sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
     assert shown.stderr.splitlines()[-1] == sentence
@@ -137,21 +177,42 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
 
 
 @pytest.mark.parametrize("command", ["campaign", "compare", "benchmark"])
-def test_device_that_jax_lacks_is_one_sentence_without_a_folder(command: str, tmp_path: Path) -> None:
+def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
+    command: str, tmp_path: Path
+) -> None:
     words = [sys.executable, "-m", "flight_cli.cli", command, "osprey_servo", "--aircraft", "1"]
     environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
-    shown = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    shown = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
     assert shown.returncode == 2
     assert shown.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
     assert "Traceback" not in shown.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust", "--in-process", "--duration", "0.1", "--set"]
-    shown = subprocess.run([*map(os.fsencode, words), b"runs=r\xff"], cwd=tmp_path, capture_output=True, check=False)
+def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(
+    tmp_path: Path,
+) -> None:
+    words = [
+        sys.executable,
+        "-m",
+        "flight_cli.cli",
+        "fly",
+        "osprey_gust",
+        "--in-process",
+        "--duration",
+        "0.1",
+        "--set",
+    ]
+    shown = subprocess.run(
+        [*map(os.fsencode, words), b"runs=r\xff"], cwd=tmp_path, capture_output=True, check=False
+    )
     assert shown.returncode == 2
-    assert re.fullmatch(rb"error: --set runs: found .*udcff', expected a folder with a name in UTF-8.*\n", shown.stderr)
+    assert re.fullmatch(
+        rb"error: --set runs: found .*udcff', expected a folder with a name in UTF-8.*\n",
+        shown.stderr,
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -183,12 +244,16 @@ def test_name_that_is_gone_is_one_sentence_with_the_new_one(words: str) -> None:
 def test_option_that_became_a_setting_names_it() -> None:
     result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--y-rate", "50"])
     assert str(result.exception) == "--y-rate: found an option that is gone, expected --set y_rate"
-    unknown = CliRunner().invoke(application(["export"]), ["export", "osprey_servo", "--set", "rate=50"])
+    unknown = CliRunner().invoke(
+        application(["export"]), ["export", "osprey_servo", "--set", "rate=50"]
+    )
     assert str(unknown.exception) == "--set: found 'rate=50', expected one of no settings"
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
-    listed = json.loads(CliRunner().invoke(application(["scenarios"]), ["scenarios", "--json"]).output)
+    listed = json.loads(
+        CliRunner().invoke(application(["scenarios"]), ["scenarios", "--json"]).output
+    )
     assert [row["name"] for row in listed] == sorted(path.stem for path in LIBRARY.glob("*.yaml"))
     (servo,) = (row for row in listed if row["name"] == "osprey_servo")
     assert (servo["aircraft"], servo["law"]) == ("osprey", "rise_di")
@@ -223,7 +288,9 @@ def command(prog_name):
 cli.application = lambda words: command
 cli.main()
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 

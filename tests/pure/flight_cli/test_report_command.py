@@ -33,19 +33,29 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return runs
 
 
-def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_run_as_figure_tables_and_json(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     png, csv, parquet = (tmp_path / f"run.{suffix}" for suffix in ("png", "csv", "parquet"))
     report(runs[:1], png=png, csv=csv, parquet=parquet, as_json=True)
-    assert json.loads(capsys.readouterr().out) == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8"))
+    assert json.loads(capsys.readouterr().out) == json.loads(
+        (runs[0] / "summary.json").read_text(encoding="utf-8")
+    )
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert csv.read_bytes()[:8] == b"stamp_ns"
     assert parquet.read_bytes()[:4] == b"PAR1"
 
 
-def test_engagement_shorter_than_sample_leaves_figures_of_flight(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_engagement_shorter_than_sample_leaves_figures_of_flight(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = read_run(run)
     instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
-    monkeypatch.setattr(run_folder, "read_run", lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
+    monkeypatch.setattr(
+        run_folder,
+        "read_run",
+        lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]),
+    )
     summary = read_flight(run, "completed").summary
     assert summary["duration"] > 1.0
     assert summary["notes"][0].endswith("s: lost")
@@ -53,7 +63,10 @@ def test_engagement_shorter_than_sample_leaves_figures_of_flight(run: Path, monk
 
 
 def test_two_runs_are_compared(
-    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    runs: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = (runs[0] / "report.html").read_bytes()
@@ -65,7 +78,10 @@ def test_two_runs_are_compared(
     assert output.splitlines()[-1] == "report:  two.html"
     assert (runs[0] / "report.html").read_bytes() == before
     report(runs, as_json=True)
-    assert [report["scenario"] for report in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]
+    assert [report["scenario"] for report in json.loads(capsys.readouterr().out)] == [
+        "osprey_gust",
+        "osprey_servo",
+    ]
     assert (runs[0].parent / "comparison.html").is_file()
 
 
@@ -78,7 +94,7 @@ def test_two_runs_are_compared(
 )
 def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
     nowhere: dict[str, Any] = {option: Path("/proc/none/file")}
-    with pytest.raises(ParameterError, match=f"^--{option}: /proc/none/file cannot be written "):
+    with pytest.raises(ParameterError, match=f"^{option}: /proc/none/file cannot be written "):
         report(runs[:1], **nowhere)
 
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the aircraft."""
+"""`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the
+aircraft.
+"""
 
 import json
 import re
@@ -38,7 +40,11 @@ app = application([*COMMANDS])
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
 OMEGA = np.array([40.0, 8.0, 80.0, 30.0])  # SI, by channel
 DAMPING = np.array([6.0, 0.3, 8.0, 3.0])  # 1/s
-FULL, SPEED, THROTTLE = 0.523599, 25.0, 0.5  # rad as in the maps ardupilot and px4; m/s; throttle in trim
+FULL, SPEED, THROTTLE = (
+    0.523599,
+    25.0,
+    0.5,
+)  # rad as in the maps ardupilot and px4; m/s; throttle in trim
 EPOCH = 1_790_000_000_000_000  # us since 1970, of a tlog
 GROUND, DURATION, RATE = 10.0, 40.0, 50  # s on the ground before the flight, s, Hz
 LAG = 0.05  # s, of the servos
@@ -60,7 +66,9 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """First-order channels y_dot = -damping y + Omega v, with servos v_dot = (u - v) / lag, behind held random inputs."""
+    """First-order channels y_dot = -damping y + Omega v, with servos v_dot = (u - v) / lag, behind
+    held random inputs.
+    """
     random, steps, dt = np.random.default_rng(1), round(DURATION * RATE), 1.0 / RATE
     held = np.repeat(random.choice([-1.0, 0.0, 1.0], (steps // 15 + 1, 4)), 15, axis=0)[:steps]
     u = held * [0.04, 0.1, 0.04, 0.06]
@@ -73,7 +81,9 @@ def flight() -> Flight:
 
 
 def sticks(u: FloatArray) -> FloatArray:
-    """Pulses of roll, pitch, throttle and yaw, us, between RCn_MIN 1000 and RCn_MAX 2000, those of the map ardupilot."""
+    """Pulses of roll, pitch, throttle and yaw, us, between RCn_MIN 1000 and RCn_MAX 2000, those of
+    the map ardupilot.
+    """
     elevator, thrust, aileron, rudder = u.T
     surfaces = (1500.0 + 500.0 * surface / FULL for surface in (aileron, elevator, rudder))
     roll, pitch, yaw = surfaces
@@ -85,35 +95,66 @@ def on_ground(flight: Flight) -> Flight:
     count = round(GROUND * RATE)
     still = np.zeros((count, 4))
     still[:, 1] = -SPEED
-    return Flight([round(1e6 * (1.0 + k / RATE)) for k in range(count)], still, np.zeros((count, 4)))
+    return Flight(
+        [round(1e6 * (1.0 + k / RATE)) for k in range(count)], still, np.zeros((count, 4))
+    )
 
 
-ENDS = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "REVERSED": 0.0}  # us, those of the map ardupilot
+ENDS = {
+    "MIN": 1000.0,
+    "TRIM": 1500.0,
+    "MAX": 2000.0,
+    "REVERSED": 0.0,
+}  # us, those of the map ardupilot
 AXES = ("ROLL", "PITCH", "THROTTLE", "YAW")
 PARAMETERS = {
     **{f"RCMAP_{axis}": float(number) for number, axis in enumerate(AXES, start=1)},
-    **{f"SERVO{number}_FUNCTION": function for number, function in enumerate((4.0, 19.0, 70.0, 21.0), start=1)},
-    **{f"{kind}{number}_{end}": value for kind in ("RC", "SERVO") for number in range(1, 5) for end, value in ENDS.items()},
+    **{
+        f"SERVO{number}_FUNCTION": function
+        for number, function in enumerate((4.0, 19.0, 70.0, 21.0), start=1)
+    },
+    **{
+        f"{kind}{number}_{end}": value
+        for kind in ("RC", "SERVO")
+        for number in range(1, 5)
+        for end, value in ENDS.items()
+    },
     "SERVO2_REVERSED": 1.0,
 }
 
 
 def dataflash(
-    path: Path, flight: Flight, mode: int = 0, parameters: Mapping[str, float] = PARAMETERS, changes: Changes = ()
+    path: Path,
+    flight: Flight,
+    mode: int = 0,
+    parameters: Mapping[str, float] = PARAMETERS,
+    changes: Changes = (),
 ) -> Path:
-    """A log of ArduPlane. The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the first parameters say."""
+    """A log of ArduPlane. The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the
+    first parameters say.
+    """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
-    y, pulses = np.concatenate([part.y for part in parts]), np.concatenate([sticks(part.u) for part in parts])
+    y, pulses = (
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([sticks(part.u) for part in parts]),
+    )
     servos = pulses.copy()
     for column, number in enumerate(range(1, 5)):
-        if parameters.get(f"RC{number}_REVERSED", 0.0) != parameters.get(f"SERVO{number}_REVERSED", 0.0):
+        if parameters.get(f"RC{number}_REVERSED", 0.0) != parameters.get(
+            f"SERVO{number}_REVERSED", 0.0
+        ):
             servos[:, column] = 3000.0 - servos[:, column]
     speed = y[:, [1]] + SPEED
     messages = {
         "MODE": (("Mode", "ModeNum"), [(1, (mode, mode))]),
         "IMU": (("GyrX", "GyrY", "GyrZ"), list(zip(stamps, y[:, [2, 0, 3]], strict=True))),
-        "CTUN": (("As", "E2T"), list(zip(stamps, np.column_stack([speed / 1.05, np.full(len(speed), 1.05)]), strict=True))),
+        "CTUN": (
+            ("As", "E2T"),
+            list(
+                zip(stamps, np.column_stack([speed / 1.05, np.full(len(speed), 1.05)]), strict=True)
+            ),
+        ),
         "ATT": (("Roll", "Pitch", "Yaw"), [(stamp, (5.0, -2.0, 350.0)) for stamp in stamps]),
         "RCIN": (("C1", "C2", "C3", "C4"), list(zip(stamps, pulses, strict=True))),
         "RCOU": (("C1", "C2", "C3", "C4"), list(zip(stamps, servos, strict=True))),
@@ -123,7 +164,9 @@ def dataflash(
 
 
 def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (2a3dc4b7)") -> Path:
-    """The channels of the flight as those of a multicopter, in STABILIZE, which has the number of MANUAL of a plane."""
+    """The channels of the flight as those of a multicopter, in STABILIZE, which has the number of
+    MANUAL of a plane.
+    """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
     y, u = np.concatenate([part.y for part in parts]), np.concatenate([part.u for part in parts])
@@ -141,16 +184,31 @@ def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (
     return path
 
 
-def tlog(path: Path, flight: Flight, parameters: Mapping[str, float] = MappingProxyType({}), system: int = 1) -> Path:
-    messages: list[tuple[int, Any]] = [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))]
+def tlog(
+    path: Path,
+    flight: Flight,
+    parameters: Mapping[str, float] = MappingProxyType({}),
+    system: int = 1,
+) -> Path:
+    messages: list[tuple[int, Any]] = [
+        (EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))
+    ]
     count = len(parameters)
     for index, (name, value) in enumerate(parameters.items()):
-        messages.append((EPOCH, mavlink.MAVLink_param_value_message(name.encode(), value, 9, count, index)))
+        messages.append(
+            (EPOCH, mavlink.MAVLink_param_value_message(name.encode(), value, 9, count, index))
+        )
     for part in (on_ground(flight), flight):
-        for stamp, y, pulses in zip(part.stamp_us, part.y, np.rint(sticks(part.u)).astype(int).tolist(), strict=True):
+        for stamp, y, pulses in zip(
+            part.stamp_us, part.y, np.rint(sticks(part.u)).astype(int).tolist(), strict=True
+        ):
             ms, at = stamp // 1000, EPOCH + stamp
-            messages.append((at, mavlink.MAVLink_attitude_message(ms, 0.1, -0.03, -0.2, y[2], y[0], y[3])))
-            messages.append((at, mavlink.MAVLink_vfr_hud_message(y[1] + SPEED, 0.0, 0, 50, 0.0, 0.0)))
+            messages.append(
+                (at, mavlink.MAVLink_attitude_message(ms, 0.1, -0.03, -0.2, y[2], y[0], y[3]))
+            )
+            messages.append(
+                (at, mavlink.MAVLink_vfr_hud_message(y[1] + SPEED, 0.0, 0, 50, 0.0, 0.0))
+            )
             channels = [*pulses, *[0] * 14]
             messages.append((at, mavlink.MAVLink_rc_channels_message(ms, 16, *channels, 0)))
     write_tlog(path, messages, system)
@@ -162,16 +220,27 @@ def stamped(flight: Flight, values: FloatArray) -> list[tuple[int, FloatArray]]:
 
 
 def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = False) -> Path:
-    """A log of PX4. A VTOL flies the first half on its rotors, whose torques in instance 0 oppose the rates to the end."""
+    """A log of PX4. A VTOL flies the first half on its rotors, whose torques in instance 0 oppose
+    the rates to the end.
+    """
     elevator, thrust, aileron, rudder = flight.u.T
     still = np.zeros(len(thrust))
     level = np.column_stack([np.ones(len(thrust)), still, still, still])
     topics = {
         "vehicle_angular_velocity": ("float[3] xyz;", stamped(flight, flight.y[:, [2, 0, 3]])),
-        "airspeed_validated": ("float true_airspeed_m_s;", stamped(flight, flight.y[:, [1]] + SPEED)),
+        "airspeed_validated": (
+            "float true_airspeed_m_s;",
+            stamped(flight, flight.y[:, [1]] + SPEED),
+        ),
         "vehicle_attitude": ("float[4] q;", stamped(flight, level)),
-        "vehicle_torque_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([aileron, elevator, rudder]) / FULL)),
-        "vehicle_thrust_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([THROTTLE + thrust, still, still]))),
+        "vehicle_torque_setpoint": (
+            "float[3] xyz;",
+            stamped(flight, np.column_stack([aileron, elevator, rudder]) / FULL),
+        ),
+        "vehicle_thrust_setpoint": (
+            "float[3] xyz;",
+            stamped(flight, np.column_stack([THROTTLE + thrust, still, still])),
+        ),
     }
     second = {}
     if vtol:
@@ -179,13 +248,18 @@ def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = Fals
         second[name] = topics[name][1]
         topics[name] = ("float[3] xyz;", stamped(flight, -0.1 * flight.y[:, [2, 0, 3]]))
         kinds = np.where(np.arange(len(thrust)) < len(thrust) // 2, 1.0, 2.0)
-        topics["vehicle_status"] = ("float vehicle_type;float is_vtol;", stamped(flight, np.column_stack([kinds, kinds > 0])))
+        topics["vehicle_status"] = (
+            "float vehicle_type;float is_vtol;",
+            stamped(flight, np.column_stack([kinds, kinds > 0])),
+        )
     write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0}, changes, second)
     return path
 
 
 def in_order(content: bytes) -> bytes:
-    """The packets of a tlog in the order of their stamps: MAVLink 2, 12 bytes beside the payload, after a stamp of 8."""
+    """The packets of a tlog in the order of their stamps: MAVLink 2, 12 bytes beside the payload,
+    after a stamp of 8.
+    """
     packets: list[bytes] = []
     start = 0
     while start < len(content):
@@ -211,7 +285,9 @@ def ulog_of_2020(path: Path, flight: Flight) -> Path:
 
 def imported(log: Path, bag: Path, *options: str, map_name: str = "ardupilot") -> Result:
     """`rise-di import`."""
-    return CliRunner().invoke(app, ["import", str(log), "--map", map_name, "--output", str(bag), *options])
+    return CliRunner().invoke(
+        app, ["import", str(log), "--map", map_name, "--output", str(bag), *options]
+    )
 
 
 WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
@@ -232,10 +308,14 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
     tape = read_run(bag).tape
     assert (tape["y"].names, tape["u"].names) == (OUTPUTS, INPUTS)
     assert len(tape["y"].stamp_ns) == len(flight.y)  # of the flight, without the time on the ground
-    assert tape["y"].values == pytest.approx(flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0], abs=1e-5)  # float32
+    assert tape["y"].values == pytest.approx(
+        flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0], abs=1e-5
+    )  # float32
     resolution = 0.5 / 500.0 * FULL if write is tlog else 0.0  # rad: pulses are whole us in MAVLink
     assert tape["u"].values == pytest.approx(flight.u, abs=resolution + 1e-6)
-    assert np.median(tape["commands"].values, axis=0) == pytest.approx([0.0, THROTTLE, 0.0, 0.0], abs=1e-6)
+    assert np.median(tape["commands"].values, axis=0) == pytest.approx(
+        [0.0, THROTTLE, 0.0, 0.0], abs=1e-6
+    )
 
 
 def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path) -> None:
@@ -243,14 +323,17 @@ def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path)
     assert imported(ulog(tmp_path / "flight.ulg", flight), bag, map_name="px4").exit_code == 0
     response = recorded_response(bag, OUTPUTS, INPUTS)
     assert (response.sign_ratio >= MIN_RATIO).all()
-    assert response.Omega.diagonal() == pytest.approx(OMEGA, rel=0.15)  # the least that the log of a real flight has to reach
+    assert response.Omega.diagonal() == pytest.approx(
+        OMEGA, rel=0.15
+    )  # the least that the log of a real flight has to reach
 
 
 def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: Path) -> None:
     path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11), tmp_path / "bag"
     refused = imported(path, bag)
     assert str(refused.exception) == (
-        "the log: found no flight in MANUAL in the log, expected it, for only there the sticks are the commands, or --servos"
+        "the log: found no flight in MANUAL in the log, expected it, for only there the sticks "
+        "are the commands, or --servos"
     )
     assert not bag.exists()
     assert imported(path, bag, "--servos").exit_code == 0
@@ -262,12 +345,17 @@ def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: P
 def test_servos_give_u_of_the_stick_that_moved_them(
     stick_reversed: float, servo_reversed: float, flight: Flight, tmp_path: Path
 ) -> None:
-    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft. u follows the pulse."""
+    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft. u
+    follows the pulse.
+    """
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
     content["inputs"]["elevator"]["positive"] = "nose down" if stick_reversed else "nose up"
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     parameters = {**PARAMETERS, "RC2_REVERSED": stick_reversed, "SERVO2_REVERSED": servo_reversed}
-    path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters), tmp_path / "bag"
+    path, bag = (
+        dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters),
+        tmp_path / "bag",
+    )
     assert imported(path, bag, "--servos", map_name=str(tmp_path / "map.yaml")).exit_code == 0
     tape = read_run(bag).tape
     assert tape["u"].names == INPUTS
@@ -275,62 +363,102 @@ def test_servos_give_u_of_the_stick_that_moved_them(
 
 
 @pytest.mark.parametrize("option", [[], ["--servos"]], ids=["sticks", "servos"])
-def test_log_whose_parameters_differ_from_the_map_is_refused(option: list[str], flight: Flight, tmp_path: Path) -> None:
-    path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"RC2_REVERSED": 1.0, "RC1_MIN": 1100.0})
-    sentence = "the log: found RC2_REVERSED 1, RC1_MIN 1100, expected RC2_REVERSED 0, RC1_MIN 1000 as in the map ardupilot:"
+def test_log_whose_parameters_differ_from_the_map_is_refused(
+    option: list[str], flight: Flight, tmp_path: Path
+) -> None:
+    path = dataflash(
+        tmp_path / "flight.bin",
+        flight,
+        parameters=PARAMETERS | {"RC2_REVERSED": 1.0, "RC1_MIN": 1100.0},
+    )
+    sentence = (
+        "the log: found RC2_REVERSED 1, RC1_MIN 1100, expected RC2_REVERSED 0, RC1_MIN "
+        "1000 as in the map ardupilot:"
+    )
     assert str(imported(path, tmp_path / "bag", *option).exception).startswith(sentence)
     assert not (tmp_path / "bag").exists()
 
 
-def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(flight: Flight, tmp_path: Path) -> None:
+def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(
+    flight: Flight, tmp_path: Path
+) -> None:
     reversed_ = tlog(tmp_path / "reversed.tlog", flight, {"RC2_REVERSED": 1.0})
     refused = imported(reversed_, tmp_path / "bag", map_name="ardupilot_mavlink")
-    assert "found RC2_REVERSED 1, expected RC2_REVERSED 0 as in the map ardupilot_mavlink" in str(refused.exception)
-    path = tlog(tmp_path / "flight.tlog", flight, {name: value for name, value in PARAMETERS.items() if name != "RC4_TRIM"})
+    assert "found RC2_REVERSED 1, expected RC2_REVERSED 0 as in the map ardupilot_mavlink" in str(
+        refused.exception
+    )
+    path = tlog(
+        tmp_path / "flight.tlog",
+        flight,
+        {name: value for name, value in PARAMETERS.items() if name != "RC4_TRIM"},
+    )
     result = imported(path, tmp_path / "bag", map_name="ardupilot_mavlink")
     assert result.exit_code == 0
-    assert "warning: the log has no RC4_TRIM before the samples: compare the map with them yourself" in result.stderr
+    assert (
+        "warning: the log has no RC4_TRIM before the samples: compare the map with them yourself"
+        in result.stderr
+    )
 
 
 def test_parameters_of_the_samples_count_and_not_the_last_ones(
     flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A servo that was reversed in flight and is not after it, as on an aircraft that is built otherwise on the ground."""
+    """A servo that was reversed in flight and is not after it, as on an aircraft that is built
+    otherwise on the ground.
+    """
     bag, end = tmp_path / "bag", flight.stamp_us[-1]
     changes = [(end + 20_000_000, "SERVO2_REVERSED", 0.0), (end + 20_000_000, "RC2_MIN", 1100.0)]
     path = dataflash(tmp_path / "flight.bin", flight, mode=11, changes=changes)
     result = imported(path, bag, "--servos")
     assert result.exit_code == 0, result.output
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
-    sentence = "SERVO2_REVERSED changes from 1 to 0 at 70.0 s of the log, after the samples: signs and effects are those of 1"
+    sentence = (
+        "SERVO2_REVERSED changes from 1 to 0 at 70.0 s of the log, after the samples: "
+        "signs and effects are those of 1"
+    )
     assert f"warning: {sentence}" in result.stderr
-    assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
+    assert (
+        yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))[
+            "SERVO2_REVERSED"
+        ]
+        == 1.0
+    )
     warn_of_lacks_in(bag, None)  # of check and identify
     assert sentence in capsys.readouterr().err
 
 
-def test_change_between_the_samples_is_refused_and_left_out_by_the_window(flight: Flight, tmp_path: Path) -> None:
+def test_change_between_the_samples_is_refused_and_left_out_by_the_window(
+    flight: Flight, tmp_path: Path
+) -> None:
     bag, half = tmp_path / "bag", flight.stamp_us[len(flight.stamp_us) // 2]
     path = dataflash(tmp_path / "flight.bin", flight, changes=[(half, "SERVO2_REVERSED", 0.0)])
     assert str(imported(path, bag).exception) == (
-        "the log: found SERVO2_REVERSED changes from 1 to 0 at 30.0 s of the log, expected no change between the samples: leave"
-        " it out by --from and --until"
+        "the log: found SERVO2_REVERSED changes from 1 to 0 at 30.0 s of the log, expected no "
+        "change between the samples: leave it out by --from and --until"
     )
     assert imported(path, bag, "--from", "11", "--until", "29").exit_code == 0
     assert imported(path, tmp_path / "later", "--servos", "--from", "31").exit_code == 0
     u = read_run(tmp_path / "later").tape["u"]["elevator"]
-    assert np.abs(u + flight.u[-len(u) :, 0]).max() <= 1e-6  # the pulses have not changed, their meaning has
+    assert (
+        np.abs(u + flight.u[-len(u) :, 0]).max() <= 1e-6
+    )  # the pulses have not changed, their meaning has
 
 
 def test_log_without_the_mode_is_not_taken_for_manual(flight: Flight, tmp_path: Path) -> None:
     path = dataflash(tmp_path / "flight.bin", flight)
     path.write_bytes(path.read_bytes().replace(b"MODE", b"XODE", 1))
-    assert "the log: found no message with the mode, expected" in str(imported(path, tmp_path / "bag").exception)
+    assert "the log: found no message with the mode, expected" in str(
+        imported(path, tmp_path / "bag").exception
+    )
     assert imported(path, tmp_path / "bag", "--servos").exit_code == 0
 
 
-def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, tmp_path: Path) -> None:
-    """The bag has the u of the map of the import: signs and effects by another map would be those of another u."""
+def test_imported_log_is_read_with_the_map_of_its_import_alone(
+    flight: Flight, tmp_path: Path
+) -> None:
+    """The bag has the u of the map of the import: signs and effects by another map would be those
+    of another u.
+    """
     bag = tmp_path / "bag"
     assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
@@ -340,20 +468,35 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, t
     for key, value in (("sign", -1), ("scale", 0.4), ("positive", "nose down")):
         path, inputs = tmp_path / f"{key}.yaml", content["inputs"]
         inputs_by_another = inputs | {"elevator": inputs["elevator"] | {key: value}}
-        path.write_text(yaml.safe_dump(content | {"inputs": inputs_by_another}, sort_keys=False), encoding="utf-8")
-        for arguments in (["check", str(path), "--run", str(bag)], ["identify", "--bridge", str(path), *identify]):
+        path.write_text(
+            yaml.safe_dump(content | {"inputs": inputs_by_another}, sort_keys=False),
+            encoding="utf-8",
+        )
+        for arguments in (
+            ["check", str(path), "--run", str(bag)],
+            ["identify", "--bridge", str(path), *identify],
+        ):
             refused = str(CliRunner().invoke(app, arguments).exception)
             assert f"found inputs.elevator.{key} " in refused
-            assert refused.endswith(f"expected {value}, that of the map ardupilot: import the log again, with --map")
+            assert refused.endswith(
+                f"expected {value}, that of the map ardupilot: import the log again, with --map"
+            )
 
 
-def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(flight: Flight, tmp_path: Path) -> None:
-    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half of the usual thrust."""
+def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
+    flight: Flight, tmp_path: Path
+) -> None:
+    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half
+    of the usual thrust.
+    """
     quadrotor, bag = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml"), tmp_path / "bag"
     log = multicopter(tmp_path / "flight.bin", flight)
     assert imported(log, bag, map_name=quadrotor).exit_code == 0
     tape = read_run(bag).tape
-    assert (tape["y"].names, tape["u"].names) == (("q", "vertical_speed", "p", "r"), ("pitch", "thrust", "roll", "yaw"))
+    assert (tape["y"].names, tape["u"].names) == (
+        ("q", "vertical_speed", "p", "r"),
+        ("pitch", "thrust", "roll", "yaw"),
+    )
     assert len(tape["y"].stamp_ns) == len(flight.y)  # without the time on the ground
     assert tape["y"].values == pytest.approx(flight.y, abs=1e-5)
     assert tape["u"].values == pytest.approx(flight.u, abs=1e-6)
@@ -361,12 +504,16 @@ def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(flight: F
     servos = imported(log, tmp_path / "no", "--servos", map_name=quadrotor)
     assert "--servos: found a multicopter, expected none" in str(servos.exception)
     refused = imported(rover, tmp_path / "no", map_name=quadrotor)
-    assert "found one of a rover, expected one of a plane or a multicopter" in str(refused.exception)
+    assert "found one of a rover, expected one of a plane or a multicopter" in str(
+        refused.exception
+    )
 
 
 def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path: Path) -> None:
     whole = dataflash(tmp_path / "whole.bin", flight)
-    short = dataflash(tmp_path / "short.bin", Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200]))
+    short = dataflash(
+        tmp_path / "short.bin", Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200])
+    )
     (tmp_path / "both.bin").write_bytes(short.read_bytes() + whole.read_bytes())
     both, alone = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
     assert both.kind == "a DataFlash log of ArduPilot, the longest of 2 parts: its clock goes back"
@@ -378,10 +525,17 @@ def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path:
     [[(500, 2**50)], [(500, 1_030_000_000)], [(500, 0), (501, 0)], [(0, 0)]],
     ids=["ahead", "half a minute ahead", "two back", "at the begin"],
 )
-def test_samples_with_damaged_stamps_are_left_out(places: list[tuple[int, int]], flight: Flight, tmp_path: Path) -> None:
+def test_samples_with_damaged_stamps_are_left_out(
+    places: list[tuple[int, int]], flight: Flight, tmp_path: Path
+) -> None:
     flown = flight._replace(stamp_us=[stamp + 1_000_000_000 for stamp in flight.stamp_us])
     rows = list(zip(flown.stamp_us, flown.y[:, [2, 0, 3]], strict=True))
-    write_dataflash(tmp_path / "whole.bin", {"IMU": (("GyrX", "GyrY", "GyrZ"), rows)}, {}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    write_dataflash(
+        tmp_path / "whole.bin",
+        {"IMU": (("GyrX", "GyrY", "GyrZ"), rows)},
+        {},
+        "ArduPlane V4.6.0 (1f2e3d4c)",
+    )
     whole = (tmp_path / "whole.bin").read_bytes()
     for place, stamp in places:
         whole = whole.replace(struct.pack("<Q", flown.stamp_us[place]), struct.pack("<Q", stamp), 1)
@@ -394,27 +548,50 @@ def test_samples_with_damaged_stamps_are_left_out(places: list[tuple[int, int]],
 
 def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    assert imported(dataflash(tmp_path / "flight.bin", flight), bag, "--from", "15", "--until", "25").exit_code == 0
+    assert (
+        imported(
+            dataflash(tmp_path / "flight.bin", flight), bag, "--from", "15", "--until", "25"
+        ).exit_code
+        == 0
+    )
     tape = read_run(bag).tape
     assert tape.time("y")[-1] == pytest.approx(10.0)
     assert tape["pose"].names == ("phi", "theta", "psi")
     assert tape["pose"].values[0] == pytest.approx(np.radians([5.0, -2.0, -10.0]), abs=1e-6)
-    assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
+    assert (
+        yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))[
+            "SERVO2_REVERSED"
+        ]
+        == 1.0
+    )
 
 
-def test_report_of_imported_flight_shows_y_and_u_and_no_error(flight: Flight, tmp_path: Path) -> None:
+def test_report_of_imported_flight_shows_y_and_u_and_no_error(
+    flight: Flight, tmp_path: Path
+) -> None:
     bag = tmp_path / "bag"
     assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
-    result = CliRunner().invoke(app, ["report", str(bag), "--png", str(tmp_path / "flight.png"), "--json"])
+    result = CliRunner().invoke(
+        app, ["report", str(bag), "--png", str(tmp_path / "flight.png"), "--json"]
+    )
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output)
     assert (summary["outcome"], summary["scenario"], summary["errors"]) == ("imported", None, {})
     assert summary["duration"] == pytest.approx(DURATION, abs=2.0 / RATE)
-    for key, values in (("outputs", flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0]), ("inputs", flight.u)):
+    for key, values in (
+        ("outputs", flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0]),
+        ("inputs", flight.u),
+    ):
         rms = [metrics["whole"]["rms"] for metrics in summary[key].values()]
         assert rms == pytest.approx(np.sqrt(np.mean(values**2, axis=0)), rel=1e-3)
     page = (bag / "report.html").read_text(encoding="utf-8")
-    assert re.findall("<h2>([^<]*)</h2>", page) == ["Replay", "Output y", "Input u", "Pose", "Spectrum of u"]
+    assert re.findall("<h2>([^<]*)</h2>", page) == [
+        "Replay",
+        "Output y",
+        "Input u",
+        "Pose",
+        "Spectrum of u",
+    ]
     assert "flight.bin, a DataFlash log of ArduPilot, by the map ardupilot" in page
     shown = View(bag)
     shown.update()
@@ -423,7 +600,10 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(flight: Flight, tm
         (["replay", str(bag)], "found an imported log, expected a flight of the stack"),
         (
             ["report", str(bag), str(bag)],
-            "found an imported log, expected a flight of the stack: a comparison is of tracking errors",
+            (
+                "found an imported log, expected a flight of the stack: a comparison is of "
+                "tracking errors"
+            ),
         ),
     ):
         assert sentence in str(CliRunner().invoke(app, command).exception)
@@ -433,7 +613,8 @@ def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path)
     whole = ulog(tmp_path / "whole.ulg", flight).read_bytes()
     (tmp_path / "cut.ulg").write_bytes(whole[: len(whole) // 2 + 3])  # inside a message
     rates = [
-        len(read_vehicle_log(tmp_path / name).tables["vehicle_angular_velocity"].stamp_ns) for name in ("cut.ulg", "whole.ulg")
+        len(read_vehicle_log(tmp_path / name).tables["vehicle_angular_velocity"].stamp_ns)
+        for name in ("cut.ulg", "whole.ulg")
     ]
     assert rates[0] == pytest.approx(rates[1] / 2, rel=0.02)  # the head has the definitions
 
@@ -461,24 +642,38 @@ def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path:
     assert "1 of 7 and 1: it alone moves" in result.stdout
 
 
-def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(flight: Flight, tmp_path: Path) -> None:
+def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(
+    flight: Flight, tmp_path: Path
+) -> None:
     later = Flight([stamp + 10_000 for stamp in flight.stamp_us], -flight.y, -flight.u)
     path, _ = two_systems(tmp_path, flight, later)
     sentence = "the log: found motion of the systems 7 and 1, expected --system 7 or --system 1"
     assert str(imported(path, tmp_path / "bag").exception) == sentence
-    assert "--system: found 3, expected one of 7 and 1" in str(imported(path, tmp_path / "bag", "--system", "3").exception)
+    assert "--system: found 3, expected one of 7 and 1" in str(
+        imported(path, tmp_path / "bag", "--system", "3").exception
+    )
     assert imported(path, tmp_path / "bag", "--system", "1").exit_code == 0
-    assert "found RC2_REVERSED 1" in str(imported(path, tmp_path / "other", "--system", "7").exception)
+    assert "found RC2_REVERSED 1" in str(
+        imported(path, tmp_path / "other", "--system", "7").exception
+    )
     other = dataflash(tmp_path / "flight.bin", flight)
-    assert "--system: found 1, expected none" in str(imported(other, tmp_path / "no", "--system", "1").exception)
-    assert "--instance: found 'IMU', expected" in str(imported(other, tmp_path / "no", "--instance", "IMU").exception)
+    assert "--system: found 1, expected none" in str(
+        imported(other, tmp_path / "no", "--system", "1").exception
+    )
+    assert "--instance: found 'IMU', expected" in str(
+        imported(other, tmp_path / "no", "--instance", "IMU").exception
+    )
     assert "--instance IMU: found 3, expected one of 0" in str(
         imported(other, tmp_path / "no", "--instance", "IMU=3").exception
     )
 
 
-def arrivals(path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None) -> Path:
-    """A tlog with other times of arrival, us; with `copies` a second link brings each message again at its own time."""
+def arrivals(
+    path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None
+) -> Path:
+    """A tlog with other times of arrival, us; with `copies` a second link brings each message again
+    at its own time.
+    """
     packets: list[tuple[int, bytes]] = []
     content = path.read_bytes()
     start = 0
@@ -499,36 +694,60 @@ def arrivals(path: Path, arrival: Callable[[int], int], *, copies: Callable[[int
         (lambda stamp: (stamp // 500_000 + 1) * 500_000, None),
         (lambda stamp: stamp, lambda stamp: stamp + 250_000),
         (lambda stamp: stamp, lambda stamp: stamp + 3_000_000),
-        (lambda stamp: stamp + 40_000 * (stamp // 1_000_000 % 3), lambda stamp: (stamp // 300_000 + 1) * 300_000),
+        (
+            lambda stamp: stamp + 40_000 * (stamp // 1_000_000 % 3),
+            lambda stamp: (stamp // 300_000 + 1) * 300_000,
+        ),
     ],
     ids=["bunched", "second link", "slow second link", "both links uneven"],
 )
 def test_messages_of_a_tlog_have_the_time_of_their_autopilot(
-    arrival: Callable[[int], int], copies: Callable[[int], int] | None, flight: Flight, tmp_path: Path
+    arrival: Callable[[int], int],
+    copies: Callable[[int], int] | None,
+    flight: Flight,
+    tmp_path: Path,
 ) -> None:
     bag = tmp_path / "bag"
-    assert imported(arrivals(tlog(tmp_path / "a.tlog", flight), arrival, copies=copies), bag).exit_code == 0
+    assert (
+        imported(arrivals(tlog(tmp_path / "a.tlog", flight), arrival, copies=copies), bag).exit_code
+        == 0
+    )
     tape = read_run(bag).tape
     assert np.diff(tape["y"].stamp_ns) == pytest.approx(1e9 / RATE)
     assert len(tape["y"].stamp_ns) == pytest.approx(len(flight.y), abs=1)
     response = recorded_response(bag, OUTPUTS, INPUTS)
     deviations = response.Omega_deviation.diagonal()
-    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == pytest.approx(np.zeros(4), abs=3.0)
+    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == pytest.approx(
+        np.zeros(4), abs=3.0
+    )
 
 
 def sensors(
-    path: Path, flight: Flight, name: str, parameters: Mapping[str, float], *instances: FloatArray, **flags: Any
+    path: Path,
+    flight: Flight,
+    name: str,
+    parameters: Mapping[str, float],
+    *instances: FloatArray,
+    **flags: Any,
 ) -> Path:
-    """A log of ArduPlane with several sensors: values by instance, shape (N, fields), and flags by field, a value for each."""
+    """A log of ArduPlane with several sensors: values by instance, shape (N, fields), and flags by
+    field, a value for each.
+    """
     fields = {"ARSP": ("Airspeed",), "IMU": ("GyrX", "GyrY", "GyrZ")}[name]
     rows = []
     for number, values in enumerate(instances):
         flag_values = [flag[number] for flag in flags.values()]
-        rows += [(stamp, (number, *row, *flag_values)) for stamp, row in zip(flight.stamp_us, values, strict=True)]
+        rows += [
+            (stamp, (number, *row, *flag_values))
+            for stamp, row in zip(flight.stamp_us, values, strict=True)
+        ]
     messages: dict[str, tuple[tuple[str, ...], Any]] = {
         "MODE": (("Mode", "ModeNum"), [(1, (0, 0))]),
         "IMU": (("GyrX", "GyrY", "GyrZ"), stamped(flight, flight.y[:, [2, 0, 3]])),
-        "CTUN": (("Aspd", "E2T"), stamped(flight, np.column_stack([flight.y[:, 1] + SPEED, np.ones(len(flight.y))]))),
+        "CTUN": (
+            ("Aspd", "E2T"),
+            stamped(flight, np.column_stack([flight.y[:, 1] + SPEED, np.ones(len(flight.y))])),
+        ),
         "RCIN": (("C1", "C2", "C3", "C4"), stamped(flight, sticks(flight.u))),
     } | {name: (("I", *fields, *flags), rows)}
     write_dataflash(path, messages, {**PARAMETERS, **parameters}, "ArduPlane V4.6.0 (1f2e3d4c)")
@@ -557,36 +776,71 @@ def test_airspeed_is_that_of_the_sensor_that_measures(
     assert log.tables["ARSP"].fields["Airspeed"] == pytest.approx(flight.y[:, 1] + SPEED, abs=1e-4)
 
 
-def test_airspeed_of_a_primary_that_changes_in_flight_is_that_of_each_instant(flight: Flight, tmp_path: Path) -> None:
+def test_airspeed_of_a_primary_that_changes_in_flight_is_that_of_each_instant(
+    flight: Flight, tmp_path: Path
+) -> None:
     half = len(flight.y) // 2
     dies = np.vstack([flight.y[:half, [1]] + SPEED, DEAD[half:]])
-    path = sensors(tmp_path / "a.bin", flight, "ARSP", {}, dies, flight.y[:, [1]] + SPEED, H=(1, 1), U=(1, 1), Pri=(0, 0))
-    assert "found ARSP of 0 and 1, which differ, expected --instance ARSP=0 or --instance ARSP=1" in str(
-        imported(path, tmp_path / "no").exception
+    path = sensors(
+        tmp_path / "a.bin",
+        flight,
+        "ARSP",
+        {},
+        dies,
+        flight.y[:, [1]] + SPEED,
+        H=(1, 1),
+        U=(1, 1),
+        Pri=(0, 0),
+    )
+    assert (
+        "found ARSP of 0 and 1, which differ, expected --instance ARSP=0 or --instance ARSP=1"
+        in str(imported(path, tmp_path / "no").exception)
     )
     assert imported(path, tmp_path / "bag", "--instance", "ARSP=1").exit_code == 0
     rows = [
-        (stamp, (number, dies[k, 0] if number == 0 else flight.y[k, 1] + SPEED, number or k < half, 1, int(k >= half)))
+        (
+            stamp,
+            (
+                number,
+                dies[k, 0] if number == 0 else flight.y[k, 1] + SPEED,
+                number or k < half,
+                1,
+                int(k >= half),
+            ),
+        )
         for k, stamp in enumerate(flight.stamp_us)
         for number in (0, 1)
     ]
-    write_dataflash(path, {"ARSP": (("I", "Airspeed", "H", "U", "Pri"), rows)}, {}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    write_dataflash(
+        path,
+        {"ARSP": (("I", "Airspeed", "H", "U", "Pri"), rows)},
+        {},
+        "ArduPlane V4.6.0 (1f2e3d4c)",
+    )
     log = read_vehicle_log(path)
     assert log.taken == (("ARSP", "0 and 1 of 0 and 1: the primary"),)
     assert log.tables["ARSP"].fields["Airspeed"] == pytest.approx(flight.y[:, 1] + SPEED, abs=1e-4)
 
 
-def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(flight: Flight, tmp_path: Path) -> None:
+def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(
+    flight: Flight, tmp_path: Path
+) -> None:
     rates = flight.y[:, [2, 0, 3]]
-    not_used = sensors(tmp_path / "a.bin", flight, "IMU", {"INS_USE": 0.0, "INS_USE2": 1.0}, -rates, rates)
+    not_used = sensors(
+        tmp_path / "a.bin", flight, "IMU", {"INS_USE": 0.0, "INS_USE2": 1.0}, -rates, rates
+    )
     log = read_vehicle_log(not_used)
     assert log.taken == (("IMU", "1 of 0 and 1: it alone is used and moves"),)
     assert log.tables["IMU"].fields["GyrY"] == pytest.approx(rates[:, 1], abs=1e-6)
     turned = sensors(tmp_path / "b.bin", flight, "IMU", {}, rates, -rates)
-    with pytest.raises(ParameterError, match="found IMU of 0 and 1, which differ, expected --instance IMU=0 or"):
+    with pytest.raises(
+        ParameterError, match="found IMU of 0 and 1, which differ, expected --instance IMU=0 or"
+    ):
         read_vehicle_log(turned)
     equal = sensors(tmp_path / "c.bin", flight, "IMU", {}, rates, rates + 0.001)
-    assert read_vehicle_log(equal).taken == (("IMU", "0 of 0 and 1: the first of those that agree"),)
+    assert read_vehicle_log(equal).taken == (
+        ("IMU", "0 of 0 and 1: the first of those that agree"),
+    )
 
 
 def test_vtol_of_px4_is_flown_by_its_surfaces_as_a_plane(flight: Flight, tmp_path: Path) -> None:
@@ -596,17 +850,28 @@ def test_vtol_of_px4_is_flown_by_its_surfaces_as_a_plane(flight: Flight, tmp_pat
     assert "1 of 0 and 1: the surfaces of a VTOL" in " ".join(result.stdout.split())
     tape = read_run(bag).tape
     half = len(flight.u) // 2  # the first half is flown on the rotors
-    assert tape["u"].values == pytest.approx(flight.u[half:] - np.median(flight.u[half:], axis=0), abs=1e-5)
+    assert tape["u"].values == pytest.approx(
+        flight.u[half:] - np.median(flight.u[half:], axis=0), abs=1e-5
+    )
 
 
-def test_log_of_the_other_kind_of_vehicle_than_the_map_is_refused(flight: Flight, tmp_path: Path) -> None:
+def test_log_of_the_other_kind_of_vehicle_than_the_map_is_refused(
+    flight: Flight, tmp_path: Path
+) -> None:
     path = multicopter(tmp_path / "copter.bin", flight)
-    sentence = "the log: found one of a multicopter, expected one of a plane as in the map ardupilot, or another --map"
+    sentence = (
+        "the log: found one of a multicopter, expected one of a plane as in the map "
+        "ardupilot, or another --map"
+    )
     assert str(imported(path, tmp_path / "no").exception) == sentence
 
 
-def test_log_without_the_gyroscope_names_the_mask_of_the_log(flight: Flight, tmp_path: Path) -> None:
-    path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"LOG_BITMASK": 65407.0})
+def test_log_without_the_gyroscope_names_the_mask_of_the_log(
+    flight: Flight, tmp_path: Path
+) -> None:
+    path = dataflash(
+        tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"LOG_BITMASK": 65407.0}
+    )
     path.write_bytes(path.read_bytes().replace(b"IMU\0", b"XMU\0", 1))
     sentence = "outputs.q: found no q in the log, expected IMU: LOG_BITMASK is 65407"
     assert str(imported(path, tmp_path / "no").exception) == sentence
@@ -624,14 +889,19 @@ def test_what_the_log_says_stands_beside_what_the_map_says(flight: Flight, tmp_p
     refused = imported(path, tmp_path / "no")
     assert refused.exception
     table = dict(re.findall(r"(\w+) +(.*?) *\n", refused.stdout))
-    assert (table["RC1_MIN"].split(), table["RC2_MIN"].split()) == (["1100", "1000"], ["1000", "1000"])
+    assert (table["RC1_MIN"].split(), table["RC2_MIN"].split()) == (
+        ["1100", "1000"],
+        ["1000", "1000"],
+    )
     assert table["vehicle"].split() == ["plane", "plane"]
 
 
 def test_loss_of_airspeed_is_told_with_the_instant(flight: Flight, tmp_path: Path) -> None:
     lost = flight.y.copy()
     lost[len(lost) // 2 :, 1] = np.nan
-    result = imported(ulog(tmp_path / "a.ulg", flight._replace(y=lost)), tmp_path / "bag", map_name="px4")
+    result = imported(
+        ulog(tmp_path / "a.ulg", flight._replace(y=lost)), tmp_path / "bag", map_name="px4"
+    )
     assert result.exit_code == 0
     sentence = "warning: no airspeed or thrust at 1000 of 2000 samples, from 20.0 s of the log on"
     assert sentence in result.stderr
@@ -652,7 +922,9 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
         ("flight.ulg", "ardupilot", "inputs.elevator: found no joy.axes"),
         ("absent.bin", "ardupilot", "no such file"),
     ):
-        assert sentence in str(imported(tmp_path / name, tmp_path / "no", map_name=map_name).exception)
+        assert sentence in str(
+            imported(tmp_path / name, tmp_path / "no", map_name=map_name).exception
+        )
 
 
 def test_damaged_bytes_cost_what_they_hold_and_print_nothing(
@@ -663,7 +935,9 @@ def test_damaged_bytes_cost_what_they_hold_and_print_nothing(
     content = bytearray(path.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
     path.write_bytes(content)
-    assert 0 < whole - sum(len(table.stamp_ns) for table in read_vehicle_log(path).tables.values()) < 5
+    assert (
+        0 < whole - sum(len(table.stamp_ns) for table in read_vehicle_log(path).tables.values()) < 5
+    )
     path = ulog(tmp_path / "flight.ulg", flight)
     path.write_bytes(path.read_bytes().replace(b"float FW_AIRSPD_TRIM", b"fl0at FW_AIRSPD_TRIM"))
     assert read_vehicle_log(path).parameters == {}

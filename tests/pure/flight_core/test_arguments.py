@@ -35,7 +35,9 @@ def test_other_values_are_no_number(value: object) -> None:
 
 @pytest.mark.parametrize("value", [2.5, 0, "3", True])
 def test_a_count_is_an_integer(value: object) -> None:
-    with pytest.raises(ParameterError, match=r"^samples: found .*, expected an integer of 1 or more$"):
+    with pytest.raises(
+        ParameterError, match=r"^samples: found .*, expected an integer of 1 or more$"
+    ):
         as_count(value, "samples", 1)
 
 
@@ -46,7 +48,11 @@ def test_a_list_of_numbers_has_numbers(value: object) -> None:
 
 
 def test_paths_are_texts_or_path_like() -> None:
-    assert as_path("runs/latest", "run", "") == as_path(Path("runs/latest"), "run", "") == Path("runs/latest")
+    assert (
+        as_path("runs/latest", "run", "")
+        == as_path(Path("runs/latest"), "run", "")
+        == Path("runs/latest")
+    )
 
 
 @pytest.mark.parametrize("value", [None, 3, b"runs", "", ["runs"]])

@@ -37,7 +37,9 @@ def exact_sine(x: float) -> float:
     """The Taylor series in 80 decimal digits."""
     with localcontext() as context:
         context.prec = 80
-        angle = Decimal(x) - 2 * round(Fraction(x) / (2 * PI)) * Decimal(PI.numerator) / Decimal(PI.denominator)
+        angle = Decimal(x) - 2 * round(Fraction(x) / (2 * PI)) * Decimal(PI.numerator) / Decimal(
+            PI.denominator
+        )
         term = total = angle
         for k in range(1, 40):
             term *= -angle * angle / (2 * k * (2 * k + 1))
@@ -77,7 +79,10 @@ def test_sine_of_any_number_is_bounded() -> None:
 
 def test_parts_of_pi() -> None:
     assert abs(Fraction(PI_HIGH) + Fraction(PI_LOW) - PI) < Fraction(2) ** -81
-    assert all((Fraction(k) * Fraction(PI_HIGH)) == Fraction(k * PI_HIGH) for k in (1, 319, 318309, 2**23 - 1))
+    assert all(
+        (Fraction(k) * Fraction(PI_HIGH)) == Fraction(k * PI_HIGH)
+        for k in (1, 319, 318309, 2**23 - 1)
+    )
 
 
 @given(arrays(np.float64, (4, 4), elements=st.floats(-1.0, 1.0)))
@@ -91,13 +96,18 @@ def test_inverse_pivots() -> None:
 
 
 def test_jax_is_near() -> None:
-    """XLA may contract products and sums, so the bound is a rounding per term, and not every bit."""
+    """XLA may contract products and sums, so the bound is a rounding per term, and not every
+    bit.
+    """
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
         for _ in range(20):
             matrix, vector = rng.normal(size=(8, 8)), rng.normal(size=8)
             scale = np.abs(matrix) @ np.abs(vector)
-            assert (np.abs(jax.jit(product)(matrix, vector) - product(matrix, vector)) <= 8 * 2.0**-53 * scale).all()
+            assert (
+                np.abs(jax.jit(product)(matrix, vector) - product(matrix, vector))
+                <= 8 * 2.0**-53 * scale
+            ).all()
             x = rng.normal(size=50) * 100.0
             assert np.abs(jax.jit(sine)(x) - sine(x)).max() < 1e-15
 
@@ -107,5 +117,7 @@ def test_log_of_another_arithmetic_refused() -> None:
     stored = StoredFile("osprey_servo.yaml", scenario_yaml(scenario).encode())
     tape = simulate(scenario)
     assert replay(RecordedRun(tape, stored, provenance())).equal()
-    with pytest.raises(ParameterError, match="arithmetic: found 7, expected 1: a later version recorded the log"):
+    with pytest.raises(
+        ParameterError, match="arithmetic: found 7, expected 1: a later version recorded the log"
+    ):
         replay(RecordedRun(tape, stored, {"rise_di_versions": {"arithmetic": "7"}}))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments in which no node can start: each is one sentence with the mend, from every command and from a node."""
+"""Environments in which no node can start: each is one sentence with the mend, from every command
+and from a node.
+"""
 
 import resource
 import shutil
@@ -30,7 +32,13 @@ STARTS = {
 @pytest.fixture(autouse=True)
 def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A right environment."""
-    for name in ("ROS_LOG_DIR", "ROS_HOME", "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", environment.PROFILE_VARIABLE):
+    for name in (
+        "ROS_LOG_DIR",
+        "ROS_HOME",
+        "ROS_DOMAIN_ID",
+        "RMW_IMPLEMENTATION",
+        environment.PROFILE_VARIABLE,
+    ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
 
@@ -44,31 +52,53 @@ def test_right_environment_passes_in_a_millisecond() -> None:
     ("variables", "sentence"),
     [
         ({"HOME": ""}, r"ROS_LOG_DIR: found none and no HOME, expected .* ROS_LOG_DIR=FOLDER"),
-        ({"ROS_LOG_DIR": "/proc/nope"}, r"/proc/nope: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER"),
+        (
+            {"ROS_LOG_DIR": "/proc/nope"},
+            r"/proc/nope: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER",
+        ),
         ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID: found '233', expected a number from 0 to 232"),
-        ({"RCUTILS_LOGGING_USE_STDOUT": "5"}, r"^RCUTILS_LOGGING_USE_STDOUT: found '5', expected 0, 1, or none$"),
-        ({"RMW_IMPLEMENTATION": "rmw_nope"}, r"RMW_IMPLEMENTATION: found 'rmw_nope', expected one of .*rmw_fastrtps_cpp"),
+        (
+            {"RCUTILS_LOGGING_USE_STDOUT": "5"},
+            r"^RCUTILS_LOGGING_USE_STDOUT: found '5', expected 0, 1, or none$",
+        ),
+        (
+            {"RMW_IMPLEMENTATION": "rmw_nope"},
+            r"RMW_IMPLEMENTATION: found 'rmw_nope', expected one of .*rmw_fastrtps_cpp",
+        ),
     ],
 )
-def test_variable_without_use_is_named(variables: dict[str, str], sentence: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variable_without_use_is_named(
+    variables: dict[str, str], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(ParameterError, match=sentence):
         require_ros_environment()
 
 
-@pytest.mark.parametrize("date", ["1969-12-31T23:59:59", "2038-01-18T03:14:08", "2038-01-20T00:00:00", "2107-01-01T00:00:00"])
-def test_clock_beyond_the_stamps_of_ros_is_named(date: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "date",
+    ["1969-12-31T23:59:59", "2038-01-18T03:14:08", "2038-01-20T00:00:00", "2107-01-01T00:00:00"],
+)
+def test_clock_beyond_the_stamps_of_ros_is_named(
+    date: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """2^31 s is 2038-01-19T03:14:08 UTC. The middleware reports that it "cannot publish data"."""
     at = datetime.fromisoformat(f"{date}+00:00").timestamp()
     monkeypatch.setattr(time, "time", lambda: at)
-    with pytest.raises(ParameterError, match=rf"^system clock: found {date[:10]} .* to 2038-01-18 03:14 UTC.* --in-process$"):
+    with pytest.raises(
+        ParameterError,
+        match=rf"^system clock: found {date[:10]} .* to 2038-01-18 03:14 UTC.* --in-process$",
+    ):
         require_ros_environment()
 
 
 def test_limit_of_open_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (12, 4096))
-    with pytest.raises(ParameterError, match=r"^ulimit -n: found 12 open files, expected 128 or more: ulimit -n 1024$"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^ulimit -n: found 12 open files, expected 128 or more: ulimit -n 1024$",
+    ):
         require_ros_environment()
 
 
@@ -83,12 +113,17 @@ def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:
         (["--net"], "true", "error: 127.0.0.1: cannot be reached"),
         (
             ["--mount"],
-            "mount -t tmpfs -o size=1m tmpfs /dev/shm && ! dd if=/dev/zero of=/dev/shm/x bs=64k 2> /dev/null",
+            (
+                "mount -t tmpfs -o size=1m tmpfs /dev/shm && ! dd if=/dev/zero of=/dev/shm/x "
+                "bs=64k 2> /dev/null"
+            ),
             "error: /dev/shm: found 0 bytes free",
         ),
     ],
 )
-def test_host_that_cannot_fly_is_told(options: list[str], before: str, sentence: str, tmp_path: Path) -> None:
+def test_host_that_cannot_fly_is_told(
+    options: list[str], before: str, sentence: str, tmp_path: Path
+) -> None:
     pytest.importorskip("rclpy")
     if (unshare := shutil.which("unshare")) is None:
         pytest.skip("needs unshare")

@@ -47,7 +47,9 @@ def test_no_module_writes_by_itself() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 given = [value.value for value in node.args if isinstance(value, ast.Constant)]
-                opens = node.func.attr in {"open", "fdopen"} and bool({"w", "wb", "x", "xb", "a", "ab"} & set(map(str, given)))
+                opens = node.func.attr in {"open", "fdopen"} and bool(
+                    {"w", "wb", "x", "xb", "a", "ab"} & set(map(str, given))
+                )
                 if opens or node.func.attr in {"write_text", "write_bytes"}:
                     writers.add(str(path.relative_to(SOURCES)))
     assert writers == set(OWN_WRITERS)
@@ -114,7 +116,9 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """A full disk at the n-th write of a report: each file has the old or the new content, and the outcome survives."""
+    """A full disk at the n-th write of a report: each file has the old or the new content, and the
+    outcome survives.
+    """
     write_report(run, "completed")
     (run / REPORT).write_text("an older page", encoding="utf-8")
     before = files_in(run)
@@ -157,7 +161,9 @@ def test_report_of_links_writes_nothing_elsewhere(run: Path, tmp_path: Path) -> 
     assert files_in(outside) == {"precious": b"precious"}
 
 
-def test_report_of_read_only_archive_goes_to_output(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_of_read_only_archive_goes_to_output(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = files_in(run)
     report([run], output=tmp_path / "pages" / "today")
     assert files_in(run) == before
@@ -167,14 +173,18 @@ def test_report_of_read_only_archive_goes_to_output(run: Path, tmp_path: Path, c
         report([run, run], output=tmp_path / "pages")
 
 
-def test_scenario_parsed_before_any_file_written(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenario_parsed_before_any_file_written(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("osprey_gust.yaml", SUMMARY, REPORT):
         (run / name).unlink(missing_ok=True)
     log = next(run.glob("*.mcap"))
     other = shutil.copy(log, run.parent / "log")
     content = Path(other).read_bytes()
     assert content.count(b"/**/controller:") > 0
-    log.write_bytes(content.replace(b"/**/controller:", b"/**/controllex:"))  # in its attachments, which are not compressed
+    log.write_bytes(
+        content.replace(b"/**/controller:", b"/**/controllex:")
+    )  # in its attachments, which are not compressed
     before = set(files_in(run))
     with pytest.raises(ParameterError):
         write_report(run)

@@ -33,7 +33,8 @@ class Installed(NamedTuple):
 @pytest.mark.parametrize(
     ("origin", "command"),
     [  # PEP 610
-        ('{"url": "file:///home/user/rise-di", "dir_info": {}}', 'pip install "rise-di[campaign] @ file:///home/user/rise-di"'),
+        ('{"url": "file:///home/user/rise-di", "dir_info": {}}',
+        'pip install "rise-di[campaign] @ file:///home/user/rise-di"'),
         ('{"url": "file:///a/rise_di-0.4.0-py3-none-any.whl", "archive_info": {}}',
          'pip install "rise-di[campaign] @ file:///a/rise_di-0.4.0-py3-none-any.whl"'),
         ('{"url": "https://example.org/rise-di.git", "vcs_info": {"vcs": "git", "commit_id": "a"}}',
@@ -44,7 +45,9 @@ class Installed(NamedTuple):
 def test_installed_stack_names_what_it_came_from(
     origin: str | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not a package of an index from which it did not come: a foreign package may have that name."""
+    """Not a package of an index from which it did not come: a foreign package may have that
+    name.
+    """
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))
     assert missing("jax") == f"found no Python package jax, expected it: {command}"
@@ -60,7 +63,13 @@ def test_workspace_names_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 
 def test_targets_and_extras_exist() -> None:
-    targets = re.findall(r"^([\w -]+):", (REPOSITORY / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    assert {target.removeprefix("make ") for target in TARGETS.values()} <= {word for line in targets for word in line.split()}
-    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    targets = re.findall(
+        r"^([\w -]+):", (REPOSITORY / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert {target.removeprefix("make ") for target in TARGETS.values()} <= {
+        word for line in targets for word in line.split()
+    }
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
     assert {*TARGETS} == {*EXTRAS.values()} == extras.keys() - {"all"}

@@ -5,13 +5,18 @@
 import subprocess
 import sys
 
-ALLOCATE = "from flight_core.memory import limit_memory; limit_memory(); print(len(bytearray({size})))"
+ALLOCATE = (
+    "from flight_core.memory import limit_memory; limit_memory(); print(len(bytearray({size})))"
+)
 
 
 def output(size: int, within: str = "true") -> str:
     command = f'{within}; exec "$0" -c "$1"'
     return subprocess.run(
-        ["/bin/sh", "-c", command, sys.executable, ALLOCATE.format(size=size)], capture_output=True, text=True, check=False
+        ["/bin/sh", "-c", command, sys.executable, ALLOCATE.format(size=size)],
+        capture_output=True,
+        text=True,
+        check=False,
     ).stderr
 
 

@@ -27,30 +27,73 @@ from rise_di_controller import laws
 BAD = {
     ("k_g: 1.0", "k_g: -1.0"): "controller.k_g: found -1.0, expected greater than 0",
     ("k_g: 1.0", "k_g: true"): "controller.k_g: found True, expected a number",
-    ("    beta:", "    betta:"): "controller.betta: unknown key, expected beta perhaps, or another of D, Lambda,",
-    ("    Lambda: [5.0, 5.0, 3.0, 0.5]", "    #"): "controller.Lambda: missing, expected the diagonal of Lambda (4), 1/s",
+    (
+        "    beta:",
+        "    betta:",
+    ): "controller.betta: unknown key, expected beta perhaps, or another of D, Lambda,",
+    (
+        "    Lambda: [5.0, 5.0, 3.0, 0.5]",
+        "    #",
+    ): "controller.Lambda: missing, expected the diagonal of Lambda (4), 1/s",
     ("D: [1, 1, 1, 1]", "D: [1, 1, 2, 1]"): "controller.D[2]: found 2, expected 1 or -1",
-    ("D: [1, 1, 1, 1]", "D: [1, 1, 1]"): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
+    (
+        "D: [1, 1, 1, 1]",
+        "D: [1, 1, 1]",
+    ): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
     ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
-    ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, .nan, 7.0]"): "controller.k_d[1]: found nan, expected a finite number",
-    ("damping: [0.9, 1.0,", "damping: [0.9, -1.0,"): "second_order.damping: found an eigenvalue of A_m with real part",
+    (
+        "k_d: [16.0, 16.0, 7.0]",
+        "k_d: [16.0, .nan, 7.0]",
+    ): "controller.k_d[1]: found nan, expected a finite number",
+    (
+        "damping: [0.9, 1.0,",
+        "damping: [0.9, -1.0,",
+    ): "second_order.damping: found an eigenvalue of A_m with real part",
     ("rate: 100.0                # Hz\n    outputs", "rate: 300.0\n    outputs"): (
-        "controller.rate: found 300 Hz, expected a rate whose period is a whole number of nanoseconds"
+        "controller.rate: found 300 Hz, expected a rate whose period is a whole number of "
+        "nanoseconds"
     ),
     ("rate: 500.0                # Hz, y and truth", "rate: 250.0"): (
         "aircraft.rate: found 250 Hz, expected a whole multiple of controller.rate (100 Hz)"
     ),
-    ("step: 0.002", "step: 0.003"): "aircraft.step: found 0.003 s, expected a whole fraction of 1 / rate (0.002 s)",
+    (
+        "step: 0.002",
+        "step: 0.003",
+    ): "aircraft.step: found 0.003 s, expected a whole fraction of 1 / rate (0.002 s)",
     ("airframe: osprey", "airframe: ospray"): "aircraft.airframe: found 'ospray', expected one of",
-    ("rudder, thrust]", "rudder, flaps]"): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
-    ("sign: auto", "sign: smooth"): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
-    ("vertical: {start", "upward: {start"): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
-    ("stop: [4.0, 8.0", "stop: [1.0, 8.0"): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
-    ("bank_rate: p", "bank_rate: roll"): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
-    ("/**/recorder", "/**/recoder"): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
-    ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no parameters under",
+    (
+        "rudder, thrust]",
+        "rudder, flaps]",
+    ): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
+    (
+        "sign: auto",
+        "sign: smooth",
+    ): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
+    (
+        "vertical: {start",
+        "upward: {start",
+    ): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
+    (
+        "stop: [4.0, 8.0",
+        "stop: [1.0, 8.0",
+    ): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
+    (
+        "bank_rate: p",
+        "bank_rate: roll",
+    ): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
+    (
+        "/**/recorder",
+        "/**/recoder",
+    ): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
+    (
+        "/**/recorder:\n  ros__parameters:",
+        "/**/recorder:\n  parameters:",
+    ): "recorder: found no parameters under",
     ("duration: 60.0", "duration: 060"): "flight.duration: found '060', expected a number",
-    ("duration: 60.0", "duration: 60.0\n    duration: 50.0"): "bad.yaml: not valid YAML (found the key duration twice",
+    (
+        "duration: 60.0",
+        "duration: 60.0\n    duration: 50.0",
+    ): "bad.yaml: not valid YAML (found the key duration twice",
     ("duration: 60.0", "duration: 60.0\n    2: 60.0"): "flight: found the key 2, expected a name",
     ("step: 0.002", "sensors: {seed: 340282366920938463463374607431768211456}\n    step: 0.002"): (
         "aircraft.sensors.seed: found 340282366920938463463374607431768211456, expected less than"
@@ -62,8 +105,12 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD])
-def test_a_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD]
+)
+def test_a_bad_scenario_is_one_sentence(
+    change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
     assert text.count(change[0]) >= 1, f"the scenario no longer holds {change[0]!r}"
     bad = tmp_path / "bad.yaml"
@@ -76,35 +123,66 @@ def test_a_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, 
 
 
 # Section of the aircraft -> its values and the sentence of the error, a pattern.
-GUST, STEP, SINE = {"start": 0.0, "speed": 1.0, "length": 9.0}, {"start": 0.0, "value": 1.0, "rise": 0.0}, {"amplitude": 1.0}
+GUST, STEP, SINE = (
+    {"start": 0.0, "speed": 1.0, "length": 9.0},
+    {"start": 0.0, "value": 1.0, "rise": 0.0},
+    {"amplitude": 1.0},
+)
 AIR = {"wind": 7.7, "sigma": 1.0}
 PRODUCT = {"into": "p", "product": ["q", "p"], "gain": 1.0}
 FOUR = "found 1 values, expected 4, one for each of"
 BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
     "actuators": [
         ({"lag": [0.02]}, rf"\.lag: {FOUR} elevator, thrust, aileron, rudder"),
-        ({"upper": [-0.1, 1.0, 1.0, 1.0]}, r"\.upper\[0\]: found -0.1, expected greater than or equal to 0"),
-        ({"weak_effect": [3.0] * 4}, r"\.weak_effect\[0\]: found 3.0, expected less than or equal to 2"),
+        (
+            {"upper": [-0.1, 1.0, 1.0, 1.0]},
+            r"\.upper\[0\]: found -0.1, expected greater than or equal to 0",
+        ),
+        (
+            {"weak_effect": [3.0] * 4},
+            r"\.weak_effect\[0\]: found 3.0, expected less than or equal to 2",
+        ),
     ],
     "sensors": [
-        ({"delay": 0.003}, r"\.delay: found 0\.003 s, expected a whole multiple of 1 / rate \(0\.002 s\)"),
+        (
+            {"delay": 0.003},
+            r"\.delay: found 0\.003 s, expected a whole multiple of 1 / rate \(0\.002 s\)",
+        ),
         ({"seed": 1.5}, r"\.seed: found 1.5, expected an? .*integer"),
-        ({"quantisation": [-0.1] * 4}, r"\.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
+        (
+            {"quantisation": [-0.1] * 4},
+            r"\.quantisation\[0\]: found -0.1, expected greater than or equal to 0",
+        ),
     ],
     "uncertainty": [
         ({"wind": "none"}, r"\.wind: found 'none', expected"),
-        ({"entries": ["A[q,q]"] * 2, "parts": [0.1, 0.6]}, r"\.entries: found A\[q,q\], A\[q,q\], expected different ones"),
+        (
+            {"entries": ["A[q,q]"] * 2, "parts": [0.1, 0.6]},
+            r"\.entries: found A\[q,q\], A\[q,q\], expected different ones",
+        ),
     ],
     "turbulence": [
-        ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),
-        ({"altitude": 100.0}, r"\.wind: found none, expected a value at 100 m: it acts below 609\.6 m"),
-        (AIR | {"altitude": 100.0}, r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m"),
+        (
+            {"altitude": 3.0, "wind": 7.7},
+            r"\.altitude: found 3\.0, expected greater than or equal to 3\.048",
+        ),
+        (
+            {"altitude": 100.0},
+            r"\.wind: found none, expected a value at 100 m: it acts below 609\.6 m",
+        ),
+        (
+            AIR | {"altitude": 100.0},
+            r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m",
+        ),
     ],
     "gusts": [
         # 2 H / V0 at 25 m/s
         (
             {"vertical": GUST | {"length": 30.0, "every": 2.3}},
-            r"\.vertical\.every: found 2\.3 s, expected at least 2\.4 s, which the gust takes at 25 m/s",
+            (
+                r"\.vertical\.every: found 2\.3 s, expected at least 2\.4 s, which the gust takes "
+                r"at 25 m/s"
+            ),
         ),
     ],
     "bias": [
@@ -117,8 +195,13 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
 }
 
 
-@pytest.mark.parametrize(("section", "values", "sentence"), [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows])
-def test_invalid_section_of_aircraft_refused_by_name(section: str, values: Any, sentence: str) -> None:
+@pytest.mark.parametrize(
+    ("section", "values", "sentence"),
+    [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows],
+)
+def test_invalid_section_of_aircraft_refused_by_name(
+    section: str, values: Any, sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=rf"^aircraft\.{section}{sentence}"):
         aircraft_parameters(rate=500.0, **{section: values})
 
@@ -126,7 +209,11 @@ def test_invalid_section_of_aircraft_refused_by_name(section: str, values: Any, 
 @pytest.mark.parametrize(
     ("section", "values", "sentence"),
     [
-        ("inertial_coupling", 0.5, r"found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling"),
+        (
+            "inertial_coupling",
+            0.5,
+            r"found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling",
+        ),
     ],
 )
 def test_section_without_data_in_airframe_refused(section: str, values: Any, sentence: str) -> None:
@@ -137,21 +224,41 @@ def test_section_without_data_in_airframe_refused(section: str, values: Any, sen
 @pytest.mark.parametrize(
     ("section", "values", "sentence"),
     [
-        ("gusts", {"up": {"q": 1.0}}, r"\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"),
-        ("inertial_coupling", [PRODUCT | {"product": ["q"]}], r"\[0\]\.product: found 1 states, expected two of them"),
+        (
+            "gusts",
+            {"up": {"q": 1.0}},
+            r"\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert",
+        ),
+        (
+            "inertial_coupling",
+            [PRODUCT | {"product": ["q"]}],
+            r"\[0\]\.product: found 1 states, expected two of them",
+        ),
     ],
 )
-def test_invalid_section_of_airframe_refused_by_name(section: str, values: Any, sentence: str) -> None:
+def test_invalid_section_of_airframe_refused_by_name(
+    section: str, values: Any, sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=rf"^airframe\.{section}{sentence}"):
-        Airframe.validate_mapping(load_airframe("osprey").model_dump() | {section: values}, "airframe")
+        Airframe.validate_mapping(
+            load_airframe("osprey").model_dump() | {section: values}, "airframe"
+        )
 
 
 def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
-    assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).rise_di().Lambda == (5.0, 5.0, 3.0, 1.0)
+    assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).rise_di().Lambda == (
+        5.0,
+        5.0,
+        3.0,
+        1.0,
+    )
 
 
 def test_error_for_unknown_scenario_lists_scenarios() -> None:
-    with pytest.raises(ParameterError, match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path"):
+    with pytest.raises(
+        ParameterError,
+        match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path",
+    ):
         find_scenario("osprey")
 
 
@@ -172,7 +279,10 @@ def test_bad_airframe_file_is_one_sentence(tmp_path: Path) -> None:
         (whole + "\nname: other\n", "found the key name twice"),
     ):
         bad.write_text(text, encoding="utf-8")
-        with pytest.raises(ParameterError, match=rf"^airframe .*bad\.yaml: not valid YAML \(.*{what}.*\), expected an"):
+        with pytest.raises(
+            ParameterError,
+            match=rf"^airframe .*bad\.yaml: not valid YAML \(.*{what}.*\), expected an",
+        ):
             load_airframe(str(bad))
 
 
@@ -188,7 +298,11 @@ def test_every_installed_scenario_is_valid() -> None:
 
 
 NAMES = st.text(st.characters(categories=["Ll"]), min_size=1, max_size=4)
-TREES = st.recursive(st.integers(), lambda children: st.dictionaries(NAMES, children, min_size=1, max_size=3), max_leaves=10)
+TREES = st.recursive(
+    st.integers(),
+    lambda children: st.dictionaries(NAMES, children, min_size=1, max_size=3),
+    max_leaves=10,
+)
 
 
 @given(tree=st.dictionaries(NAMES, TREES, min_size=1, max_size=3))
@@ -221,12 +335,25 @@ def test_output_that_cannot_be_written_is_one_sentence() -> None:
     for key, place in (("--csv", f"--csv: {path}"), ("", path)):
         with pytest.raises(ParameterError) as rejected, writing(key, path, "the path of a file"):
             Path(path).write_text("")
-        assert str(rejected.value) == f"{place} cannot be written (No such file or directory), expected the path of a file"
+        assert (
+            str(rejected.value)
+            == f"{place} cannot be written (No such file or directory), expected the path of a file"
+        )
 
 
-# A field without bounds takes .inf and NaN: no end stop, never, or what a message field has for "no value".
+# A field without bounds takes .inf and NaN: no end stop, never, or what a message field has for "no
+# value".
 ENDLESS = {
-    "ActuatorConfig": {"lower", "upper", "rate", "stuck_at", "lost_at", "weak_at", "slow_at", "loose_at"},
+    "ActuatorConfig": {
+        "lower",
+        "upper",
+        "rate",
+        "stuck_at",
+        "lost_at",
+        "weak_at",
+        "slow_at",
+        "loose_at",
+    },
     "DriftConfig": {"start"},
     "Gust": {"every"},
     "InputRow": {"release"},
@@ -243,7 +370,9 @@ def schemas(base: type[Config] = Config) -> Iterator[type[Config]]:
         with suppress(ParameterError):  # loaded, but of the full state
             laws.schema(name)
     for schema in base.__subclasses__():
-        if schema.__module__ not in RESULTS and not schema.__module__.partition(".")[0].startswith("test"):
+        if schema.__module__ not in RESULTS and not schema.__module__.partition(".")[0].startswith(
+            "test"
+        ):
             yield schema
         yield from schemas(schema)
 
@@ -261,7 +390,9 @@ def rules_of_numbers(annotation: Any, rules: Mapping[str, Any]) -> Iterator[Mapp
         yield rules
 
 
-@pytest.mark.parametrize("schema", sorted(set(schemas()), key=repr), ids=lambda schema: schema.__name__)
+@pytest.mark.parametrize(
+    "schema", sorted(set(schemas()), key=repr), ids=lambda schema: schema.__name__
+)
 def test_each_number_has_lower_and_upper_bound(schema: type[Config]) -> None:
     endless = set()
     for name, field in schema.model_fields.items():

@@ -66,9 +66,15 @@ def test_a_change_of_publisher_is_returned_once() -> None:
     assert lock.refresh("/aircraft#2", 2)
 
 
-@pytest.mark.parametrize(("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})])
-def test_delayed_reference_awaited_up_to_age_limit(late: float, modes: set[Mode], osprey_gust: Scenario) -> None:
-    """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once above it."""
+@pytest.mark.parametrize(
+    ("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})]
+)
+def test_delayed_reference_awaited_up_to_age_limit(
+    late: float, modes: set[Mode], osprey_gust: Scenario
+) -> None:
+    """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once
+    above it.
+    """
     controller, period_ns = Controller(osprey_gust.controller), 10_000_000
     visited, stamps = set(), []
     for k in range(200):
@@ -83,5 +89,7 @@ def test_delayed_reference_awaited_up_to_age_limit(late: float, modes: set[Mode]
             stamps.append(output.stamp_ns)
     assert visited == modes
     assert stamps == sorted(set(stamps))
-    if late < 0.1:  # each y is used in order, as late as its y_m, which may be extrapolated by one period
+    if (
+        late < 0.1
+    ):  # each y is used in order, as late as its y_m, which may be extrapolated by one period
         assert 199 * period_ns - stamps[-1] == nanoseconds(late) - period_ns

@@ -17,13 +17,18 @@ from flight_core.scheduling import SLICE_NS, THREADS, TIMER_SLACK
 
 def output(code: str, within: Sequence[str] = ()) -> str:
     """What a Python process prints, started by `within`."""
-    return subprocess.run([*within, sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    return subprocess.run(
+        [*within, sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
 
 
 @pytest.mark.skipif(not TIMER_SLACK.exists(), reason="no Linux, or no /proc")
 def test_timer_slack_of_thread_set_to_minimum() -> None:
     # the default of Linux is 50 us (prctl(2), PR_SET_TIMERSLACK)
-    code = "from flight_core.scheduling import *; disable_timer_slack(); print(TIMER_SLACK.read_text())"
+    code = (
+        "from flight_core.scheduling import *; disable_timer_slack(); "
+        "print(TIMER_SLACK.read_text())"
+    )
     assert int(output(code)) == 1
 
 
@@ -32,9 +37,12 @@ def kernel() -> tuple[int, ...]:
 
 
 @pytest.mark.skipif(
-    kernel() < (6, 12) or not (THREADS.parent / "sched").exists(), reason="needs Linux 6.12, CONFIG_SCHED_DEBUG"
+    kernel() < (6, 12) or not (THREADS.parent / "sched").exists(),
+    reason="needs Linux 6.12, CONFIG_SCHED_DEBUG",
 )
-@pytest.mark.skipif(os.sched_getscheduler(0) != os.SCHED_OTHER, reason="only the default policy has time slices")
+@pytest.mark.skipif(
+    os.sched_getscheduler(0) != os.SCHED_OTHER, reason="only the default policy has time slices"
+)
 def test_every_thread_of_node_has_short_time_slices() -> None:
     code = """
 import threading, time
@@ -43,7 +51,10 @@ threading.Thread(target=time.sleep, args=(0.1,)).start()
 request_short_slices()
 print([(one / "sched").read_text() for one in THREADS.iterdir()])
 """
-    assert [int(slice_ns) for slice_ns in re.findall(r"se\.slice\s*:\s*(\d+)", output(code))] == [SLICE_NS, SLICE_NS]
+    assert [int(slice_ns) for slice_ns in re.findall(r"se\.slice\s*:\s*(\d+)", output(code))] == [
+        SLICE_NS,
+        SLICE_NS,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -65,7 +76,9 @@ thread.join()
     assert int(output(code, with_policy(*policy))) == priority
 
 
-@pytest.mark.parametrize("policy", [("--fifo", "50"), ("--batch", "0")], ids=["FIFO", "no real-time priority"])
+@pytest.mark.parametrize(
+    "policy", [("--fifo", "50"), ("--batch", "0")], ids=["FIFO", "no real-time priority"]
+)
 def test_command_leaves_real_time_priority(policy: tuple[str, str]) -> None:
     """Every thread leaves the real-time priority; a different policy stays."""
     code = """

@@ -22,7 +22,11 @@ ESCAPES = "\x1b[2J\x1b]0;PWNED\x07\nall is well"
 
 @pytest.mark.parametrize(
     "error",
-    [ParameterError(ESCAPES + 9000 * "x"), FlightEnded(ESCAPES + 9000 * "x"), ChannelError("name", ESCAPES + 9000 * "x")],
+    [
+        ParameterError(ESCAPES + 9000 * "x"),
+        FlightEnded(ESCAPES + 9000 * "x"),
+        ChannelError("name", ESCAPES + 9000 * "x"),
+    ],
 )
 def test_exceptions_are_printable_and_bounded(error: Exception) -> None:
     assert str(error).isprintable()
@@ -45,7 +49,11 @@ def test_names_in_a_log_are_printable(tmp_path: Path) -> None:
             bag.write(channel, 1, 1, 1, vector(1, ("q", ESCAPES), (0.0, 0.0)))
     tape = read_run(tmp_path / "run").tape
     assert len(tape.signals) == 2
-    assert all(name.isprintable() for topic, signal in tape.signals.items() for name in (topic, *signal.names))
+    assert all(
+        name.isprintable()
+        for topic, signal in tape.signals.items()
+        for name in (topic, *signal.names)
+    )
 
 
 def test_shown_paths_are_printable() -> None:

@@ -10,7 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight_core.vectors import ChannelError, array_namespace, require_newer, require_not_future, select
+from flight_core.vectors import (
+    ChannelError,
+    array_namespace,
+    require_newer,
+    require_not_future,
+    select,
+)
 
 
 def test_values_matched_by_name_not_by_position() -> None:
@@ -32,7 +38,9 @@ def test_order_of_publisher_does_not_matter(values: list[tuple[str, float]]) -> 
         (["q", "V"], [1.0, math.nan], "finite"),
     ],
 )
-def test_invalid_sample_rejected_with_reason(names: list[str], values: list[float], reason: str) -> None:
+def test_invalid_sample_rejected_with_reason(
+    names: list[str], values: list[float], reason: str
+) -> None:
     with pytest.raises(ChannelError) as rejected:
         select(["q", "V"], names, values)
     assert rejected.value.reason == reason
@@ -51,9 +59,13 @@ def test_float_functions_equal_array_functions() -> None:
     """The functions of a Python float give the values of the array functions."""
     xp = array_namespace(0.5)
     for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
-        assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), name  # JAX in 32 bit
+        assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), (
+            name
+        )  # JAX in 32 bit
     for name in ("atan2", "hypot", "copysign", "minimum", "maximum"):
-        assert getattr(xp, name)(0.5, -2.0) == pytest.approx(float(getattr(jnp, name)(0.5, -2.0)), rel=1e-6), name
+        assert getattr(xp, name)(0.5, -2.0) == pytest.approx(
+            float(getattr(jnp, name)(0.5, -2.0)), rel=1e-6
+        ), name
     assert [xp.where(condition, 1.0, 2.0) for condition in (True, False)] == [1.0, 2.0]
 
 

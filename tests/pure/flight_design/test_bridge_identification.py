@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model: experiment, response, and a scenario that flies the aircraft."""
+"""From a channel map to gains without a model: experiment, response, and a scenario that flies the
+aircraft.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -49,14 +51,20 @@ OSPREY = load_airframe("osprey")
 
 
 def aircraft() -> AircraftConfig:
-    """The osprey with servos and noise, and y late by DELAY: what the map's aircraft is not known to be."""
+    """The osprey with servos and noise, and y late by DELAY: what the map's aircraft is not known
+    to be.
+    """
     servo = find_scenario("osprey_servo")
     sensors = servo.aircraft.sensors.model_dump() | {"delay": DELAY}
-    return servo.vary(aircraft={"gusts": {}, "rate": 100.0, "step": 0.005, "sensors": sensors}).aircraft
+    return servo.vary(
+        aircraft={"gusts": {}, "rate": 100.0, "step": 0.005, "sensors": sensors}
+    ).aircraft
 
 
 def loaded(folder: Path, name: str, airframe: str, scenario: str) -> Scenario:
-    """A scenario and its airframe as files, as the command writes them, with the real aircraft in the airframe's place."""
+    """A scenario and its airframe as files, as the command writes them, with the real aircraft in
+    the airframe's place.
+    """
     (folder / f"{name}_airframe.yaml").write_text(airframe, encoding="utf-8")
     (folder / f"{name}.yaml").write_text(scenario, encoding="utf-8")
     return replace(load_scenario(folder / f"{name}.yaml"), aircraft=aircraft())
@@ -90,13 +98,17 @@ def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None
     rows = [OSPREY.outputs.index(name) for name in response.outputs]
     columns = [list(OSPREY.inputs).index(name) for name in response.inputs]
     known = np.diag((OSPREY.matrix_c() @ OSPREY.matrix_b())[np.ix_(rows, columns)])
-    # 30 %: Omega, lag and damping change places in what 8 Hz show; a loop with a phase margin of 54 degrees bears twice as much
+    # 30 %: Omega, lag and damping change places in what 8 Hz show; a loop with a phase margin of 54
+    # degrees bears twice as much
     np.testing.assert_allclose(np.diag(channels.Omega), known, rtol=0.3)
     lag = np.array([0.02 if name != "thrust" else 0.1 for name in response.inputs])
-    # u is held for a period of 10 ms, so that it acts half of one late. V has no model, and its step response is slow: its lag
-    # is less certain, and its bandwidth of 1.4 rad/s turns 50 ms into 4 degrees of phase.
+    # u is held for a period of 10 ms, so that it acts half of one late. V has no model, and its
+    # step response is slow: its lag is less certain, and its bandwidth of 1.4 rad/s turns 50 ms
+    # into 4 degrees of phase.
     expected = lag + DELAY + 0.005
-    assert (np.abs(channels.lag + channels.delay - expected) < np.where(lag > 0.05, 0.05, 0.02)).all()
+    assert (
+        np.abs(channels.lag + channels.delay - expected) < np.where(lag > 0.05, 0.05, 0.02)
+    ).all()
 
 
 def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> None:
@@ -105,7 +117,8 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> N
     tape = simulate(loaded(identified.folder, "flight", found.airframe, found.scenario))
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
-    # the figures that a first flight of an autopilot is asked for: 10, 20, 15 mrad/s in q, p, r and 0.05 m/s
+    # the figures that a first flight of an autopilot is asked for: 10, 20, 15 mrad/s in q, p, r and
+    # 0.05 m/s
     assert rms["q"] < 0.010
     assert rms["p"] < 0.020
     assert rms["r"] < 0.015
@@ -114,40 +127,61 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> N
 
 @pytest.fixture(scope="module")
 def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels, Flyable]:
-    """Channels that are known, and their flight: q stiff, r and V damped, p with y_dot = Omega u."""
+    """Channels that are known, and their flight: q stiff, r and V damped, p with y_dot = Omega
+    u.
+    """
     damping, stiffness, zero = (
         np.array([values.get(name, 0.0) for name in MAP.outputs])
-        for values in ({"q": 39.0, "r": 22.0, "V": 2.0}, {"q": 1000.0, "r": 470.0}, {"q": 25.0, "r": 2.0})
+        for values in (
+            {"q": 39.0, "r": 22.0, "V": 2.0},
+            {"q": 1000.0, "r": 470.0},
+            {"q": 25.0, "r": 2.0},
+        )
     )
     Omega, none = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs]), 0.0 * damping
     found = Channels(Omega, none, none + 0.02, none + 0.1, damping, stiffness, zero, none)
-    return found, flying_scenario(MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml"))
+    return found, flying_scenario(
+        MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml")
+    )
 
 
 def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
     of_second_order: tuple[Channels, Flyable],
 ) -> None:
-    # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its derivative
+    # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its
+    # derivative
     found, flying = of_second_order
     controller, k = flying.controller, list(MAP.outputs).index("q")
     params, i = controller.law_params(), controller.outputs.index("q")
     gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
-    integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])  # the softened sign is one too
+    integral = params.Lambda[i] + params.beta[i] / (
+        params.K[i] * params.eps[i]
+    )  # the softened sign is one too
     s = 1j * gain
-    loop = gain * (s + integral) / s * (s + found.zero[k]) / (s**2 + found.damping[k] * s + found.stiffness[k])
+    loop = (
+        gain
+        * (s + integral)
+        / s
+        * (s + found.zero[k])
+        / (s**2 + found.damping[k] * s + found.stiffness[k])
+    )
     assert abs(loop) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
     response, models = identified.response, identified.models
-    refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))
+    refused = response._replace(
+        refusal=("", "V by thrust: found no movement, expected one", "", "")
+    )
     unusable = [*models[:1], None, *models[2:]]
     with pytest.raises(ParameterError, match=r"^V by thrust: found no movement, expected one$"):
         join(MAP, refused, unusable)
 
 
 class Known(NamedTuple):
-    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay; by default a channel of first order."""
+    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay; by default a
+    channel of first order.
+    """
 
     Omega: float = 80.0
     damping: float = 12.0
@@ -161,23 +195,37 @@ class Known(NamedTuple):
         t = np.arange(0.0, 14.0, 0.001)
         arrays = params.law_params()
         u = np.array(
-            [(arrays.amplitude * excitation.signal(instant, arrays))[0] for instant in np.floor(t / 0.01 + 1e-9) * 0.01]
+            [
+                (arrays.amplitude * excitation.signal(instant, arrays))[0]
+                for instant in np.floor(t / 0.01 + 1e-9) * 0.01
+            ]
         )
         v, z, y = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
         for k in range(len(t) - 1):
             v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / self.lag
-            y[k + 1] = y[k] + 0.001 * (self.Omega * v[k] - self.damping * y[k] - self.stiffness * z[k])
+            y[k + 1] = y[k] + 0.001 * (
+                self.Omega * v[k] - self.damping * y[k] - self.stiffness * z[k]
+            )
             z[k + 1] = z[k] + 0.001 * y[k + 1]
-        late = np.interp(t - self.delay, t, y) + noise * np.random.default_rng(1).standard_normal(len(t))
+        late = np.interp(t - self.delay, t, y) + noise * np.random.default_rng(1).standard_normal(
+            len(t)
+        )
         stamps = np.round(t * 1e9).astype(np.int64)
-        return Signal(stamps[::10], ("q",), late[::10, None]), Signal(stamps[::10], ("elevator",), u[::10, None])
+        return Signal(stamps[::10], ("q",), late[::10, None]), Signal(
+            stamps[::10], ("elevator",), u[::10, None]
+        )
 
 
 @pytest.mark.parametrize("lag", [0.03, 0.4])
-def test_model_of_channel_is_that_of_own_simulation_from_any_start(lag: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
+def test_model_of_channel_is_that_of_own_simulation_from_any_start(
+    lag: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20
+    # 1/s.
     monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag, 5.0, 30.0, 6.0),))
-    model = fit_channel(*Known().measured(noise=0.002), "q", "elevator", 1.0)  # rad/s, as of a gyroscope
+    model = fit_channel(
+        *Known().measured(noise=0.002), "q", "elevator", 1.0
+    )  # rad/s, as of a gyroscope
     assert model is not None
     assert model.usable
     assert model.stiffness == 0.0
@@ -186,7 +234,8 @@ def test_model_of_channel_is_that_of_own_simulation_from_any_start(lag: float, m
 
 
 def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
-    # 0.1 rad/s is the rms of the response: 70 % of y is unexplained, and gain and phase of the loop are certain
+    # 0.1 rad/s is the rms of the response: 70 % of y is unexplained, and gain and phase of the loop
+    # are certain
     model = fit_channel(*Known().measured(noise=0.1), "q", "elevator", 1.0)
     assert model is not None
     assert model.misfit > 0.5
@@ -199,7 +248,8 @@ def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
 
 
 def test_fast_oscillation_of_light_airplane_found() -> None:
-    # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15 s
+    # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15
+    # s
     known = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
     model = fit_channel(*known.measured(noise=0.02), "q", "elevator", 1.0)
     assert model is not None
@@ -208,10 +258,13 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
 
 
 def thrust_with_phugoid(amplitude: float) -> Tape:
-    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose; noise as of an airspeed sensor.
+    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose;
+    noise as of an airspeed sensor.
 
-    V_dot = -0.5 V + 14 v - g gamma,   gamma_dot = 2 g V / SPEED^2: weight is lift at SPEED, and lift grows with its square.
-    Source: F. W. Lanchester, "Aerodonetics", 1908; undamped, its frequency is sqrt(2) g / SPEED, here 0.09 Hz.
+    V_dot = -0.5 V + 14 v - g gamma,
+        gamma_dot = 2 g V / SPEED^2: weight is lift at SPEED, and lift grows with its square.
+    Source: F. W. Lanchester, "Aerodonetics", 1908; undamped, its frequency is sqrt(2) g / SPEED,
+    here 0.09 Hz.
     """
     params = experiment(MAP, SPEED, amplitude, "airframe.yaml").controller
     arrays, step = params.law_params(), 0.01  # s, exact for a u that is held so long
@@ -228,7 +281,13 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
     held = np.zeros((len(t), 4))
     held[:, place] = u
     pose = Signal(stamps, ("climb",), SPEED * states[:, 1:2])
-    return Tape({"y": Signal(stamps, tuple(MAP.outputs), y), "u": Signal(stamps, params.inputs, held), "pose": pose})
+    return Tape(
+        {
+            "y": Signal(stamps, tuple(MAP.outputs), y),
+            "u": Signal(stamps, params.inputs, held),
+            "pose": pose,
+        }
+    )
 
 
 def test_thrust_told_from_phugoid_by_climb() -> None:
@@ -238,7 +297,9 @@ def test_thrust_told_from_phugoid_by_climb() -> None:
     assert model is not None
     assert model.usable
     np.testing.assert_allclose([model.Omega, model.damping], [14.0, 0.5], rtol=0.05)
-    assert model.lag + model.delay == pytest.approx(0.1, abs=0.03)  # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
+    assert model.lag + model.delay == pytest.approx(
+        0.1, abs=0.03
+    )  # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
     of_log_alone = fit_channel(tape["y"], tape["u"], "V", "thrust", 1.0)
     assert of_log_alone is not None
     assert of_log_alone.Omega > 1.5 * 14.0, "the phugoid is large enough to matter"
@@ -266,7 +327,9 @@ def test_written_map_has_trims_that_were_sent() -> None:
     sent = Signal(np.arange(20) * 150_000_000, names, raw)
     trims = measured_trims(MAP, sent, 0)
     assert trims["elevator"] == pytest.approx(0.25 * row.scale)
-    written = ChannelMap.validate_mapping(yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map")
+    written = ChannelMap.validate_mapping(
+        yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map"
+    )
     assert written.inputs["elevator"].trim == pytest.approx(0.25 * row.scale, rel=1e-4)
     assert written.outputs == MAP.outputs
 
@@ -279,12 +342,17 @@ def test_trim_near_a_stop_narrows_the_limits_and_says_what_to_change() -> None:
     assert narrower.inputs["thrust"].lower == thrust.lower
     assert narrower.inputs["thrust"].upper == pytest.approx(0.15, rel=1e-3)
     expected = (
-        "thrust: its trim is 0.85, so that the upper limit is 0.15 in place of 0.3: fly slower, or trim the aircraft otherwise"
+        "thrust: its trim is 0.85, so that the upper limit is 0.15 in place of 0.3: fly "
+        "slower, or trim the aircraft otherwise"
     )
     assert sentences == [expected]
-    assert ChannelMap.validate_mapping(yaml.safe_load(map_text(narrower, {"thrust": 0.85}, "a log")), "map")
+    assert ChannelMap.validate_mapping(
+        yaml.safe_load(map_text(narrower, {"thrust": 0.85}, "a log")), "map"
+    )
     with pytest.raises(
-        ParameterError, match=r"inputs\.thrust: found a trim of 1 at its stop, expected room on both sides: fly slower"
+        ParameterError,
+        match=r"inputs\.thrust: found a trim of 1 at its stop, expected room on both sides: fly "
+        r"slower",
     ):
         within_range(MAP, trims | {"thrust": 1.0})
 
@@ -294,7 +362,9 @@ HOVER_MAP = load_map(str(QUADROTOR / "map.yaml"))
 
 
 def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path: Path) -> None:
-    """The airframe of the example, whose channels are q, p, r and a vertical speed, by an experiment without an airspeed."""
+    """The airframe of the example, whose channels are q, p, r and a vertical speed, by an
+    experiment without an airspeed.
+    """
     frame = str(QUADROTOR / "airframe.yaml")
 
     def flown(name: str, airframe: str, scenario: str) -> Tape:
@@ -309,7 +379,9 @@ def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path:
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
     channels = join(HOVER_MAP, response, channel_models(HOVER_MAP, tape, [(0, 10**18)], None))
     known = load_airframe(frame)
-    np.testing.assert_allclose(np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1)  # q, p, r by a noise of 20 mrad/s
+    np.testing.assert_allclose(
+        np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1
+    )  # q, p, r by a noise of 20 mrad/s
     found = flying_scenario(HOVER_MAP, channels, None, str(tmp_path / "flight_airframe.yaml"))
     assert "speed" not in yaml.safe_load(found.airframe)
     _, error = best_error(flown("flight", found.airframe, found.scenario))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The test for a loss of effect, in a flight with damage, and channels that keep the law of the start."""
+"""The test for a loss of effect, in a flight with damage, and channels that keep the law of the
+start.
+"""
 
 import math
 
@@ -20,23 +22,38 @@ pytestmark = pytest.mark.slow
 
 
 ACTUATION = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)
-LOST, WEAK = [0.0, math.inf, math.inf, math.inf], [math.inf, math.inf, 0.0, math.inf]  # s: elevator; aileron, of half effect
+LOST, WEAK = (
+    [0.0, math.inf, math.inf, math.inf],
+    [math.inf, math.inf, 0.0, math.inf],
+)  # s: elevator; aileron, of half effect
 
 
 @pytest.fixture(scope="module")
 def damaged() -> tuple[Recording, Airframe]:
-    """8 s in light turbulence, with a bank, without elevator and with half of the aileron, and the aircraft before."""
+    """8 s in light turbulence, with a bank, without elevator and with half of the aileron, and the
+    aircraft before.
+    """
     flown = find_scenario("osprey_servo").vary(
-        aircraft={"rate": 100.0, "step": 0.01, "gusts": {}, "turbulence": {"altitude": 100.0, "wind": 7.7}}
+        aircraft={
+            "rate": 100.0,
+            "step": 0.01,
+            "gusts": {},
+            "turbulence": {"altitude": 100.0, "wind": 7.7},
+        }
         | {"actuators": {"lag": ACTUATION.lag.tolist(), "lost_at": LOST, "weak_at": WEAK}},
-        reference_model={"rate": 100.0, "pulses": {"p": {"start": [3.0, 5.0], "stop": [4.0, 6.0], "value": [0.2, -0.2]}}},
+        reference_model={
+            "rate": 100.0,
+            "pulses": {"p": {"start": [3.0, 5.0], "stop": [4.0, 6.0], "value": [0.2, -0.2]}},
+        },
         flight={"duration": 8.0},
     )
     airframe = flown.aircraft.sampled_airframe()
     return recording(simulate(flown), airframe), airframe
 
 
-def test_lost_elevator_is_dead_and_weak_aileron_changed(damaged: tuple[Recording, Airframe]) -> None:
+def test_lost_elevator_is_dead_and_weak_aileron_changed(
+    damaged: tuple[Recording, Airframe],
+) -> None:
     lon, lat = change_test(*damaged, ACTUATION)
     assert (lon.outputs, lon.found, lon.dead) == (("q", "V"), True, "elevator")
     assert (lat.outputs, lat.found, lat.dead) == (("p", "r"), True, "")
@@ -51,7 +68,9 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(damaged: tuple[Recording
 def test_loss_within_what_a_model_may_err_is_no_change(
     damaged: tuple[Recording, Airframe], model: float, *, found: bool
 ) -> None:
-    """Half of the effect beside a model that has already most of the loss: 17 and 31 % are left to find."""
+    """Half of the effect beside a model that has already most of the loss: 17 and 31 % are left to
+    find.
+    """
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, model, 1.0])
     flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
@@ -62,19 +81,33 @@ def test_loss_within_what_a_model_may_err_is_no_change(
 def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:
     law = controller.law_params()
     effect = law.D * law.input_scale
-    return effect * law.K, effect * law.K * law.Lambda, effect * law.beta, effect * law.beta / law.eps
+    return (
+        effect * law.K,
+        effect * law.K * law.Lambda,
+        effect * law.beta,
+        effect * law.beta / law.eps,
+    )
 
 
 def test_channels_keep_the_law_of_the_start() -> None:
-    """Gains from e, its integral and the sign to u are those of each, and u_o and u_ff are 0 in the others."""
-    start, designed = (find_scenario(name).rise_di() for name in ("osprey_servo", "osprey_observer"))
+    """Gains from e, its integral and the sign to u are those of each, and u_o and u_ff are 0 in the
+    others.
+    """
+    start, designed = (
+        find_scenario(name).rise_di() for name in ("osprey_servo", "osprey_observer")
+    )
     bare = [True, False, False, True]  # q and V, the last channel with them
     mixed = with_channels_of(start, designed, bare, [False] * 4)
     for gain, of_start, of_designed in zip(*map(law_of, (mixed, start, designed)), strict=True):
         assert gain == pytest.approx(np.where(bare, of_start, of_designed))
     RiseDiConfig.validate_mapping(mixed.model_dump(), "controller")  # with its margins
     assert mixed.observer is not None
-    assert np.any(np.reshape(mixed.observer.F, (4, -1)), axis=1).tolist() == [False, True, True, False]
+    assert np.any(np.reshape(mixed.observer.F, (4, -1)), axis=1).tolist() == [
+        False,
+        True,
+        True,
+        False,
+    ]
     assert mixed.guard().nominal is not None
     nominal = mixed.guard().nominal
     assert nominal is not None

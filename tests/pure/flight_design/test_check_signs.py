@@ -38,7 +38,9 @@ AIRFRAME = load_airframe("osprey")
 OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
 
 
-def check_osprey(channel_map: ChannelMap, D: tuple[int, ...] = (1, 1, 1, 1), measured: Response | None = None) -> SignCheck:
+def check_osprey(
+    channel_map: ChannelMap, D: tuple[int, ...] = (1, 1, 1, 1), measured: Response | None = None
+) -> SignCheck:
     return check(channel_map, OMEGA, OUTPUTS, INPUTS, D, measured)
 
 
@@ -52,8 +54,16 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 def test_shipped_maps_fit_controller_of_osprey(name: str) -> None:
     result = CliRunner().invoke(app, ["check", str(MAP_FILES[name]), "--json"])
     assert result.exit_code == 0
-    channels = [(channel["output"], channel["input"], channel["D"]) for channel in json.loads(result.stdout)["channels"]]
-    assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
+    channels = [
+        (channel["output"], channel["input"], channel["D"])
+        for channel in json.loads(result.stdout)["channels"]
+    ]
+    assert channels == [
+        ("q", "elevator", 1),
+        ("p", "aileron", 1),
+        ("r", "rudder", 1),
+        ("V", "thrust", 1),
+    ]
 
 
 def test_through_map_of_right_signs_omega_is_that_of_airframe() -> None:
@@ -68,11 +78,15 @@ def test_input_with_wrong_sign_changes_own_d_only(name: str, channel: str) -> No
     original, k = named_map(name), INPUTS.index(channel)
     row = original.inputs[channel]
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
-    flipped = changed(original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
+    flipped = changed(
+        original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span
+    )
     checked = check_osprey(flipped)
     assert [channel.D for channel in checked.channels] == [-1 if i == k else 1 for i in range(4)]
     assert len(checked.contradictions) == 1
-    assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
+    assert (
+        f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
+    )
 
 
 @pytest.mark.parametrize("channel", OUTPUTS)
@@ -80,18 +94,28 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_contradiction(channel: str) 
     k = OUTPUTS.index(channel)
     original = load_map("ardupilot")
     flipped = changed(original, "outputs", channel, sign=-original.outputs[channel].sign)
-    checked = check_osprey(changed(flipped, "inputs", INPUTS[k], sign=-original.inputs[INPUTS[k]].sign))
+    checked = check_osprey(
+        changed(flipped, "inputs", INPUTS[k], sign=-original.inputs[INPUTS[k]].sign)
+    )
     assert [channel.D for channel in checked.channels] == [1, 1, 1, 1]
     assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
 
 
 def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
-    path, flipped = tmp_path / "ardupilot.yaml", changed(load_map("ardupilot"), "inputs", "elevator", sign=-1)
-    content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
+    path, flipped = (
+        tmp_path / "ardupilot.yaml",
+        changed(load_map("ardupilot"), "inputs", "elevator", sign=-1),
+    )
+    content = json.loads(
+        json.dumps(flipped.model_dump(exclude_none=True))
+    )  # lists in place of tuples, for YAML
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 1
-    sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator means nose"
+    sentence = (
+        "error: with the map ardupilot D of q and elevator is -1, the controller has +1: "
+        "a positive elevator means nose"
+    )
     assert sentence in result.stderr
 
 
@@ -99,19 +123,26 @@ def test_channels_of_quadrotor_go_by_their_motions() -> None:
     folder = REPOSITORY / "examples" / "px4_quadrotor"
     hover, frame = load_map(str(folder / "map.yaml")), load_airframe(str(folder / "airframe.yaml"))
     Omega = frame.matrix_b()
-    np.testing.assert_array_equal(through(hover, Omega), Omega)  # outputs are the states, in one order
+    np.testing.assert_array_equal(
+        through(hover, Omega), Omega
+    )  # outputs are the states, in one order
     climbs = changed(hover, "inputs", "thrust", positive="climbs")  # of a raw value that sinks
     np.testing.assert_array_equal(through(climbs, Omega), Omega * [1.0, -1.0, 1.0, 1.0])
-    with pytest.raises(ParameterError, match=r"outputs\.p\.positive: found 'climbs', expected a motion to which p responds"):
+    with pytest.raises(
+        ParameterError,
+        match=r"outputs\.p\.positive: found 'climbs', expected a motion to which p responds",
+    ):
         through(changed(hover, "outputs", "p", positive="climbs"), Omega)
 
 
-# Recorded flights, with the servos' lags, a delay of 0.15 s as on an autopilot, and moderate turbulence.
+# Recorded flights, with the servos' lags, a delay of 0.15 s as on an autopilot, and moderate
+# turbulence.
 
 DELAY = 0.15  # s
 LOOP = {"rate": 50.0, "delay": DELAY, "max_age": 0.4, "hold": 0.5, "ramp": 2.0}
 EXCITATION = {  # half a minute in all
-    "law": "excitation", "amplitude": [0.04, 0.04, 0.1, 0.2], "width": [0.3, 0.3, 0.4, 1.0], "period": [4.0, 4.0, 4.0, 6.0],
+    "law": "excitation", "amplitude": [0.04, 0.04, 0.1, 0.2], "width": [0.3, 0.3, 0.4, 1.0],
+    "period": [4.0, 4.0, 4.0, 6.0],
     "lowest": [0.3, 0.3, 0.3, 0.15], "highest": [2.5, 2.5, 2.5, 0.8], "pause": 0.5,
 }  # fmt: skip
 
@@ -119,12 +150,17 @@ EXCITATION = {  # half a minute in all
 def flown(controller: dict[str, Any], duration: float, seed: int, wind: float) -> Tape:
     """The osprey under a controller, y stamped when it arrives and u when it is computed."""
     base = find_scenario("osprey_servo")
-    shared = {key: getattr(base.controller, key) for key in ("outputs", "inputs", "D", "input_scale", "lag", "lower", "upper")}
+    shared = {
+        key: getattr(base.controller, key)
+        for key in ("outputs", "inputs", "D", "input_scale", "lag", "lower", "upper")
+    }
     turbulence = {"altitude": 100.0, "wind": wind, "seed": seed}
     sensors = {"noise": base.aircraft.sensors.noise, "delay": DELAY, "seed": seed}
     values = shared | LOOP | controller
     aircraft = {"rate": 100.0, "gusts": {}, "turbulence": turbulence, "sensors": sensors}
-    flight = base.vary(flight={"duration": duration}, aircraft=aircraft, reference_model={"rate": 100.0})
+    flight = base.vary(
+        flight={"duration": duration}, aircraft=aircraft, reference_model={"rate": 100.0}
+    )
     flight = replace(flight, controller=AnyLaw.validate_mapping(values, "controller"))
     tape = simulate(flight)
     signals = dict(tape.signals)
@@ -139,7 +175,11 @@ def response(tape: Tape, excitation: Signal | None) -> Response:
 
 def turned(signal: Signal, name: str) -> Signal:
     """A signal with one channel of the opposite sign, as a wrong row of a map would record it."""
-    return Signal(signal.stamp_ns, signal.names, signal.values * np.where(np.array(signal.names) == name, -1.0, 1.0))
+    return Signal(
+        signal.stamp_ns,
+        signal.names,
+        signal.values * np.where(np.array(signal.names) == name, -1.0, 1.0),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -151,9 +191,12 @@ def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
     checked = check_osprey(load_map("ardupilot"), measured=response(experiment, None))
     assert not checked.contradictions
     assert not checked.uncertain
-    # within a factor of two of C B: enough for a sign; the elevator's is spread by the short period of 10 rad/s
+    # within a factor of two of C B: enough for a sign; the elevator's is spread by the short period
+    # of 10 rad/s
     measured = np.array([channel.measured for channel in checked.channels])
-    assert (np.abs(np.log2(measured / [channel.effect for channel in checked.channels])) < 1.0).all()
+    assert (
+        np.abs(np.log2(measured / [channel.effect for channel in checked.channels])) < 1.0
+    ).all()
 
 
 @pytest.mark.parametrize(("topic", "k"), [("u", 0), ("u", 1), ("y", 2), ("y", 3)])
@@ -162,14 +205,20 @@ def test_each_wrong_sign_found_in_experiment(experiment: Tape, topic: str, k: in
     wrong = Tape({**experiment.signals, topic: turned(experiment[topic], name)})
     checked = check_osprey(load_map("ardupilot"), measured=response(wrong, None))
     assert len(checked.contradictions) == 1
-    assert f"the recorded flight has {OUTPUTS[k]}_dot fall with {INPUTS[k]}" in checked.contradictions[0]
+    assert (
+        f"the recorded flight has {OUTPUTS[k]}_dot fall with {INPUTS[k]}"
+        in checked.contradictions[0]
+    )
 
 
 def test_flight_under_guidance_refused_since_commands_follow_y(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_route", 1.0)
     (tmp_path / "run").mkdir()
     write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
-    with pytest.raises(ParameterError, match="found a flight under guidance, whose y_m follows y, expected an experiment"):
+    with pytest.raises(
+        ParameterError,
+        match="found a flight under guidance, whose y_m follows y, expected an experiment",
+    ):
         recorded_response(tmp_path / "run", OUTPUTS, INPUTS)
 
 
@@ -178,4 +227,7 @@ def test_flight_that_does_not_show_sign_says_which_input_to_excite() -> None:
     checked = check_osprey(load_map("ardupilot"), measured=response(tape, None))
     assert not checked.contradictions
     assert len(checked.uncertain) == 1
-    assert "the recorded flight does not show the sign of rudder: r by rudder: found rudder constant" in checked.uncertain[0]
+    assert (
+        "the recorded flight does not show the sign of rudder: r by rudder: found rudder constant"
+        in checked.uncertain[0]
+    )

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - D and U are the paper's names
-"""Gains: Theorem 1 worked by hand, the engineering procedure on the osprey, refusals, and the predicted delay margin."""
+"""Gains: Theorem 1 worked by hand, the engineering procedure on the osprey, refusals, and the
+predicted delay margin.
+"""
 
 import json
 import math
@@ -39,7 +41,9 @@ from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_m
 pytestmark = pytest.mark.slow
 
 AIRFRAME = load_airframe("osprey")
-SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
+SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(
+    delay=0.0, rate_limit={}
+)
 HAND = Bounds(
     U=np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]),
     N_d=np.array([1.0, 2.0, 3.0]),
@@ -50,9 +54,13 @@ HAND = Bounds(
 
 @pytest.fixture(scope="module")
 def osprey() -> Study:
-    """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with its gusts."""
+    """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with
+    its gusts.
+    """
     scenario = find_scenario("osprey_gust")
-    return ideal_control.study_airframe(AIRFRAME, ideal_control.manoeuvre(scenario, AIRFRAME), samples=20)
+    return ideal_control.study_airframe(
+        AIRFRAME, ideal_control.manoeuvre(scenario, AIRFRAME), samples=20
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +71,9 @@ def selected(osprey: Study) -> selection.Selection:
 
 def names(conditions: tuple[Condition, ...], channels: tuple[str, ...]) -> list[str]:
     return [
-        condition.name if condition.channel is None else f"{condition.name} of {channels[condition.channel]}"
+        condition.name
+        if condition.channel is None
+        else f"{condition.name} of {channels[condition.channel]}"
         for condition in conditions
     ]
 
@@ -74,7 +84,8 @@ def failing_in_loop(assessment: GainAssessment[Any]) -> list[str]:
 
 @pytest.mark.equation(29, 30)
 def test_beta_follows_29_and_30_from_last_channel_up() -> None:
-    # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 + 1/1) = 36
+    # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 +
+    # 1/1) = 36
     assert gain_conditions.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
 
 
@@ -94,9 +105,13 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
 def test_gains_of_theorem_1_meet_conditions() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert not gain_conditions.failing(conditions)
-    assert [condition.margin for condition in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
+    assert [condition.margin for condition in conditions[:3]] == pytest.approx(
+        [1.0, 1.0, 1.0]
+    )  # the least beta
     assert conditions[3].margin == pytest.approx(1.5)
-    assert (conditions[4].value, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
+    assert (conditions[4].value, conditions[4].bound) == pytest.approx(
+        (0.3, 1.0 / 3.0)
+    )  # 2 rows of 0.15; 1 - 2/3
 
 
 @pytest.mark.equation(29, 30, "Step 2")
@@ -107,10 +122,16 @@ def test_gains_of_theorem_1_meet_conditions() -> None:
         ({"k_d": np.array([20.0, 2.7])}, ["k_d, step 3 of a"]),
     ],
 )
-def test_a_condition_that_fails_is_named(change: dict[str, FloatArray | float], failing: list[str]) -> None:
+def test_a_condition_that_fails_is_named(
+    change: dict[str, FloatArray | float], failing: list[str]
+) -> None:
     bounds = HAND._replace(gamma_2=np.array([1.0, 1.0, 0.0]))
     good = gain_conditions.theorem_gains(bounds, np.ones(3))
-    assert good.beta.tolist() == [36.0, 7.0, 3.0]  # with Lambda = 1 the gamma_2 of the second channel is 1
+    assert good.beta.tolist() == [
+        36.0,
+        7.0,
+        3.0,
+    ]  # with Lambda = 1 the gamma_2 of the second channel is 1
     conditions = gain_conditions.failing(gain_conditions.check(good._replace(**change), bounds))  # type: ignore[arg-type]
     assert names(conditions, ("a", "b", "c")) == failing
 
@@ -129,7 +150,9 @@ def test_gain_that_22_does_not_allow_refused() -> None:
 def test_bounds_of_U_are_those_of_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
     places = np.array(list(product((0.0, 0.5, 1.0), repeat=4))).reshape(-1, 2, 2)
-    samples = lower + places * (upper - lower)  # the corners of the interval, and points between them
+    samples = lower + places * (
+        upper - lower
+    )  # the corners of the interval, and points between them
     # U_12 = W_12 - L_21 with D = I: largest with W_12 = 0.3 / 0.9, L_21 = 0, which is a corner
     assert gain_conditions.bound_U(samples)[0, 1] == pytest.approx(0.3 / 0.9)
 
@@ -144,57 +167,88 @@ def test_n_d_is_minus_D_U_v_dot() -> None:
 
 def test_airframe_with_unstable_zero_refused(osprey_gust: Scenario) -> None:
     rows = [list(row) for row in AIRFRAME.A]
-    rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
-    with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
-        ideal_control.study_airframe(AIRFRAME.model_copy(update={"A": rows}), ideal_control.manoeuvre(osprey_gust, AIRFRAME))
+    rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = (
+        0.69  # the zero at -0.69 1/s is that entry
+    )
+    with pytest.raises(
+        ParameterError,
+        match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right",
+    ):
+        ideal_control.study_airframe(
+            AIRFRAME.model_copy(update={"A": rows}), ideal_control.manoeuvre(osprey_gust, AIRFRAME)
+        )
 
 
-def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
+def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(
+    selected: selection.Selection,
+) -> None:
     controller = selected.chosen
     params = controller.law_params()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
-    # Products of 0.63, 0.63, 0.46, 0.46 rad over total lags of 0.035 and 0.115 s. By hand in flight, K of q and p were 18.
+    # Products of 0.63, 0.63, 0.46, 0.46 rad over total lags of 0.035 and 0.115 s. By hand in
+    # flight, K of q and p were 18.
     np.testing.assert_allclose(params.K, [18.0, 18.0, 0.46 / 0.035, 0.46 / 0.115])
-    np.testing.assert_allclose(params.Lambda[:2], [4.5, 4.5])  # a quarter of K: both have more than 45 deg of phase
-    widths = params.eps * params.K / params.beta / np.array([0.035, 0.035, 0.035, 0.115])  # T_eps in total lags
+    np.testing.assert_allclose(
+        params.Lambda[:2], [4.5, 4.5]
+    )  # a quarter of K: both have more than 45 deg of phase
+    widths = (
+        params.eps * params.K / params.beta / np.array([0.035, 0.035, 0.035, 0.115])
+    )  # T_eps in total lags
     np.testing.assert_allclose(widths[:2], [2.75, 2.75])
-    np.testing.assert_allclose(widths[2:], 2.75 * params.K[2:] / 4.0 / params.Lambda[2:])  # both integrals slower alike
+    np.testing.assert_allclose(
+        widths[2:], 2.75 * params.K[2:] / 4.0 / params.Lambda[2:]
+    )  # both integrals slower alike
     slew = selected.study.slew[[0, 2, 3, 1]] / params.input_scale
     np.testing.assert_allclose(params.beta, 1.25 * slew)
     assert not gain_conditions.failing(selected.engineering.loop)
-    # q alone limits the delay: 45 ms with a softening of 3 in all channels, where r and V had 32 and 26 deg of phase
+    # q alone limits the delay: 45 ms with a softening of 3 in all channels, where r and V had 32
+    # and 26 deg of phase
     assert selected.engineering.delay_margin is not None
     assert selected.engineering.delay_margin > 0.045
 
 
-def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(selected: selection.Selection) -> None:
+def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(
+    selected: selection.Selection,
+) -> None:
     literal = selected.theorem
     assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
-    assert {"lag product of q", "lag product of p", "linear stability", "delay margin"} <= set(failing_in_loop(literal))
+    assert {"lag product of q", "lag product of p", "linear stability", "delay margin"} <= set(
+        failing_in_loop(literal)
+    )
     assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
 
 
 def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
-    limited = selection.select_gains(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
+    limited = selection.select_gains(
+        osprey, SERVOS._replace(rate_limit={"thrust": 1.2})
+    ).engineering
     params = limited.controller.law_params()
-    assert params.beta[3] * params.input_scale[3] == pytest.approx(0.7 * 1.2)  # the slew of the ideal thrust is 1.14 1/s
+    assert params.beta[3] * params.input_scale[3] == pytest.approx(
+        0.7 * 1.2
+    )  # the slew of the ideal thrust is 1.14 1/s
     assert failing_in_loop(limited) == ["beta above slew of V"]
 
 
 def osprey_channels(
-    inputs: tuple[str, ...] = ("elevator", "thrust", "aileron", "rudder"), flipped: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ("elevator", "thrust", "aileron", "rudder"),
+    flipped: tuple[str, ...] = (),
 ) -> tuple[FloatArray, ChannelPairing]:
     """Omega of the osprey with its inputs in some order, some of them counted the other way."""
     columns = [list(AIRFRAME.inputs).index(name) for name in inputs]
     turned = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
-    return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * turned, ChannelPairing(AIRFRAME.outputs, inputs)
+    return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * turned, ChannelPairing(
+        AIRFRAME.outputs, inputs
+    )
 
 
 @pytest.mark.equation("Remark 1")
 def test_wrong_D_refused_with_one_that_fits() -> None:
     Omega, channels = osprey_channels(flipped=("elevator",))
-    sentence = r"^controller\.D: found \[1, 1, 1, 1\], expected \[-1, 1, 1, 1\], .* or flip elevator and keep D$"
+    sentence = (
+        r"^controller\.D: found \[1, 1, 1, 1\], expected \[-1, 1, 1, 1\], .* or flip "
+        r"elevator and keep D$"
+    )
     with pytest.raises(ParameterError, match=sentence):
         selection.require_channels(Omega, channels, [1, 1, 1, 1])
     assert selection.require_channels(Omega, channels, [-1, 1, 1, 1]).tolist() == [-1, 1, 1, 1]
@@ -205,7 +259,10 @@ def test_wrong_D_refused_with_one_that_fits() -> None:
     [
         (
             ("elevator", "thrust", "rudder", "aileron"),
-            r"^controller\.inputs: found .*p-rudder, r-aileron with max abs\(U - I\) = 25.* p-aileron, r-rudder$",
+            (
+                r"^controller\.inputs: found .*p-rudder, r-aileron with max abs\(U - I\) = 25.* "
+                r"p-aileron, r-rudder$"
+            ),
         ),
         (
             ("thrust", "elevator", "aileron", "rudder"),
@@ -213,7 +270,9 @@ def test_wrong_D_refused_with_one_that_fits() -> None:
         ),
     ],
 )
-def test_pairing_without_decomposition_or_with_strong_coupling_refused(inputs: tuple[str, ...], sentence: str) -> None:
+def test_pairing_without_decomposition_or_with_strong_coupling_refused(
+    inputs: tuple[str, ...], sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         selection.require_channels(*osprey_channels(inputs))
 
@@ -226,10 +285,18 @@ def linear(params: LawParams) -> LinearLaw:
 
 
 def osprey_loop(
-    factor: float = 3.0, K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0), Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0)
+    factor: float = 3.0,
+    K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0),
+    Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0),
 ) -> tuple[LinearPlant, LinearLaw]:
-    """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags wide."""
-    A, B, C = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity(), AIRFRAME.matrix_b(), AIRFRAME.matrix_c()
+    """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags
+    wide.
+    """
+    A, B, C = (
+        AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity(),
+        AIRFRAME.matrix_b(),
+        AIRFRAME.matrix_c(),
+    )
     scale, eps = 1.0 / np.abs(np.diag(C @ B)), factor * OSPREY_LOOP.total / np.array(K)
     params = law_params(K, Lambda, 1.0, sign=Sign.SOFT, input_scale=scale, eps=eps)
     return LinearPlant(A, B, C), linear(params)
@@ -253,13 +320,22 @@ def test_delay_margins_of_osprey_are_those_of_independent_prototype(
 
 
 def scalar(omega: float, T_eps: float) -> LawParams:
-    return law_params(18.0, 5.0, 100.0, sign=Sign.SOFT, input_scale=1.0 / omega, eps=np.float64(100.0) / 18.0 * T_eps)
+    return law_params(
+        18.0,
+        5.0,
+        100.0,
+        sign=Sign.SOFT,
+        input_scale=1.0 / omega,
+        eps=np.float64(100.0) / 18.0 * T_eps,
+    )
 
 
 def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
-    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by whole quarter milliseconds.
+    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by
+    whole quarter milliseconds.
 
-    Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the width of the sign.
+    Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the
+    width of the sign.
     """
     dt, ticks, period = 0.00025, 40, 0.01
     fading = math.exp(-dt / lag)
@@ -284,12 +360,15 @@ def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
 
 
 @pytest.mark.parametrize(("lag", "factor"), [(0.02, 3.0), (0.02, 5.0), (0.05, 3.0)])
-def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(lag: float, factor: float) -> None:
+def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(
+    lag: float, factor: float
+) -> None:
     omega, period = 0.98, 0.01
     params = scalar(omega, factor * (lag + 1.5 * period))
     plant = LinearPlant(np.zeros((1, 1)), np.array([[omega]]), np.eye(1))
     margin = delay_margin(plant, linear(params), Loop(np.array([lag]), 0.0, period))
-    # 0.75 ms: the simulated delay comes in steps of 0.25 ms, the predicted one in 0.1 ms, and growth has to show in 9 s
+    # 0.75 ms: the simulated delay comes in steps of 0.25 ms, the predicted one in 0.1 ms, and
+    # growth has to show in 9 s
     assert 0.003 < margin < 0.1
     assert not grows(params, omega, lag, margin - 0.00075)
     assert grows(params, omega, lag, margin + 0.00075)
@@ -314,7 +393,10 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
     ratio = selection.stable_speed_ratio(osprey, controller)
     assert 1.0 < ratio < selection.MAX_SPEED_RATIO
     surfaces = np.array([name != "V" for name in controller.outputs])
-    for factor, stable in ((ratio, True), (ratio + selection.SPEED_STEP, False)):  # the same response by a larger input_scale
+    for factor, stable in (
+        (ratio, True),
+        (ratio + selection.SPEED_STEP, False),
+    ):  # the same response by a larger input_scale
         scale = np.where(surfaces, factor**2, 1.0) * controller.input_scale
         scaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
         assert (selection.assess_gains(osprey, scaled, SERVOS).delay_margin != 0.0) == stable
@@ -349,19 +431,29 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
 
 
 def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old() -> None:
-    """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms. A faster y changes nothing.
+    """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms. A
+    faster y changes nothing.
 
     An age limit of 0.1 s would be over before the next message of such a y.
     """
     servo = find_scenario("osprey_servo").vary(flight={"duration": 1.0})
     slow, fast = (
         select_gains(
-            "navion_longitudinal", servo, rate=50.0, delay=0.04, y_rate=y_rate, samples=0, phase_margin=5.0, accept=True
+            "navion_longitudinal",
+            servo,
+            rate=50.0,
+            delay=0.04,
+            y_rate=y_rate,
+            samples=0,
+            phase_margin=5.0,
+            accept=True,
         ).chosen
         for y_rate in (9.9, 139.0)
     )
     assert (slow.delay, fast.delay) == pytest.approx((0.161515, 0.04), abs=1e-6)
-    assert (slow.max_age, fast.max_age) == pytest.approx((3.0 / 9.9, servo.controller.max_age), abs=1e-5)
+    assert (slow.max_age, fast.max_age) == pytest.approx(
+        (3.0 / 9.9, servo.controller.max_age), abs=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -378,10 +470,18 @@ def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> N
 
 
 def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
-    """The poles are those that Nelson prints for the Navion: -2.51 +-2.59j and -0.017 +-0.213j, p. 158."""
+    """The poles are those that Nelson prints for the Navion: -2.51 +-2.59j and -0.017 +-0.213j, p.
+    158.
+    """
     own = tmp_path / "own.yaml"
-    own.write_text((LIBRARY / "navion_longitudinal.yaml").read_text(encoding="utf-8").replace("navion_longitudinal", "mine"))
+    own.write_text(
+        (LIBRARY / "navion_longitudinal.yaml")
+        .read_text(encoding="utf-8")
+        .replace("navion_longitudinal", "mine")
+    )
     (shown,) = json.loads(rise_di("airframes", str(own), "--json").stdout)
     assert shown["name"] == "mine"
     poles = sorted((real, abs(imaginary)) for real, imaginary in shown["poles"])
-    np.testing.assert_allclose(poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021)  # A is printed to 3 digits
+    np.testing.assert_allclose(
+        poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021
+    )  # A is printed to 3 digits

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification by step tests: systems with a response in closed form, then an aircraft of JSBSim from end to end."""
+"""Identification by step tests: systems with a response in closed form, then an aircraft of JSBSim
+from end to end.
+"""
 
 import math
 import subprocess
@@ -75,8 +77,8 @@ STRAIGHT = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 def test_omega_and_lags_of_linear_system_identified(
     Omega: list[float], signs: list[float], coupled: float, lag: list[float]
 ) -> None:
-    # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
-    # and (0.475 + 0.1) / 0.1 times that of the lag.
+    # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is
+    # exp(-4.75) = 0.9 % of the slope, and (0.475 + 0.1) / 0.1 times that of the lag.
     known = np.diag(np.array(Omega) * signs) @ np.array([[1.0, coupled], [coupled, 1.0]])
     found = respond(lagged(known, np.array(lag)))
     assert found.Omega == pytest.approx(known, rel=0.015, abs=1e-6)
@@ -86,7 +88,8 @@ def test_omega_and_lags_of_linear_system_identified(
 
 
 def test_tangent_of_damped_rate_is_initial_slope() -> None:
-    # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s) and, at its middle, no lag.
+    # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s)
+    # and, at its middle, no lag.
     a, b = 8.0, -5.0
     t = DT * np.arange(101)
     found = steepest_tangent(b / a * (1.0 - np.exp(-a * t)), DT)
@@ -123,14 +126,18 @@ def test_drift_and_even_parts_of_response_cancel() -> None:
 
 
 def test_largest_step_determines_omega_behind_dead_zone() -> None:
-    # Half a dead zone of 0.06 hides the step of 0.05 and removes 30 % of that of 0.2: the slope is 0.7 of the true one.
+    # Half a dead zone of 0.06 hides the step of 0.05 and removes 30 % of that of 0.2: the slope is
+    # 0.7 of the true one.
     def dead(u: FloatArray, duration: float) -> FloatArray:
         return STRAIGHT(u - np.clip(u, -0.06, 0.06), duration)
 
     found = respond(dead)
     assert found.size == pytest.approx([SIZES[-1]] * 2)
     assert np.diag(found.Omega) == pytest.approx([0.7 * 3.0] * 2, rel=0.01)
-    assert found.rejected == ("elevator by 0.05: q does not move", "aileron by 0.05: p does not move")
+    assert found.rejected == (
+        "elevator by 0.05: q does not move",
+        "aileron by 0.05: p does not move",
+    )
 
 
 def test_steps_stay_inside_the_stops() -> None:
@@ -152,7 +159,10 @@ def test_step_that_ends_flight_rejected_with_reason() -> None:
 
     found = respond(fragile)
     assert np.diag(found.Omega) == pytest.approx([3.0, 3.0], rel=0.01)
-    assert found.rejected == ("elevator by 0.2: gave up at t = 0.10 s", "aileron by 0.2: gave up at t = 0.10 s")
+    assert found.rejected == (
+        "elevator by 0.2: gave up at t = 0.10 s",
+        "aileron by 0.2: gave up at t = 0.10 s",
+    )
 
 
 def test_an_output_without_response_ends_the_identification() -> None:
@@ -162,15 +172,21 @@ def test_an_output_without_response_ends_the_identification() -> None:
 
 @pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
 def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: float) -> None:
-    # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
-    # 0.1 s rounds that off by less than 1 %.
-    params = ReferenceModelConfig.validate_mapping(reference_parameters(speed, authority), "reference_model")
+    # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s
+    # w / e. The pulse's edge of 0.1 s rounds that off by less than 1 %.
+    params = ReferenceModelConfig.validate_mapping(
+        reference_parameters(speed, authority), "reference_model"
+    )
     y_m, row = Reference(params), list(params.outputs).index("V")
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
     assert steepest <= min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
-    assert steepest == pytest.approx(min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02)
-    assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)  # at most 1 g in addition to gravity
+    assert steepest == pytest.approx(
+        min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02
+    )
+    assert max(params.pulses["q"].value) * speed <= GRAVITY * (
+        1.0 + 1e-9
+    )  # at most 1 g in addition to gravity
 
 
 @pytest.fixture(scope="module")
@@ -179,25 +195,30 @@ def cessna() -> IdentifiedAircraft:
 
 
 def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None:
-    # Elevator and rudder of JSBSim's convention turn nose down and nose left: the signs of all its conventional aircraft.
+    # Elevator and rudder of JSBSim's convention turn nose down and nose left: the signs of all its
+    # conventional aircraft.
     assert cessna.D == (-1, 1, 1, -1)
     assert cessna.coupling < 1.0
     assert cessna.sideslip_zero < 0.0
-    # Its surfaces act one step of 5 ms later; its engine has to speed up the propeller, which takes about a second.
+    # Its surfaces act one step of 5 ms later; its engine has to speed up the propeller, which takes
+    # about a second.
     assert cessna.responses.lag[[0, 2, 3]] == pytest.approx([DT] * 3, abs=1e-3)
     assert 0.5 < cessna.responses.lag[1] < 2.0
     assert cessna.failure == ""
 
 
 def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> None:
-    # Numbers in the file have six digits; other machines may round the last ones of a flight differently.
+    # Numbers in the file have six digits; other machines may round the last ones of a flight
+    # differently.
     shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
     written = yaml.safe_load(cessna.text)
     assert shipped.keys() == written.keys()
     for section, content in written.items():
         for key, value in content["ros__parameters"].items():
             found = shipped[section]["ros__parameters"][key]
-            numbers = isinstance(value, float) or (isinstance(value, list) and isinstance(value[0], float))
+            numbers = isinstance(value, float) or (
+                isinstance(value, list) and isinstance(value[0], float)
+            )
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
 
 
@@ -208,10 +229,14 @@ def test_shipped_learner_begins_with_sketch(cessna: IdentifiedAircraft) -> None:
     assert learned.feedforward is not None
     assert shipped.beta == pytest.approx(gains.beta, rel=1e-3)
     for key in ("A", "B"):
-        assert getattr(shipped.feedforward, key) == pytest.approx(getattr(learned.feedforward, key), rel=1e-3, abs=1e-6)
+        assert getattr(shipped.feedforward, key) == pytest.approx(
+            getattr(learned.feedforward, key), rel=1e-3, abs=1e-6
+        )
 
 
-def test_slowest_trim_is_found_within_one_percent(monkeypatch: pytest.MonkeyPatch, cessna: IdentifiedAircraft) -> None:
+def test_slowest_trim_is_found_within_one_percent(
+    monkeypatch: pytest.MonkeyPatch, cessna: IdentifiedAircraft
+) -> None:
     def trims_from_30(condition: FlightCondition) -> None:
         if condition.speed < 30.0:
             raise FlightEnded("does not trim")
@@ -222,10 +247,16 @@ def test_slowest_trim_is_found_within_one_percent(monkeypatch: pytest.MonkeyPatc
 
 def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
     commands = reference_parameters(46.3, 2.0)
-    text = step_identification._text(cessna.condition, cessna.trim, cessna.responses, commands, cessna.selection, stall=30.0)
+    text = step_identification._text(
+        cessna.condition, cessna.trim, cessna.responses, commands, cessna.selection, stall=30.0
+    )
     log = simulate(step_identification._load(text).vary(aircraft={"gusts": {}}))["guidance"]
-    assert log["pose.psi"][-1] == pytest.approx(math.pi / 2.0, abs=math.radians(2.0))  # the band of a settled heading
-    assert log["pose.altitude"][-1] == pytest.approx(1219.2 + 100.0, abs=5.0)  # that of a settled altitude
+    assert log["pose.psi"][-1] == pytest.approx(
+        math.pi / 2.0, abs=math.radians(2.0)
+    )  # the band of a settled heading
+    assert log["pose.altitude"][-1] == pytest.approx(
+        1219.2 + 100.0, abs=5.0
+    )  # that of a settled altitude
 
 
 def rise_di(*arguments: str) -> Result:
@@ -237,7 +268,10 @@ def rise_di(*arguments: str) -> Result:
     ("airframe", "sentence"),
     [
         ("osprey", "airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
-        ("jsbsim:f61", "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH "),
+        (
+            "jsbsim:f61",
+            "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH ",
+        ),
     ],
 )
 def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(
@@ -252,10 +286,22 @@ def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(
 
 def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
     """In a process of its own: JSBSim itself prints nothing either."""
-    words = [sys.executable, "-m", "flight_cli.cli", "identify", "jsbsim:dr1", "--speed", "46", "--altitude", "900"]
+    words = [
+        sys.executable,
+        "-m",
+        "flight_cli.cli",
+        "identify",
+        "jsbsim:dr1",
+        "--speed",
+        "46",
+        "--altitude",
+        "900",
+    ]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 3
-    assert done.stderr.startswith("error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property ")
+    assert done.stderr.startswith(
+        "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "
+    )
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 

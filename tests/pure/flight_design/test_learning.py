@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: a flight that learns beside the law alone, its replay, proposals that are wrong, and the fallback."""
+"""Learning in the air: a flight that learns beside the law alone, its replay, proposals that are
+wrong, and the fallback.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -68,7 +70,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     run, lines = tmp_path_factory.mktemp("learn"), list[str]()
     chosen = written(scenario(), run / "learn.yaml")
     learned = made_learner(chosen)
-    assert fly_in_process(chosen, run, lambda t, text: None, lambda _: learned, lines.append) == "completed"
+    assert (
+        fly_in_process(chosen, run, lambda t, text: None, lambda _: learned, lines.append)
+        == "completed"
+    )
     return Flown(run, lines, learned)
 
 
@@ -90,7 +95,9 @@ def error(tape: Tape, first: float, last: float) -> FloatArray:
     """True rms error of q, V, p, r between two flight times, s."""
     truth, y_m = tape["truth"], tape["y_m"]
     within = (tape.time("y_m") >= first) & (tape.time("y_m") < last)
-    return np.array([np.sqrt(np.mean((truth[f"x.{name}"] - y_m[name])[within] ** 2)) for name in NAMES])
+    return np.array(
+        [np.sqrt(np.mean((truth[f"x.{name}"] - y_m[name])[within] ** 2)) for name in NAMES]
+    )
 
 
 def plant_of(airframe: Airframe, controller: RiseDiConfig) -> LinearPlant:
@@ -127,14 +134,15 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
     tape = read_run(run).tape
     alone = simulate(scenario(learn=None))
     before, after = error(alone, SWITCH, 22.0), error(tape, SWITCH, 22.0)
-    # the model of the second simulator of the prototype: 1.64 to 0.81 in all outputs together, here at least a fifth less
+    # the model of the second simulator of the prototype: 1.64 to 0.81 in all outputs together, here
+    # at least a fifth less
     units = np.array([0.01, 0.1, 0.02, 0.01])
     assert np.sum(after / units) < 0.8 * np.sum(before / units)
     u, t = tape["u"].values, tape.time("u")
     step = np.abs(np.diff(u, axis=0))
     at = int(np.searchsorted(t, SWITCH))
-    # in turbulence u moves in each tick; u_o goes to -F z within `observer.within`, 0.1 s: 31 mrad or 3 % a tick, and u_ff of
-    # the rudder has 8 mrad a tick along the y_m of this roll
+    # in turbulence u moves in each tick; u_o goes to -F z within `observer.within`, 0.1 s: 31 mrad
+    # or 3 % a tick, and u_ff of the rudder has 8 mrad a tick along the y_m of this roll
     assert (step[at - 1] <= step[at - 200 : at - 1].max(axis=0) + 0.04).all()
     assert len(lines) == 1
     assert "B[p, aileron]" in lines[0]
@@ -142,18 +150,27 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
 
 
 def test_feedforward_goes_on_in_the_turn_that_was_commanded_before_the_switch(flown: Flown) -> None:
-    """The model flies in a turn from 15 s on. The reference is a flight in which it flew before the turn, too."""
+    """The model flies in a turn from 15 s on. The reference is a flight in which it flew before the
+    turn, too.
+    """
     (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
     model = vary(scenario().rise_di(), change)
     before = simulate(scenario(**model.model_dump() | {"learn": None}))
-    learned, whole = (tape["internals"]["u_ff.rudder"][-600:] for tape in (read_run(flown.run).tape, before))
-    # sideslip of the two models in the first seconds of the turn; with a wings-level begin the difference is 0.8 rad
+    learned, whole = (
+        tape["internals"]["u_ff.rudder"][-600:] for tape in (read_run(flown.run).tape, before)
+    )
+    # sideslip of the two models in the first seconds of the turn; with a wings-level begin the
+    # difference is 0.8 rad
     assert np.max(np.abs(learned - whole)) < 0.1
 
 
-def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flown, tmp_path: Path) -> None:
+def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
+    flown: Flown, tmp_path: Path
+) -> None:
     model = tmp_path / "model.yaml"
-    result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--write", str(model)])
+    result = CliRunner().invoke(
+        application(["learn"]), ["learn", str(flown.run), "--write", str(model)]
+    )
     assert result.exit_code == 0, result.output
     assert flown.lines[0].partition(" flies ")[2] in " ".join(result.output.split())
     B, of_file = load_airframe(model).matrix_b(), load_airframe("osprey").matrix_b()
@@ -161,14 +178,20 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flow
     assert B[2, 0] / of_file[2, 0] - 1.0 == pytest.approx(found["B[q, elevator]"])
     assert learner(scenario(learn={"prior": str(model)})) is not None
     with pytest.raises(
-        ParameterError, match=r"^controller\.learn\.prior: found an airframe with another name, expected a model of"
+        ParameterError,
+        match=r"^controller\.learn\.prior: found an airframe with another name, expected a "
+        r"model of",
     ):
         learner(scenario(learn={"prior": "navion_lateral"}))
 
 
 def test_log_teaches_with_other_settings(flown: Flown) -> None:
-    """The flight has other parameters than what this learner proposes: it knows no refusal, and identifies once a window."""
-    result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--set", "controller.learn.updates=[10]"])
+    """The flight has other parameters than what this learner proposes: it knows no refusal, and
+    identifies once a window.
+    """
+    result = CliRunner().invoke(
+        application(["learn"]), ["learn", str(flown.run), "--set", "controller.learn.updates=[10]"]
+    )
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
     assert first.startswith("t = 10.00 s: B["), result.output
     assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
@@ -179,12 +202,22 @@ def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     ticks, t = tape["internals"], tape.time("internals")
     changed = ticks.values.copy()
     changed[(t > 5.0) & (t < 6.0), ticks.names.index("mode")] = Mode.INACTIVE
-    changed[t > 2.0, ticks.names.index("age")] = 0.02  # from there on y is two ticks late: an instant is that of the tick
-    cut = replace(tape, signals={"internals": Signal(ticks.stamp_ns[t < 9.5], ticks.names, changed[t < 9.5])})
+    changed[t > 2.0, ticks.names.index("age")] = (
+        0.02  # from there on y is two ticks late: an instant is that of the tick
+    )
+    cut = replace(
+        tape, signals={"internals": Signal(ticks.stamp_ns[t < 9.5], ticks.names, changed[t < 9.5])}
+    )
     steps = learn_again(cut, scenario(learn={"updates": [3.0]})).steps
-    assert [step.t for step in steps] == pytest.approx([3.0, 9.0], abs=0.021)  # 3 s from the first tick of either engagement
-    assert [step.sentence for step in steps] == [f"record: found {length} s, expected 10 s" for length in (2.99, 3.01)]
-    with pytest.raises(ParameterError, match=r"^the log: found at most 5\.02 s of ticks of an active controller"):
+    assert [step.t for step in steps] == pytest.approx(
+        [3.0, 9.0], abs=0.021
+    )  # 3 s from the first tick of either engagement
+    assert [step.sentence for step in steps] == [
+        f"record: found {length} s, expected 10 s" for length in (2.99, 3.01)
+    ]
+    with pytest.raises(
+        ParameterError, match=r"^the log: found at most 5\.02 s of ticks of an active controller"
+    ):
         learn_again(cut, scenario(learn={"updates": [6.0]}))
 
 
@@ -193,7 +226,10 @@ def test_log_without_outputs_that_controller_gave_up_is_refused(flown: Flown) ->
     ticks = tape["internals"]
     kept = [k for k, name in enumerate(ticks.names) if not name.startswith("given_up.")]
     bare = Signal(ticks.stamp_ns, tuple(ticks.names[k] for k in kept), ticks.values[:, kept])
-    with pytest.raises(ParameterError, match=r"^the log: found no channels given_up\.\* of internals, expected a log that has"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^the log: found no channels given_up\.\* of internals, expected a log that has",
+    ):
         learn_again(replace(tape, signals={"internals": bare}), scenario())
 
 
@@ -202,7 +238,11 @@ def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:
     assert found is not None
     for entry in found.entries:
         if entry.matrix == "B" and entry.row in true.outputs:
-            value = true.matrix_b()[true.index(entry.row), list(true.inputs).index(entry.column)] / entry.nominal - 1.0
+            value = (
+                true.matrix_b()[true.index(entry.row), list(true.inputs).index(entry.column)]
+                / entry.nominal
+                - 1.0
+            )
             assert abs(entry.error - value) < 3.0 * entry.deviation, entry.name
 
 
@@ -213,7 +253,9 @@ def test_lost_ticks_are_unknown_in_record() -> None:
     recorded = made.recording()
     # y is q, p, r, V in the law and q, V, p, r in the airframe; u is held
     np.testing.assert_array_equal(recorded.y[:, 0], [0.0, 1.0, np.nan, 3.0, np.nan, np.nan, 6.0])
-    np.testing.assert_array_equal(recorded.u, np.outer([0.0, 1.0, 1.0, 3.0, 3.0, 3.0, 6.0], [1.0, 4.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(
+        recorded.u, np.outer([0.0, 1.0, 1.0, 3.0, 3.0, 3.0, 6.0], [1.0, 4.0, 2.0, 3.0])
+    )
 
 
 def test_short_record_is_refused() -> None:
@@ -224,8 +266,13 @@ def test_short_record_is_refused() -> None:
     assert made.propose(0) == LearnerResult(None, "record: found 5.01 s, expected 10 s")
 
 
-def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, identified = made_learner(scenario(learn={"updates": [15.0]})), Mock(return_value=SimpleNamespace(parts=()))
+def test_identification_is_due_where_last_proposal_does_not_fly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, identified = (
+        made_learner(scenario(learn={"updates": [15.0]})),
+        Mock(return_value=SimpleNamespace(parts=())),
+    )
     monkeypatch.setattr(design_learner, "identify", identified)
     record_rest(made)
     sentence = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
@@ -236,7 +283,9 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     identified.assert_called_once()
 
 
-def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made, start = made_learner(scenario()), scenario().rise_di()
     better, worse = (Prediction(np.ones(4), np.ones(4), value) for value in (2.0, 1.0))
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
@@ -255,12 +304,16 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     assert made.model.matrix_b()[5, 0] == pytest.approx(0.3 * 29.0)
     refused = made.propose(0)
     assert refused.controller is None
-    assert refused.sentence.startswith("q and V: found no model with coupling, expected one, as that which flies; p and r")
+    assert refused.sentence.startswith(
+        "q and V: found no model with coupling, expected one, as that which flies; p and r"
+    )
     # the search begins at the model that flies too
     assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]
 
 
-def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_the_controller_took_back_is_not_proposed_again(
+    flown: Flown, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(design_learner, "change_test", lambda *arguments: [])
     start = scenario().rise_di()
     (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
@@ -274,19 +327,27 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     )
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
-    learned._proposed, learned._last = 0, start  # a later proposal, which lost the race with the fallback
+    learned._proposed, learned._last = (
+        0,
+        start,
+    )  # a later proposal, which lost the race with the fallback
     again = learned.propose(fallen.digest(), ["q", "V"]).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
     restarted = made_learner(scenario())  # it has proposed nothing yet
     restarted._record = learned._record
     restarted._first_ns = learned._first_ns
-    fresh = restarted.propose(without_models(start, start, ["q", "V"]).digest(), ["q", "V"]).controller
+    fresh = restarted.propose(
+        without_models(start, start, ["q", "V"]).digest(), ["q", "V"]
+    ).controller
     assert fresh is not None
     assert acting_inputs(fresh) == ("aileron", "rudder")
     none_left = without_models(start, fresh, ["p", "r"]).digest()
     sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
-    assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
+    assert sentences == [
+        "each part flies the law of the start from now on: no part is left to learn",
+        "",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -301,11 +362,15 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
 def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
     gain: float, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test, and 82 % with A free."""
+    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test, and 82 % with
+    A free.
+    """
     made, start = made_learner(scenario()), scenario().rise_di()
 
     def identified(_: Any, prior: Airframe, **__: Any) -> SimpleNamespace:
-        with_rudder = abs(prior.matrix_b()[prior.index("r"), list(prior.inputs).index("rudder")]) > 0.1
+        with_rudder = (
+            abs(prior.matrix_b()[prior.index("r"), list(prior.inputs).index("rudder")]) > 0.1
+        )
         return SimpleNamespace(parts=(), after=SimpleNamespace(log_likelihood=gain * with_rudder))
 
     monkeypatch.setattr(design_learner, "identify", identified)
@@ -317,9 +382,14 @@ def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
 
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     white, flown = Prediction(np.ones(2), np.ones(2), 1.0), load_airframe("osprey")
-    effects = Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)
+    effects = (
+        Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499),
+        Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0),
+    )
     part = Part(("elevator", "thrust"), ("q", "V"), effects, white, white, "", 0.0, gusts=True)
-    assert design_learner.weaker(part, flown).startswith("B[q, elevator]: found 70 % of that of the model that flies")
+    assert design_learner.weaker(part, flown).startswith(
+        "B[q, elevator]: found 70 % of that of the model that flies"
+    )
     # a first model, one without gusts, and one that is within the deviation that is allowed
     assert design_learner.weaker(part, None) == ""
     assert design_learner.weaker(part._replace(gusts=False), flown) == ""
@@ -327,8 +397,12 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     assert design_learner.weaker(part._replace(entries=near), flown) == ""
 
 
-LATERAL = Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437), Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028)
-"""Effects that a flight showed, with deviations: of the aileron 10 % more than in the file, of the rudder 20 % less."""
+LATERAL = (
+    Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437),
+    Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028),
+)
+"""Effects that a flight showed, with deviations: of the aileron 10 % more than in the file, of the
+rudder 20 % less."""
 
 
 def lateral(*, whiteness: float = 1.0, delay: float = 0.0, delay_deviation: float = 0.0) -> Part:
@@ -336,7 +410,17 @@ def lateral(*, whiteness: float = 1.0, delay: float = 0.0, delay_deviation: floa
     before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
     outputs = ("p", "r")
-    return Part(("aileron", "rudder"), outputs, LATERAL, before, after, "", delay, gusts=False, delay_deviation=delay_deviation)
+    return Part(
+        ("aileron", "rudder"),
+        outputs,
+        LATERAL,
+        before,
+        after,
+        "",
+        delay,
+        gusts=False,
+        delay_deviation=delay_deviation,
+    )
 
 
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
@@ -347,11 +431,19 @@ def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
     return made
 
 
-def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """B exp(-2 s) times the limit of 0.523599 rad, with s relative to the value that was found."""
     proposed = learner_that_finds(lateral(), monkeypatch).propose(0).controller
     assert proposed is not None
-    least = dict(zip(authority_names(proposed.outputs), authority(proposed, scenario().rise_di()).tolist(), strict=True))
+    least = dict(
+        zip(
+            authority_names(proposed.outputs),
+            authority(proposed, scenario().rise_di()).tolist(),
+            strict=True,
+        )
+    )
     assert least["up.p"] == pytest.approx(1.1 * 85.9437 * np.exp(-2.0 * 0.05 / 1.1) * 0.523599)
     assert least["down.r"] == pytest.approx(0.8 * 9.74028 * np.exp(-2.0 * 0.08 / 0.8) * 0.523599)
 
@@ -384,18 +476,24 @@ def test_delay_margin_counts_the_delay_that_was_found(
 
 
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
-    """No file says that u is 40 ms late: with the margin of the start alone the loop is unstable from the first model on."""
+    """No file says that u is 40 ms late: with the margin of the start alone the loop is unstable
+    from the first model on.
+    """
     actuators = scenario().aircraft.actuators.model_dump() | {"delay": 0.04}
     late = scenario().vary(aircraft={"actuators": actuators}, flight={"duration": 26.0})
     learned = made_learner(late)
     tape = simulate(late, learn=lambda _: learned)
     alone = simulate(late.vary(controller={"learn": None}))
     (taken,) = tape.changes
-    assert taken["observer.margin"] == pytest.approx(0.04 + 0.01, abs=0.01)  # a delay within 5 ms, and its deviations
+    assert taken["observer.margin"] == pytest.approx(
+        0.04 + 0.01, abs=0.01
+    )  # a delay within 5 ms, and its deviations
     flown = vary(late.rise_di(), taken)
     assert isinstance(flown, RiseDiConfig)
     true, loop = late.aircraft.sampled_airframe(), Loop(np.array(flown.lag), 0.04, 0.01)
-    assert is_stable(plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4))
+    assert is_stable(
+        plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4)
+    )
     units = np.array([0.01, 0.1, 0.02, 0.01])
     assert np.sum(error(tape, SWITCH, 26.0) / units) < np.sum(error(alone, SWITCH, 26.0) / units)
 
@@ -415,7 +513,9 @@ RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
 def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
     flown: tuple[int, int, int], frequency: float, tested: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this test."""
+    """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this
+    test.
+    """
     made, test = made_learner(scenario(learn={"updates": [10.0]})), Mock(return_value=())
     monkeypatch.setattr(design_learner, "change_test", test)
     made._known = {("p", "r"): Known(0, {}, 0.0, False)}
@@ -429,12 +529,16 @@ def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
 
 
 def test_flight_without_learner_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"^controller\.learn: found a flight without a learner"):
+    with pytest.raises(
+        ParameterError, match=r"^controller\.learn: found a flight without a learner"
+    ):
         simulate(scenario())
 
 
 def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
-    """A model without the delay of the aircraft, and a feedback eight times too strong: the model alone is certified."""
+    """A model without the delay of the aircraft, and a feedback eight times too strong: the model
+    alone is certified.
+    """
     margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
     late = scenario(learn={"updates": [6.0], "latency": 0.0}, **margin).vary(
         aircraft={"sensors": {"delay": 0.03}}, flight={"duration": 12.0}

@@ -3,8 +3,8 @@
 # ruff: noqa: N802 - V1, V2, P, K are the paper's names
 """The theorem's Lyapunov functions along flights of the law as it is sampled.
 
-In continuous time V2_dot = -z'Qz exactly, so V2 falls if `decay_matrix` is positive definite, for any beta. beta
-determines P: P stays above zero, and V2 bounds e and r, only if (29), (30) hold.
+In continuous time V2_dot = -z'Qz exactly, so V2 falls if `decay_matrix` is positive definite, for
+any beta. beta determines P: P stays above zero, and V2 bounds e and r, only if (29), (30) hold.
 """
 
 from dataclasses import replace
@@ -44,15 +44,26 @@ TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) require 1.7 and 
 def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams, Evidence]:
     case = example(dt, duration)
     params = case.params._replace(**gains)
-    return case, params, evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
+    return (
+        case,
+        params,
+        evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params),
+    )
 
 
 @cache
-def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tuple[Scenario, KnownPlant, Evidence]:
-    """The default scenario at another rate of the law, with both gusts in its first twelve seconds."""
+def osprey(
+    rate: float, beta_factor: float = 1.0, duration: float = 12.0
+) -> tuple[Scenario, KnownPlant, Evidence]:
+    """The default scenario at another rate of the law, with both gusts in its first twelve
+    seconds.
+    """
     scenario = find_scenario("osprey_gust")
     starts = {"lateral": 4.0, "vertical": 8.0}
-    gusts = {name: gust.model_dump() | {"start": starts[name]} for name, gust in scenario.aircraft.gusts.items()}
+    gusts = {
+        name: gust.model_dump() | {"start": starts[name]}
+        for name, gust in scenario.aircraft.gusts.items()
+    }
     beta = [beta_factor * value for value in scenario.rise_di().beta]
     scenario = scenario.vary(
         flight={"duration": duration},
@@ -71,8 +82,9 @@ def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) ->
 
 @pytest.mark.equation(48)
 def test_rise_of_V2_is_sampling_term_of_first_order() -> None:
-    # Where e crosses zero between two ticks, s is wrong for one of them: V2 gains at most 2 dt sum beta_i abs(r_i) there.
-    # Measured 5.4, 5.4, 2.2 and 1.4 thousandths, that is 0.27 to 0.56 times dt, of a V2 that falls by 3.
+    # Where e crosses zero between two ticks, s is wrong for one of them: V2 gains at most 2 dt sum
+    # beta_i abs(r_i) there. Measured 5.4, 5.4, 2.2 and 1.4 thousandths, that is 0.27 to 0.56 times
+    # dt, of a V2 that falls by 3.
     rises = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS]
     assert all(rise < 1.0 * dt for rise, dt in zip(rises, PERIODS, strict=True))
     assert rises[-1] < rises[0] / 2.0
@@ -80,7 +92,8 @@ def test_rise_of_V2_is_sampling_term_of_first_order() -> None:
 
 @pytest.mark.equation(4, 31, 46, 48)
 def test_V2_falls_by_integral_of_quadratic_form_up_to_sampling() -> None:
-    # Measured 0.14, 0.090, 0.064 and 0.037 of a fall of 3: one derivation of V2_dot, another of V2, none of them the law's.
+    # Measured 0.14, 0.090, 0.064 and 0.037 of a fall of 3: one derivation of V2_dot, another of V2,
+    # none of them the law's.
     worst = []
     for dt in PERIODS:
         case, params, found = fly_example(dt, 6.0)
@@ -93,7 +106,8 @@ def test_V2_falls_by_integral_of_quadratic_form_up_to_sampling() -> None:
 
 @pytest.mark.equation(28)
 def test_e_and_r_settle_on_band_of_second_order_where_conditions_hold() -> None:
-    # The disturbance and the reference are persistent, yet halving dt quarters both: measured 4.0 times each.
+    # The disturbance and the reference are persistent, yet halving dt quarters both: measured 4.0
+    # times each.
     cases = [fly_example(dt, 12.0)[2] for dt in PERIODS]
     for name in ("e", "r"):
         bands = [tail(getattr(case, name), case.t, 8.0) for case in cases]
@@ -103,26 +117,44 @@ def test_e_and_r_settle_on_band_of_second_order_where_conditions_hold() -> None:
 
 def test_r_is_the_error_filtered_by_Lambda() -> None:
     _, params, found = fly_example(0.0025, 6.0)
-    r = np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e  # (4), e_dot by another route than the evidence's
+    r = (
+        np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e
+    )  # (4), e_dot by another route than the evidence's
     settled = found.t > 0.1  # at engagement e_dot turns within a tick
-    # second differences at 2.5 ms differ by less than 1 %; Lambda wrong by a tenth makes 5 % and more
-    assert np.abs(r - found.r)[settled].max() < 0.02 * np.abs(params.Lambda * found.e)[settled].max()
+    # second differences at 2.5 ms differ by less than 1 %; Lambda wrong by a tenth makes 5 % and
+    # more
+    assert (
+        np.abs(r - found.r)[settled].max() < 0.02 * np.abs(params.Lambda * found.e)[settled].max()
+    )
 
 
 def test_constant_of_lemma_2_is_hand_worked_one() -> None:
-    # e falls from 2 to 0 in 2 s with N_d = 0.5, Lambda = 3, beta = 2, U = 1: zeta = 0.5, gamma_2 = 3 (2 / 0.5 - 1) = 9
-    # gamma_1 = max(-2, 1 - 9 1.5 - 1, 2 - 9 2) = -2, zeta_b = beta 2 + gamma_1 zeta = 4 - 1 = 3
+    # e falls from 2 to 0 in 2 s with N_d = 0.5, Lambda = 3, beta = 2, U = 1: zeta = 0.5, gamma_2 =
+    # 3 (2 / 0.5 - 1) = 9 gamma_1 = max(-2, 1 - 9 1.5 - 1, 2 - 9 2) = -2, zeta_b = beta 2 + gamma_1
+    # zeta = 4 - 1 = 3
     one = np.ones((1, 1))
     plant = KnownPlant(-one, one, one, lambda t, x: 0.0 * x)
     column, zero = np.array([[2.0], [1.0], [0.0]]), np.zeros(3)
-    flight = Evidence(np.arange(3.0), column, -np.ones((3, 1)), column, np.full((3, 1), 0.5), zero, zero, zero, zero)
+    flight = Evidence(
+        np.arange(3.0),
+        column,
+        -np.ones((3, 1)),
+        column,
+        np.full((3, 1), 0.5),
+        zero,
+        zero,
+        zero,
+        zero,
+    )
     assert lemma_2(plant, flight, law_params(1.0, 3.0, 2.0)) == pytest.approx(3.0)
 
 
 @pytest.mark.equation(3, 47)
 def test_P_stays_positive_with_constant_of_lemma_2() -> None:
     case, params, found = fly_example(0.005, 12.0)
-    assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
+    assert (
+        np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9
+    )  # measured 0.93: steps 2 and 3 of the theorem hold
     zeta_b = lemma_2(case.plant, found, params)
     flight = fly(case.plant, case.y_m, 0.005, params, case.x_0)
     P = evidence(case.plant, flight, params, zeta_b).P
@@ -136,9 +168,13 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
     _, weak, bad = fly_example(0.01, 60.0, beta=TOO_SMALL * params.beta)
     assert tail(good.e, good.t, 20.0) < 1e-3  # measured 3.3e-4
     assert tail(bad.e, bad.t, 20.0) > 0.25  # measured 0.31
-    assert bad.P[-1] < -lemma_2(case.plant, good, params)  # the constant that carries the good gains: -9.1 against 5.4
+    assert bad.P[-1] < -lemma_2(
+        case.plant, good, params
+    )  # the constant that carries the good gains: -9.1 against 5.4
     half = len(bad.t) // 2
-    assert bad.P[-1] - bad.P[half] < 0.5 * (bad.P[half] - bad.P[0])  # and it keeps falling: -5.5, -9.1
+    assert bad.P[-1] - bad.P[half] < 0.5 * (
+        bad.P[half] - bad.P[0]
+    )  # and it keeps falling: -5.5, -9.1
     with pytest.raises(ValueError, match=r"beta\[0\]: found 0.25, expected at least"):
         lemma_2(case.plant, bad, weak)
 
@@ -153,16 +189,20 @@ def test_with_beta_too_small_V2_still_falls_so_that_fall_alone_proves_nothing() 
 
 @pytest.mark.equation(48)
 def test_with_K_too_small_V2_rises_at_every_period() -> None:
-    # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no sampling term.
+    # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no
+    # sampling term.
     for dt in (0.01, 0.005, 0.0025):
-        case, params, found = fly_example(dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0]))
+        case, params, found = fly_example(
+            dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0])
+        )
         assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() < -6.0
         assert largest_rise(found.V2) > 2.5
         assert tail(found.e, found.t, 15.0) < 1e-3  # the conditions are sufficient, not necessary
 
 
 def test_literal_sign_lets_V2_rise_by_chatter_that_fades_with_period() -> None:
-    # It reverses at every tick at rest, so its sampling term adds up over the flight: measured 0.86, 0.43 and 0.20 in 6 s.
+    # It reverses at every tick at rest, so its sampling term adds up over the flight: measured
+    # 0.86, 0.43 and 0.20 in 6 s.
     rises = [largest_rise(fly_example(dt, 6.0, sign=Sign.LITERAL)[2].V2) for dt in PERIODS[1:]]
     implicit = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS[1:]]
     assert all(1.5 < before / after < 3.0 for before, after in pairwise(rises))
@@ -170,7 +210,8 @@ def test_literal_sign_lets_V2_rise_by_chatter_that_fades_with_period() -> None:
 
 
 def test_along_osprey_V2_rises_by_sampling_term_only() -> None:
-    # Engaged in trim, e(0) = 0: V2 has nothing to lose, all it does is sampling. Measured 2.0e-3, 5.0e-4, 7.9e-5.
+    # Engaged in trim, e(0) = 0: V2 has nothing to lose, all it does is sampling. Measured 2.0e-3,
+    # 5.0e-4, 7.9e-5.
     rises = [largest_rise(osprey(rate)[2].V2) for rate in (100.0, 200.0, 400.0)]
     assert rises[0] < 4e-3
     assert all(before / after > 3.0 for before, after in pairwise(rises))
@@ -178,31 +219,40 @@ def test_along_osprey_V2_rises_by_sampling_term_only() -> None:
 
 @pytest.mark.equation(1)
 def test_along_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
-    # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2 omega (D U D)^-1 N_d.
+    # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2
+    # omega (D U D)^-1 N_d.
     for rate in (100.0, 200.0):
         scenario, plant, found = osprey(rate)
         _, D, U = decompose(plant.C @ plant.B)
         needed = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, found.N_d.T)), axis=1)
         predicted = np.array(scenario.rise_di().omega) * needed / rate**2
-        assert np.max(np.abs(found.e), axis=0) == pytest.approx(predicted, rel=0.05)  # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
+        assert np.max(np.abs(found.e), axis=0) == pytest.approx(
+            predicted, rel=0.05
+        )  # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
 
 
 @pytest.mark.equation(16, 17, 18, 47)
 def test_along_osprey_P_needs_beta_above_largest_N_d() -> None:
     scenario, _, good = osprey(200.0)
     beta = np.array(scenario.rise_di().beta)
-    assert np.all(np.max(np.abs(good.N_d), axis=0) < beta)  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
+    assert np.all(
+        np.max(np.abs(good.N_d), axis=0) < beta
+    )  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
     assert good.P.min() > -1e-6  # measured -3e-9 with zeta_b = beta e(0) = 0
     _, _, bad = osprey(200.0, beta_factor=0.1)
     assert bad.P[-1] < -10.0  # measured -12.3
-    assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(np.abs(good.e[:, 0]))  # pitch rate: 0.14 against 5.9e-4 rad/s
+    assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(
+        np.abs(good.e[:, 0])
+    )  # pitch rate: 0.14 against 5.9e-4 rad/s
 
 
 def test_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
     scenario, plant, _ = osprey(100.0, duration=0.1)
     law = scenario.controller.law_params()
     assert np.linalg.eigvalsh(decay_matrix(plant, law)).min() < -7.0  # measured -7.8
-    raised = law._replace(K=np.array([30.0, 50.0, 18.0, 4.0]), Lambda=np.array([1.0, 1.0, 1.0, 0.5]))
+    raised = law._replace(
+        K=np.array([30.0, 50.0, 18.0, 4.0]), Lambda=np.array([1.0, 1.0, 1.0, 0.5])
+    )
     assert np.linalg.eigvalsh(decay_matrix(plant, raised)).min() > 0.25  # measured 0.30
 
 
@@ -210,6 +260,8 @@ def test_tape_without_truth_at_ticks_refused() -> None:
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
     tape = simulate(scenario)
     truth = tape["truth"]
-    short = replace(tape, signals={**tape.signals, "truth": replace(truth, stamp_ns=truth.stamp_ns + 1)})
+    short = replace(
+        tape, signals={**tape.signals, "truth": replace(truth, stamp_ns=truth.stamp_ns + 1)}
+    )
     with pytest.raises(ValueError, match="truth: samples at 0 of 11 ticks"):
         from_tape(scenario, short)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification from a log: flights of aircraft whose A and B are known, and systems whose innovations are known."""
+"""Identification from a log: flights of aircraft whose A and B are known, and systems whose
+innovations are known.
+"""
 
 import json
 import re
@@ -35,7 +37,9 @@ from flight_log.tape_writer import write_run
 pytestmark = pytest.mark.slow
 
 OSPREY = load_airframe("osprey")
-ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)  # those of osprey_servo; a flight in one process has no delay
+ACTUATORS = Actuation(
+    np.array([0.02, 0.1, 0.02, 0.02]), 0.0
+)  # those of osprey_servo; a flight in one process has no delay
 DURATION = 36.0  # s: the commands of osprey_servo end at 33 s
 AIR: dict[str, dict[str, Any]] = {
     "calm": {"gusts": {}},
@@ -67,7 +71,9 @@ def flight(air: str, uncertainty: float) -> Tape:
 
 @cache
 def identified(air: str, uncertainty: float) -> Identification:
-    return identify(innovation_filters.recording(flight(air, uncertainty), OSPREY), OSPREY, ACTUATORS)
+    return identify(
+        innovation_filters.recording(flight(air, uncertainty), OSPREY), OSPREY, ACTUATORS
+    )
 
 
 def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, float]:
@@ -76,13 +82,25 @@ def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, flo
     values = {}
     for entry in entries:
         row = aircraft.index(entry.row)
-        value = A[row, aircraft.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
+        value = (
+            A[row, aircraft.index(entry.column)]
+            if entry.matrix == "A"
+            else B[row, inputs.index(entry.column)]
+        )
         values[entry.name] = float(value / entry.nominal - 1.0)
     return values
 
 
 FLIGHTS = [("gust", 0.5), ("turbulence", 0.3)]
-MATTER = ("B[V, thrust]", "B[q, elevator]", "A[p, p]", "B[p, aileron]", "A[beta, r]", "A[p, r]", "B[r, rudder]")
+MATTER = (
+    "B[V, thrust]",
+    "B[q, elevator]",
+    "A[p, p]",
+    "B[p, aileron]",
+    "A[beta, r]",
+    "A[p, r]",
+    "B[r, rudder]",
+)
 """What moves the outputs: the effect of each input, roll damping, and the coupling of yaw."""
 
 
@@ -94,15 +112,27 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
     for name in MATTER:
         assert abs(by_name[name].error - true[name]) < 3.0 * by_name[name].deviation, name
     # turbulence hides what the inputs do: their effects are known less well
-    largest = {"B[V, thrust]": 0.01, "B[q, elevator]": 0.1, "B[p, aileron]": 0.01, "B[r, rudder]": 0.05}
+    largest = {
+        "B[V, thrust]": 0.01,
+        "B[q, elevator]": 0.1,
+        "B[p, aileron]": 0.01,
+        "B[r, rudder]": 0.05,
+    }
     if air == "turbulence":
-        largest = {"B[V, thrust]": 0.06, "B[q, elevator]": 0.12, "B[p, aileron]": 0.02, "B[r, rudder]": 0.12}
+        largest = {
+            "B[V, thrust]": 0.06,
+            "B[q, elevator]": 0.12,
+            "B[p, aileron]": 0.02,
+            "B[r, rudder]": 0.12,
+        }
     for name, bound in largest.items():
         assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < bound, name
 
 
 @pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
-def test_innovations_of_held_out_samples_are_smaller_and_whiter(air: str, uncertainty: float) -> None:
+def test_innovations_of_held_out_samples_are_smaller_and_whiter(
+    air: str, uncertainty: float
+) -> None:
     found = identified(air, uncertainty)
     assert found.refusal == ""
     assert len(found.parts) == 2  # nothing is taken as coupled that is not
@@ -116,7 +146,9 @@ def test_innovations_of_held_out_samples_are_smaller_and_whiter(air: str, uncert
 def test_the_deviations_are_those_of_the_errors() -> None:
     found = identified("gust", 0.5)
     true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), found.entries)
-    scaled = np.array([(entry.error - true[entry.name]) / entry.deviation for entry in found.entries])
+    scaled = np.array(
+        [(entry.error - true[entry.name]) / entry.deviation for entry in found.entries]
+    )
     # of 26 normal numbers the mean square is below 2 with a probability of 0.998
     assert np.mean(scaled**2) < 2.0
 
@@ -124,22 +156,38 @@ def test_the_deviations_are_those_of_the_errors() -> None:
 def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
     found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
-    pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs [\d.]+ times the amplitude"
+    pattern = (
+        r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs "
+        r"[\d.]+ times the amplitude"
+    )
     assert re.match(pattern, found.refusal)
 
 
 def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     """At rest the innovations are 0. The seconds that move are then no outliers."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 20.0})  # p moves from 11 s on
-    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, Actuation(np.zeros(4), 0.0))
+    found = identify(
+        innovation_filters.recording(simulate(scenario), OSPREY),
+        OSPREY,
+        Actuation(np.zeros(4), 0.0),
+    )
     assert all(0.0 < entry.deviation < 0.3 for entry in found.entries)
 
 
 def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
-    """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll pitches it."""
+    """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll
+    pitches it.
+    """
     A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
-    row, aileron, elevator = OSPREY.index("p"), list(OSPREY.inputs).index("aileron"), list(OSPREY.inputs).index("elevator")
-    coupled = {"B[p, elevator]": 0.1 * B[row, aileron], "A[q, p]": 0.1 * A[OSPREY.index("q"), OSPREY.index("q")]}
+    row, aileron, elevator = (
+        OSPREY.index("p"),
+        list(OSPREY.inputs).index("aileron"),
+        list(OSPREY.inputs).index("elevator"),
+    )
+    coupled = {
+        "B[p, elevator]": 0.1 * B[row, aileron],
+        "A[q, p]": 0.1 * A[OSPREY.index("q"), OSPREY.index("q")],
+    }
     B[row, elevator], A[OSPREY.index("q"), row] = coupled.values()
     airframe = tmp_path / "coupled.yaml"
     airframe.write_text(as_yaml(OSPREY.with_matrices(A, B, np.ones((8, 3)))), encoding="utf-8")
@@ -149,8 +197,13 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     assert [part.outputs for part in found.parts] == [OSPREY.outputs]
     entries = {entry.name: entry for entry in found.entries}
     for name, value in coupled.items():
-        assert abs(entries[name].value - value) < 3.0 * abs(entries[name].unit) * entries[name].deviation, name
-    assert found.airframe.matrix_b()[row, elevator] == pytest.approx(coupled["B[p, elevator]"], rel=0.2)
+        assert (
+            abs(entries[name].value - value)
+            < 3.0 * abs(entries[name].unit) * entries[name].deviation
+        ), name
+    assert found.airframe.matrix_b()[row, elevator] == pytest.approx(
+        coupled["B[p, elevator]"], rel=0.2
+    )
     assert "#   B[p, elevator]: " in model_yaml(found, "a flight")
 
 
@@ -158,13 +211,19 @@ def test_lost_samples_are_predicted_over() -> None:
     tape = flight("gust", 0.5)
     y = tape["y"]
     kept = np.random.default_rng(1).random(len(y.stamp_ns)) > 0.2
-    lossy = replace(tape, signals={**tape.signals, "y": Signal(y.stamp_ns[kept], y.names, y.values[kept])})
+    lossy = replace(
+        tape, signals={**tape.signals, "y": Signal(y.stamp_ns[kept], y.names, y.values[kept])}
+    )
     recorded = innovation_filters.recording(lossy, OSPREY)
     assert np.isnan(recorded.y[:, 0]).mean() == pytest.approx(0.2, abs=0.02)
     found = identify(recorded, OSPREY, ACTUATORS)
     true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), found.entries)
     assert found.refusal == ""
-    assert all(abs(entry.error - true[entry.name]) < 3.0 * entry.deviation for entry in found.entries if entry.name in MATTER)
+    assert all(
+        abs(entry.error - true[entry.name]) < 3.0 * entry.deviation
+        for entry in found.entries
+        if entry.name in MATTER
+    )
 
 
 # Parts with a known result
@@ -173,23 +232,38 @@ def test_lost_samples_are_predicted_over() -> None:
 def test_y_taken_at_stamps_of_u() -> None:
     tape = flight("gust", 0.5)
     y, u = tape["y"], tape["u"]
-    fast = np.repeat(y.values, 5, axis=0) + np.tile([[0.0], [9.0], [9.0], [9.0], [9.0]], (len(y.values), 1))
+    fast = np.repeat(y.values, 5, axis=0) + np.tile(
+        [[0.0], [9.0], [9.0], [9.0], [9.0]], (len(y.values), 1)
+    )
     stamps = np.arange(len(fast)) * 2_000_000
-    recorded = innovation_filters.recording(replace(tape, signals={"y": Signal(stamps, y.names, fast), "u": u}), OSPREY)
+    recorded = innovation_filters.recording(
+        replace(tape, signals={"y": Signal(stamps, y.names, fast), "u": u}), OSPREY
+    )
     order = [y.names.index(name) for name in OSPREY.outputs]
     np.testing.assert_array_equal(recorded.y, y.values[: len(recorded.y), order])
     assert recorded.period == 0.01
 
 
 def test_log_that_shows_no_model_is_refused() -> None:
-    """An output that never changes, and a gap of twelve days, which must not be filled with samples."""
+    """An output that never changes, and a gap of twelve days, which must not be filled with
+    samples.
+    """
     tape = flight("gust", 0.5)
     y, u = tape["y"], tape["u"]
     still = Signal(y.stamp_ns, y.names, y.values * [name != "p" for name in y.names])
-    with pytest.raises(ParameterError, match=r"^the log: found no change of p, expected a flight that excites each output$"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^the log: found no change of p, expected a flight that excites each output$",
+    ):
         innovation_filters.recording(replace(tape, signals={"y": still, "u": u}), OSPREY)
-    late = [Signal(of.stamp_ns + 10**15 * (of.stamp_ns > of.stamp_ns.mean()), of.names, of.values) for of in (y, u)]
-    with pytest.raises(ParameterError, match=r"^the log: found .* s of u in 1e\+06 s, expected a log without long gaps$"):
+    late = [
+        Signal(of.stamp_ns + 10**15 * (of.stamp_ns > of.stamp_ns.mean()), of.names, of.values)
+        for of in (y, u)
+    ]
+    with pytest.raises(
+        ParameterError,
+        match=r"^the log: found .* s of u in 1e\+06 s, expected a log without long gaps$",
+    ):
         innovation_filters.recording(replace(tape, signals={"y": late[0], "u": late[1]}), OSPREY)
 
 
@@ -205,19 +279,32 @@ def osprey_model(noise: Any = (0.0017, 0.03, 0.0017, 0.0017)) -> NominalModel:
 
 
 def test_the_osprey_has_two_blocks() -> None:
-    names = [{np.array(list(OSPREY.states))[k] for k in block.states} for block in innovation_filters.blocks(osprey_model())]
+    names = [
+        {np.array(list(OSPREY.states))[k] for k in block.states}
+        for block in innovation_filters.blocks(osprey_model())
+    ]
     assert names == [{"V", "alpha", "q", "theta"}, {"beta", "p", "r", "phi"}]
 
 
 def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     block = innovation_filters.blocks(osprey_model())[0]
     model = block.restricted(osprey_model())
-    model = model._replace(A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity)
-    names = Names(("V", "alpha", "q", "theta"), ("elevator", "thrust"), ("q", "V"), ("vertical", "longitudinal"))
+    model = model._replace(
+        A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity
+    )
+    names = Names(
+        ("V", "alpha", "q", "theta"),
+        ("elevator", "thrust"),
+        ("q", "V"),
+        ("vertical", "longitudinal"),
+    )
     bank = innovation_filters.filter_bank(model, names, 25.0, np.ones((1, 2)))
     # simulate the filter's own model with the noise for which it is designed
     generator, Phi, H = np.random.default_rng(1), bank.sampled.Phi[0, 0], bank.sampled.H
-    wind = [bank.sampled.states.index("x.wind.vertical"), bank.sampled.states.index("x.wind.longitudinal")]
+    wind = [
+        bank.sampled.states.index("x.wind.vertical"),
+        bank.sampled.states.index("x.wind.longitudinal"),
+    ]
     _, gust = innovation_filters.wind_model(names.winds, 25.0)
     z, y = np.zeros(len(Phi)), np.zeros((20_000, 2))
     for k in range(len(y)):
@@ -225,9 +312,15 @@ def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
         z = Phi @ z
         z[wind] += gust * 0.1 * generator.standard_normal(2)  # root of the period, s
     level = np.full(len(y) // innovation_filters.HOLD, 4)
-    r, _ = innovation_filters.Passage(bank, y, np.zeros((len(y), 2)), level).run(np.zeros((1, len(Phi))))
-    e = np.asarray(np.linalg.solve(np.linalg.cholesky(bank.covariance[0, 4]), r[0, 1000:].T).T, dtype=np.float64)
-    # 19000 samples: the standard deviation of a variance is 1 %; states and disturbances have almost no noise here
+    r, _ = innovation_filters.Passage(bank, y, np.zeros((len(y), 2)), level).run(
+        np.zeros((1, len(Phi)))
+    )
+    e = np.asarray(
+        np.linalg.solve(np.linalg.cholesky(bank.covariance[0, 4]), r[0, 1000:].T).T,
+        dtype=np.float64,
+    )
+    # 19000 samples: the standard deviation of a variance is 1 %; states and disturbances have
+    # almost no noise here
     np.testing.assert_allclose(np.cov(e.T), np.eye(2), atol=0.04)
     assert whiteness(e, np.ones(len(e), dtype=bool)).max() < 2.0
 
@@ -274,17 +367,28 @@ def command(*arguments: Any) -> Any:
 
 def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None:
     model = tmp_path / "model.yaml"
-    result = command(run_folder(tmp_path), "--airframe", "osprey", "--set", "delay=0", "--write", model, "--json")
+    result = command(
+        run_folder(tmp_path), "--airframe", "osprey", "--set", "delay=0", "--write", model, "--json"
+    )
     assert result.exit_code == 0
     found = identified("turbulence", 0.3)
     entries = json.loads(result.stdout)["entries"]
     assert list(entries) == [entry.name for entry in found.entries]
     for entry in found.entries:
-        shown = {"nominal": entry.nominal, "value": entry.value, "change": entry.error, "deviation": entry.deviation}
+        shown = {
+            "nominal": entry.nominal,
+            "value": entry.value,
+            "change": entry.error,
+            "deviation": entry.deviation,
+        }
         assert entries[entry.name] == shown | {"unit": entry.nominal}
     written = load_airframe(str(model))
     np.testing.assert_array_equal(written.matrix_b(), found.airframe.matrix_b())
     np.testing.assert_array_equal(written.matrix_gusts(), found.airframe.matrix_gusts())
-    header = [line for line in model.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    header = [
+        line for line in model.read_text(encoding="utf-8").splitlines() if line.startswith("#")
+    ]
     assert any("B[q, elevator]" in line for line in header)
-    assert {"nominal", "identified", "held out"} <= set(re.findall(r'"name":"([^"]+)"', model.with_suffix(".html").read_text()))
+    assert {"nominal", "identified", "held out"} <= set(
+        re.findall(r'"name":"([^"]+)"', model.with_suffix(".html").read_text())
+    )

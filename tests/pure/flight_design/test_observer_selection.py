@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Selection of an observer: shipped scenarios, delay margin, models that are refused, the one without A, the command."""
+"""Selection of an observer: shipped scenarios, delay margin, models that are refused, the one
+without A, the command.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -39,7 +41,8 @@ SHIPPED = ("osprey_observer", "osprey_turbulence")
 
 
 FLOWN = SERVO.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
-"""osprey_servo with y at the rate of the law and steps of 5 ms: half of the time of the shipped one."""
+"""osprey_servo with y at the rate of the law and steps of 5 ms: half of the time of the shipped
+one."""
 
 
 def with_observer(controller: RiseDiConfig) -> Scenario:
@@ -67,18 +70,25 @@ def Omega() -> FloatArray:  # noqa: N802 - the paper's name
 
 def test_shipped_scenarios_have_observer_that_command_writes(tmp_path: Path) -> None:
     written = tmp_path / "gains.yaml"
-    result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--observer", "--write", str(written)])
+    result = CliRunner().invoke(
+        application(["gains"]), ["gains", "osprey", "--observer", "--write", str(written)]
+    )
     assert result.exit_code == 0, result.output
     assert "gains of a search in osprey_servo" in result.output
-    section = yaml.safe_load(written.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
+    section = yaml.safe_load(written.read_text(encoding="utf-8"))["/**/controller"][
+        "ros__parameters"
+    ]
     again = RiseDiConfig.validate_mapping(section, "controller")
     assert again.observer is not None
     for shipped in (find_scenario(name).controller for name in SHIPPED):
         assert shipped.feedforward == again.feedforward
         assert shipped.observer is not None
         for key in ("Phi", "Gamma", "L", "F"):
-            # another LAPACK may differ in the last of the ten digits, amplified by the Riccati equations
-            np.testing.assert_allclose(getattr(shipped.observer, key), getattr(again.observer, key), rtol=1e-6, atol=1e-9)
+            # another LAPACK may differ in the last of the ten digits, amplified by the Riccati
+            # equations
+            np.testing.assert_allclose(
+                getattr(shipped.observer, key), getattr(again.observer, key), rtol=1e-6, atol=1e-9
+            )
 
 
 def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> None:
@@ -90,7 +100,9 @@ def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> No
         law = linear_law(controller.tuned_law(), 4, 0.01)
         assert selected.delay_margin >= margin
         assert is_stable(plant, law, loop, np.full(4, margin))
-        assert not is_stable(plant, law, loop, np.full(4, selected.delay_margin + 0.001))  # the search ends within 0.1 ms
+        assert not is_stable(
+            plant, law, loop, np.full(4, selected.delay_margin + 0.001)
+        )  # the search ends within 0.1 ms
     assert np.prod(by_rule(0.045).relaxation) > np.prod(by_rule(0.03).relaxation)
 
 
@@ -105,7 +117,13 @@ def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not()
     controller = by_rule().controller
     calm = with_observer(controller).vary(flight={"duration": 12.0}, aircraft={"gusts": {}})
     within, beyond = (
-        rms(simulate(calm.vary(aircraft={"sensors": calm.aircraft.sensors.model_dump() | {"delay": delay}})))
+        rms(
+            simulate(
+                calm.vary(
+                    aircraft={"sensors": calm.aircraft.sensors.model_dump() | {"delay": delay}}
+                )
+            )
+        )
         for delay in (0.02, 0.08)
     )
     assert within[0] < 5.0  # mrad/s in q
@@ -113,37 +131,59 @@ def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not()
 
 
 def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
-    # q, V, p, r in gusts: measured 0.94, 0.15, 0.14, 0.46; the rule is a start, and the gains of a search are better still
+    # q, V, p, r in gusts: measured 0.94, 0.15, 0.14, 0.46; the rule is a start, and the gains of a
+    # search are better still
     alone, observed = rms_alone(), rms(simulate(with_observer(by_rule().controller)))
     assert (observed < [1.0, 0.5, 0.5, 0.5] * alone).all()
 
 
 def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     flipped = OSPREY.with_matrices(OSPREY.matrix_a(), -OSPREY.matrix_b(), np.ones((8, 3)))
-    gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
-    with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
-        with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
-    monkeypatch.setattr(observer_selection, "MAX_RELAXATION", 1.2)  # the search up to 18 takes half a minute
+    gains = gains_by_rule(
+        model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed
+    )
     with pytest.raises(
-        ParameterError, match=r"^--margin: delay margin \(ms\): .*, expected at least 500.*; give the loop less delay"
+        ParameterError,
+        match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]",
+    ):
+        with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
+    monkeypatch.setattr(
+        observer_selection, "MAX_RELAXATION", 1.2
+    )  # the search up to 18 takes half a minute
+    with pytest.raises(
+        ParameterError,
+        match=r"^--margin: delay margin \(ms\): .*, expected at least 500.*; give the loop less "
+        r"delay",
     ):
         with_aircraft_observer(SERVO.rise_di(), OSPREY, [gains], NOISE, 0.5)
     with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
         with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)
     calm = OSPREY.model_copy(update={"gusts": {}})
-    with pytest.raises(ParameterError, match=r"^airframe osprey: found no gusts, expected the effect of wind"):
+    with pytest.raises(
+        ParameterError, match=r"^airframe osprey: found no gusts, expected the effect of wind"
+    ):
         with_aircraft_observer(SERVO.rise_di(), calm, [gains], NOISE, 0.03)
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--set", "model=osprey"], "error: --set model: found osprey, expected observer beside it"),
+        (
+            ["--set", "model=osprey"],
+            "error: --set model: found osprey, expected observer beside it",
+        ),
         (["--observer", "--check"], "error: --observer: found it beside --check"),
-        (["--observer", "--set", "margin=0.9"], "error: --set margin: found 0.9, expected 0 to 0.5 s"),
+        (
+            ["--observer", "--set", "margin=0.9"],
+            "error: --set margin: found 0.9, expected 0 to 0.5 s",
+        ),
     ],
 )
-def test_command_refuses_options_that_contradict_each_other(arguments: list[str], sentence: str) -> None:
+def test_command_refuses_options_that_contradict_each_other(
+    arguments: list[str], sentence: str
+) -> None:
     with pytest.raises(ParameterError) as refused:
-        CliRunner().invoke(application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False)
+        CliRunner().invoke(
+            application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False
+        )
     assert f"error: {refused.value}".startswith(sentence)

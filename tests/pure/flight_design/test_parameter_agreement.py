@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of ArduPilot against the channel maps. Expected values are by its formulas for channels and servos."""
+"""The parameters of ArduPilot against the channel maps. Expected values are by its formulas for
+channels and servos.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -25,7 +27,9 @@ from flight_log.vehicle_log import ParameterRecord
 MAPS = ("ardupilot", "ardupilot_mavlink")
 AXES = {"elevator": "PITCH", "thrust": "THROTTLE", "aileron": "ROLL", "rudder": "YAW"}
 ENDS = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "REVERSED": 0.0}  # us, of the shipped maps
-PARAMETERS = {f"RC{number}_{end}": value for number in range(1, 5) for end, value in ENDS.items()} | {
+PARAMETERS = {
+    f"RC{number}_{end}": value for number in range(1, 5) for end, value in ENDS.items()
+} | {
     "RCMAP_ROLL": 1.0,
     "RCMAP_PITCH": 2.0,
     "RCMAP_THROTTLE": 3.0,
@@ -33,8 +37,12 @@ PARAMETERS = {f"RC{number}_{end}": value for number in range(1, 5) for end, valu
 }
 
 
-def agreement(channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None) -> str:
-    """The sentence of `require_agreement` for parameters at the samples, and others that the log has after them."""
+def agreement(
+    channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None
+) -> str:
+    """The sentence of `require_agreement` for parameters at the samples, and others that the log
+    has after them.
+    """
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs]
     recorded = {name: (ParameterRecord(0, value),) for name, value in values.items()}
     recorded |= {name: (ParameterRecord(10**12, value),) for name, value in (later or {}).items()}
@@ -69,29 +77,49 @@ def test_parameter_that_differs_is_refused_with_both_values_and_the_mend(
     with pytest.raises(ParameterError) as refused:
         agreement(named_map(name), PARAMETERS | {parameter: value})
     sentence = str(refused.value)
-    assert sentence.startswith(f"the log: found {parameter} {value:g}, expected {parameter} {expected:g} as in the map {name}:")
+    assert sentence.startswith(
+        f"the log: found {parameter} {value:g}, expected {parameter} {expected:g} as in the map "
+        f"{name}:"
+    )
     assert f": {mend}" in sentence
 
 
 def test_parameter_that_the_log_lacks_is_told_and_not_assumed() -> None:
-    values = {name: value for name, value in PARAMETERS.items() if name not in {"RC1_REVERSED", "RCMAP_PITCH"}}
-    sentence = "the log has no RCMAP_PITCH, RC1_REVERSED before the samples: compare the map with them yourself"
+    values = {
+        name: value
+        for name, value in PARAMETERS.items()
+        if name not in {"RC1_REVERSED", "RCMAP_PITCH"}
+    }
+    sentence = (
+        "the log has no RCMAP_PITCH, RC1_REVERSED before the samples: compare the map "
+        "with them yourself"
+    )
     assert agreement(named_map("ardupilot"), values) == sentence
-    assert agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 0.0}) == sentence  # it may have been another one
+    assert (
+        agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 0.0}) == sentence
+    )  # it may have been another one
     with pytest.raises(ParameterError, match="found RC1_REVERSED 1, expected RC1_REVERSED 0"):
         agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 1.0})
 
 
 @pytest.mark.parametrize("name", MAPS)
 def test_map_of_a_reversed_channel_agrees_with_the_reversal_alone(name: str) -> None:
-    """With RC2_REVERSED a larger pulse is nose down: so is the motion of the row for an increasing raw value."""
+    """With RC2_REVERSED a larger pulse is nose down: so is the motion of the row for an increasing
+    raw value.
+    """
     reversed_map = changed(name, "inputs", positive="nose down")
     assert agreement(reversed_map, PARAMETERS | {"RC2_REVERSED": 1.0}) == ""
     with pytest.raises(ParameterError, match="found RC2_REVERSED 0, expected RC2_REVERSED 1"):
         agreement(reversed_map, PARAMETERS)
 
 
-SURFACE = {"SERVO5_FUNCTION": 19.0, "SERVO5_MIN": 1000.0, "SERVO5_TRIM": 1400.0, "SERVO5_MAX": 2000.0, "SERVO5_REVERSED": 0.0}
+SURFACE = {
+    "SERVO5_FUNCTION": 19.0,
+    "SERVO5_MIN": 1000.0,
+    "SERVO5_TRIM": 1400.0,
+    "SERVO5_MAX": 2000.0,
+    "SERVO5_REVERSED": 0.0,
+}
 PULSES = np.array([1000.0, 1200.0, 1400.0, 1700.0, 2000.0])
 
 
@@ -104,7 +132,9 @@ def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign
     """SRV_Channel::pwm_from_angle: from the trim to either end, each with a slope of its own."""
     servo = servo_of(elevator(), "elevator", SURFACE | {"SERVO5_REVERSED": is_reversed})
     assert servo.output == 5
-    np.testing.assert_allclose(servo.deflection(PULSES, elevator()), sign * np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))
+    np.testing.assert_allclose(
+        servo.deflection(PULSES, elevator()), sign * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    )
 
 
 @pytest.mark.parametrize(("is_reversed", "part"), [(False, 0.25), (True, 0.75)])
@@ -132,7 +162,10 @@ def test_raw_value_of_half_a_deflection(name: str, positive: str, raw: float) ->
 @pytest.mark.parametrize("absent", [name for name in SURFACE if name != "SERVO5_FUNCTION"])
 def test_servo_without_one_of_its_parameters_is_refused(absent: str) -> None:
     values = {name: value for name, value in SURFACE.items() if name != absent}
-    with pytest.raises(ParameterError, match=f"inputs.elevator: found no {absent} in the log before the samples, expected it"):
+    with pytest.raises(
+        ParameterError,
+        match=f"inputs.elevator: found no {absent} in the log before the samples, expected it",
+    ):
         servo_of(elevator(), "elevator", values)
 
 
@@ -140,7 +173,10 @@ def test_servo_without_one_of_its_parameters_is_refused(absent: str) -> None:
     ("values", "sentence"),
     [
         ({"SERVO5_FUNCTION": 77.0}, "found no servo with SERVOn_FUNCTION 19 in the log"),
-        ({"SERVO5_TRIM": 2000.0}, r"SERVO5_MIN, TRIM, MAX: found \[1000.0, 2000.0, 2000.0\], expected ascending values"),
+        (
+            {"SERVO5_TRIM": 2000.0},
+            r"SERVO5_MIN, TRIM, MAX: found \[1000.0, 2000.0, 2000.0\], expected ascending values",
+        ),
     ],
 )
 def test_servo_that_has_no_sense_is_refused(values: dict[str, float], sentence: str) -> None:
@@ -154,19 +190,38 @@ SECOND = 1_000_000_000
 def test_changes_are_told_with_the_value_of_the_samples() -> None:
     """The log begins at 10 s, the samples are from 30 to 60 s."""
     recorded = {
-        "SERVO2_REVERSED": (ParameterRecord(0, 1.0), ParameterRecord(20 * SECOND, 0.0), ParameterRecord(65 * SECOND, 1.0)),
-        "RC1_MIN": (ParameterRecord(0, 1000.0), ParameterRecord(40 * SECOND, 1000.0)),  # once more the same
-        "TECS_SPDWEIGHT": (ParameterRecord(0, 1.0), ParameterRecord(40 * SECOND, 2.0)),  # not between u and the surface
+        "SERVO2_REVERSED": (
+            ParameterRecord(0, 1.0),
+            ParameterRecord(20 * SECOND, 0.0),
+            ParameterRecord(65 * SECOND, 1.0),
+        ),
+        "RC1_MIN": (
+            ParameterRecord(0, 1000.0),
+            ParameterRecord(40 * SECOND, 1000.0),
+        ),  # once more the same
+        "TECS_SPDWEIGHT": (
+            ParameterRecord(0, 1.0),
+            ParameterRecord(40 * SECOND, 2.0),
+        ),  # not between u and the surface
     }
     assert changes(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND) == [
-        "SERVO2_REVERSED changes from 1 to 0 at 10.0 s of the log, before the samples: signs and effects are those of 0",
-        "SERVO2_REVERSED changes from 0 to 1 at 55.0 s of the log, after the samples: signs and effects are those of 0",
+        (
+            "SERVO2_REVERSED changes from 1 to 0 at 10.0 s of the log, before the samples: signs "
+            "and effects are those of 0"
+        ),
+        (
+            "SERVO2_REVERSED changes from 0 to 1 at 55.0 s of the log, after the samples: signs "
+            "and effects are those of 0"
+        ),
     ]
 
 
 @pytest.mark.parametrize("name", ["RCMAP_PITCH", "SERVO1_REVERSED", "PWM_MAIN_REV"])
 def test_change_between_the_samples_is_refused(name: str) -> None:
     recorded = {name: (ParameterRecord(0, 1.0), ParameterRecord(60 * SECOND, 2.0))}
-    with pytest.raises(ParameterError, match=f"found {name} changes from 1 to 2 at 50.0 s of the log, expected no change"):
+    with pytest.raises(
+        ParameterError,
+        match=f"found {name} changes from 1 to 2 at 50.0 s of the log, expected no change",
+    ):
         changes(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND)
     assert len(changes(recorded, 10 * SECOND, 60 * SECOND, 90 * SECOND)) == 1

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins as a requirement: gains whose measured margins meet it, checked by python-control, and what a margin costs."""
+"""Margins as a requirement: gains whose measured margins meet it, checked by python-control, and
+what a margin costs.
+"""
 
 import math
 import re
@@ -26,7 +28,14 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains.gain_design import select_gains
 from flight_design.gains.ideal_control import Manoeuvre
-from flight_design.gains.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
+from flight_design.gains.requirement import (
+    NAMES,
+    Requirement,
+    above_zeros,
+    conditions,
+    least_fraction,
+    requirement,
+)
 from flight_design.gains.trade import linear_error, trade
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
@@ -41,7 +50,9 @@ RESPONSE = {"elevator": -8.0, "throttle": 3.0}  # abs(Omega_ii)
 
 
 def integrators() -> Airframe:
-    """q_dot = -8 elevator, V_dot = 3 throttle: a loop that python-control has channel by channel."""
+    """q_dot = -8 elevator, V_dot = 3 throttle: a loop that python-control has channel by
+    channel.
+    """
     return Airframe.validate_mapping(
         {
             "name": "integrators",
@@ -67,7 +78,9 @@ def selected(phase_margin: float) -> RiseDiConfig:
         "rise": 0.1,
         "pulses": {"q": whole["pulses"]["q"]},
     }
-    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, 4.0)
+    manoeuvre = Manoeuvre(
+        ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, 4.0
+    )
     studied = ideal_control.study_airframe(integrators(), manoeuvre, samples=3)
     setting = gain_selection.loop_setting(SERVO)._replace(
         lag=LAG, delay=0.0, rate_limit={}, requirement=requirement(phase_margin, accept=True)
@@ -76,9 +89,13 @@ def selected(phase_margin: float) -> RiseDiConfig:
 
 
 def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, float]:
-    """Phase margin, deg, and largest sensitivity of K (1 + integral dt z / (z - 1)) and the sampled lag and integrator."""
+    """Phase margin, deg, and largest sensitivity of K (1 + integral dt z / (z - 1)) and the sampled
+    lag and integrator.
+    """
     params, name = controller.law_params(), controller.inputs[channel]
-    integral = params.Lambda[channel] + params.beta[channel] / params.eps[channel] / params.K[channel]
+    integral = (
+        params.Lambda[channel] + params.beta[channel] / params.eps[channel] / params.K[channel]
+    )
     z = control.tf([1.0, 0.0], [1.0], T)
     K = params.K[channel] * params.input_scale[channel] * (1.0 + integral * T * z / (z - 1.0))
     P = control.sample_system(control.tf([abs(RESPONSE[name])], [LAG[name], 1.0, 0.0]), T, "zoh")
@@ -90,8 +107,9 @@ def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, fl
 
 @pytest.mark.parametrize("phase_margin", [30.0, 45.0, 60.0])
 def test_selected_gains_have_the_phase_margin(phase_margin: float) -> None:
-    # The law integrates by a trapezoid, python-control's K backward: half a tick of the integral, 0.5 degrees here. A step of
-    # the search is 5 % of the integral, at most 1.5 degrees, and a sensitivity of 2 asks for more than 30 degrees.
+    # The law integrates by a trapezoid, python-control's K backward: half a tick of the integral,
+    # 0.5 degrees here. A step of the search is 5 % of the integral, at most 1.5 degrees, and a
+    # sensitivity of 2 asks for more than 30 degrees.
     controller = selected(phase_margin)
     found = [of_python_control(controller, i) for i in range(2)]
     for phase, sensitivity in found:
@@ -104,7 +122,9 @@ def test_selected_gains_have_the_phase_margin(phase_margin: float) -> None:
 def test_a_larger_margin_costs_integral_gain() -> None:
     def integral(controller: RiseDiConfig) -> FloatArray:
         params = controller.law_params()
-        return np.asarray(params.K * params.input_scale * (params.Lambda + params.beta / params.eps / params.K))
+        return np.asarray(
+            params.K * params.input_scale * (params.Lambda + params.beta / params.eps / params.K)
+        )
 
     each = [integral(selected(phase_margin)) for phase_margin in (30.0, 45.0, 60.0)]
     assert (np.diff(each, axis=0) < 0.0).all()
@@ -114,7 +134,9 @@ def test_gains_of_osprey_meet_the_requirement() -> None:
     chosen = select_gains("osprey", "osprey_servo", samples=20).engineering
     assert not chosen.unmet
     assert {condition.name for condition in chosen.loop} >= set(NAMES)
-    of = margins(SERVO.vary(controller=chosen.controller), aircraft=50, seed=9)  # other aircraft than those of the selection
+    of = margins(
+        SERVO.vary(controller=chosen.controller), aircraft=50, seed=9
+    )  # other aircraft than those of the selection
     assert of.worst is not None
     assert math.degrees(of.nominal.phase.min()) >= 45.0 - 0.01
     assert math.degrees(of.worst.phase.min()) >= 30.0
@@ -124,7 +146,11 @@ def test_gains_of_osprey_meet_the_requirement() -> None:
 
 def test_conditions_say_what_is_missing() -> None:
     of = margins(SERVO.vary(controller={"softening": 2.75, "Lambda": [5.0, 5.0, 3.0, 0.5]}))
-    failing = [condition.name for condition in conditions(of, Requirement(phase=math.radians(80.0))) if not condition.holds]
+    failing = [
+        condition.name
+        for condition in conditions(of, Requirement(phase=math.radians(80.0)))
+        if not condition.holds
+    ]
     assert failing[:1] == ["phase margin (deg)"]
     assert least_fraction(of.nominal, Requirement(phase=math.radians(80.0))) == pytest.approx(
         math.degrees(of.nominal.phase.min()) / 80.0
@@ -132,7 +158,10 @@ def test_conditions_say_what_is_missing() -> None:
 
 
 def test_margin_below_40_deg_has_to_be_accepted() -> None:
-    with pytest.raises(ParameterError, match=r"^phase_margin: found 30\.0, expected at least 40 deg, or accept beside it$"):
+    with pytest.raises(
+        ParameterError,
+        match=r"^phase_margin: found 30\.0, expected at least 40 deg, or accept beside it$",
+    ):
         requirement(30.0)
     assert math.degrees(requirement(30.0, accept=True).phase) == pytest.approx(30.0)
     with pytest.raises(ParameterError, match=r"^phase_margin: found 90\.0, expected 5 to 80 deg$"):
@@ -140,7 +169,8 @@ def test_margin_below_40_deg_has_to_be_accepted() -> None:
 
 
 def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
-    # e_dot = -k e - a t: e = -(a / k) (t - (1 - exp(-k t)) / k), from trim on. Sampling at 1 ms: 1 %
+    # e_dot = -k e - a t: e = -(a / k) (t - (1 - exp(-k t)) / k), from trim on. Sampling at 1 ms: 1
+    # %
     k, a, period, duration = 5.0, 2.0, 0.001, 4.0
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
@@ -152,7 +182,8 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
 
 
 def test_trade_predicts_the_flight() -> None:
-    # Linear, without noise, and u* of the nominal airframe: within 5 % of the rms of a flight without noise
+    # Linear, without noise, and u* of the nominal airframe: within 5 % of the rms of a flight
+    # without noise
     selection = select_gains("osprey", "osprey_servo", samples=2)
     (row,) = trade(selection, (45.0,))
     flown = simulate(SERVO.vary(aircraft={"sensors": {}}, controller=selection.chosen))
@@ -163,7 +194,8 @@ def test_trade_predicts_the_flight() -> None:
 
 
 def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
-    # y_dot = eta_1 + u beside an oscillator of 5 rad/s that y does not drive: its damping is that of the zeros
+    # y_dot = eta_1 + u beside an oscillator of 5 rad/s that y does not drive: its damping is that
+    # of the zeros
     def asked(damping: float) -> float:
         A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -25.0, -10.0 * damping]])
         return above_zeros(Requirement(), LinearPlant(A, np.eye(3)[:, :1], np.eye(3)[:1])).damping
@@ -181,7 +213,17 @@ def rise_di(*arguments: str) -> Result:
 def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
     page = tmp_path / "loop.html"
-    result = rise_di("osprey", "--set", "samples=2", "--set", "phase-margin=50", "--write", str(path), "--page", str(page))
+    result = rise_di(
+        "osprey",
+        "--set",
+        "samples=2",
+        "--set",
+        "phase-margin=50",
+        "--write",
+        str(path),
+        "--page",
+        str(page),
+    )
     assert result.exit_code == 0, result.output
     assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(
         re.findall(r">([^<>]+)<", page.read_text())

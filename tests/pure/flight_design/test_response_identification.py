@@ -9,7 +9,11 @@ from scipy.signal import cont2discrete
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
-from flight_design.identification.response_identification import Response, begins_with_Omega, identify_response
+from flight_design.identification.response_identification import (
+    Response,
+    begins_with_Omega,
+    identify_response,
+)
 
 OUTPUTS, INPUTS = ("p", "r"), ("aileron", "rudder")
 OMEGA: FloatArray = np.array([[40.0, 3.0], [-2.0, 8.0]])  # rad/s^2 per rad
@@ -17,8 +21,11 @@ DAMPING = np.diag([6.0, 1.5])  # 1/s
 LAG, DELAY, STEP = np.array([0.03, 0.08]), 0.12, 0.001  # s
 
 
-def flown(doublets: float, noise: float = 1e-3, seed: int = 1, seconds: float = 40.0) -> tuple[Signal, Signal]:
-    """y_dot = -DAMPING y + OMEGA v behind lags and a delay, in coloured disturbances; y arrives 50 times a second, irregularly.
+def flown(
+    doublets: float, noise: float = 1e-3, seed: int = 1, seconds: float = 40.0
+) -> tuple[Signal, Signal]:
+    """y_dot = -DAMPING y + OMEGA v behind lags and a delay, in coloured disturbances; y arrives 50
+    times a second, irregularly.
 
     Exact at every millisecond for inputs that are held. The inputs are doublets in turn.
     """
@@ -54,30 +61,43 @@ def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_errors() -> 
     found = identified(*flown(0.1))
     assert not any(found.refusal)
     assert (np.abs(found.Omega - OMEGA) < 4.0 * found.Omega_deviation).all()
-    assert (np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.2).all()  # known well enough for gains
-    # u is held for 0.02 s and y_dot is known every 0.02 s: delay and lag apart are finer than that, their sum is known better
+    assert (
+        np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.2
+    ).all()  # known well enough for gains
+    # u is held for 0.02 s and y_dot is known every 0.02 s: delay and lag apart are finer than that,
+    # their sum is known better
     assert found.delay + found.lag == pytest.approx(DELAY + LAG, abs=0.015)
 
 
 def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
-    # From 20 s on the log holds a u that does not act, as that of a controller beside an autopilot which flies by itself.
+    # From 20 s on the log holds a u that does not act, as that of a controller beside an autopilot
+    # which flies by itself.
     y, u = flown(0.1)
     engaged_ns = nanoseconds(20.0)
-    other = Signal(u.stamp_ns, u.names, np.where((u.stamp_ns > engaged_ns)[:, None], -u.values, u.values))
+    other = Signal(
+        u.stamp_ns, u.names, np.where((u.stamp_ns > engaged_ns)[:, None], -u.values, u.values)
+    )
     found = identify_response(y, other, OUTPUTS, INPUTS, engaged=[(0, engaged_ns)])
     assert not any(found.refusal)
-    assert (np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.3).all()  # half of the time: 0.2 times sqrt(2)
-    assert (np.diag(identified(y, other).Omega) / np.diag(OMEGA) < 0.5).all()  # the two halves contradict each other
+    assert (
+        np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.3
+    ).all()  # half of the time: 0.2 times sqrt(2)
+    assert (
+        np.diag(identified(y, other).Omega) / np.diag(OMEGA) < 0.5
+    ).all()  # the two halves contradict each other
     assert (found.sign_ratio > 10.0).all()
 
 
 def test_input_that_hardly_moves_refused_with_excitation_that_it_needs() -> None:
     found = identified(*flown(2e-4))
-    assert all("excite" in sentence and "times as strongly" in sentence for sentence in found.refusal)
+    assert all(
+        "excite" in sentence and "times as strongly" in sentence for sentence in found.refusal
+    )
 
 
 def test_response_whose_sign_is_not_that_of_omega_is_no_fit() -> None:
-    # 1120 / (s^2 + 23 s + 267), all of it in the slow part: an elevator of 110 rad/s^2 per rad had an Omega of -0.016
+    # 1120 / (s^2 + 23 s + 267), all of it in the slow part: an elevator of 110 rad/s^2 per rad had
+    # an Omega of -0.016
     t = np.arange(0.02, 0.8, 0.02)
     assert not begins_with_Omega(t, np.array([0.07, 0.003, -0.016, 23.0, 267.0, 1120.0]))
     assert begins_with_Omega(t, np.array([0.07, 0.04, 110.0, 23.0, 0.0, 0.0]))

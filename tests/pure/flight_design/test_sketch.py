@@ -7,13 +7,20 @@ import pytest
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.parameters import ParameterError
-from flight_design.identification.innovation_filters import Actuation, Recording, blocks, filter_model
+from flight_design.identification.innovation_filters import (
+    Actuation,
+    Recording,
+    blocks,
+    filter_model,
+)
 from flight_design.identification.sketch import sketch, sketched
 from flight_design.learning.learner import Learner
 from flight_design.learning.scenario_learner import learner
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "throttle", "aileron", "rudder")
-STEPS = {  # Omega_ii of docs/evidence/tables/experiments-jsbsim_omega.csv, true airspeed, m/s: light, fighter, airliner
+# Omega_ii of docs/evidence/tables/experiments-jsbsim_omega.csv, true airspeed, m/s: light, fighter,
+# airliner
+STEPS = {
     "c172p": ((-8.47, 3.31, 6.37, -0.901), 46.3),
     "f16": ((-3.42, 11.1, 12.2, -0.627), 154.3),
     "B747": ((-0.315, 2.23, 0.341, -0.155), 180.1),
@@ -26,10 +33,13 @@ def test_sketch_has_the_modes_of_an_aircraft(name: str) -> None:
     frame = sketch(name, np.diag(Omega), OUTPUTS, INPUTS, speed)
     modes = np.linalg.eigvals(frame.matrix_a() + frame.matrix_gravity())
     oscillations = sorted(abs(mode) for mode in modes if mode.imag > 0.1 and mode.real < 0.0)
-    # short period and Dutch roll, rad/s: MIL-F-8785C has both between 0.4 and 10 in these flight phases
+    # short period and Dutch roll, rad/s: MIL-F-8785C has both between 0.4 and 10 in these flight
+    # phases
     assert len(oscillations) == 2
     assert 0.4 < oscillations[0] < oscillations[1] < 10.0
-    assert max(mode.real for mode in modes) < 0.1  # the spiral may grow slowly: 20 s to double are 0.035 1/s
+    assert (
+        max(mode.real for mode in modes) < 0.1
+    )  # the spiral may grow slowly: 20 s to double are 0.035 1/s
 
 
 def test_parts_of_sketch_do_not_couple() -> None:
@@ -37,7 +47,11 @@ def test_parts_of_sketch_do_not_couple() -> None:
     frame = sketch("c172p", np.diag(Omega) + 0.01, OUTPUTS, INPUTS, speed)
     still = Recording(0.01, np.linspace(0.0, 0.09, 10), np.zeros((10, 4)), np.zeros((10, 4)))
     parts = blocks(filter_model(frame, Actuation(np.full(4, 0.02), 0.0), still))
-    assert sorted([frame.outputs[i] for i in part.outputs] for part in parts) == [["V"], ["p", "r"], ["q"]]
+    assert sorted([frame.outputs[i] for i in part.outputs] for part in parts) == [
+        ["V"],
+        ["p", "r"],
+        ["q"],
+    ]
 
 
 def test_learner_begins_with_feedforward() -> None:
@@ -52,7 +66,9 @@ def test_learner_begins_with_feedforward() -> None:
     np.testing.assert_array_equal(frame.matrix_a().ravel(), controller.feedforward.A)
     np.testing.assert_array_equal(frame.matrix_b().ravel(), controller.feedforward.B)
     # wind is the aircraft relative to the air: a gust to the right is a sideslip from the left
-    np.testing.assert_allclose(frame.gust_direction("lateral")[[5, 6]], -frame.matrix_a()[[5, 6], 4] / 46.3)
+    np.testing.assert_allclose(
+        frame.gust_direction("lateral")[[5, 6]], -frame.matrix_a()[[5, 6], 4] / 46.3
+    )
 
 
 def test_sketch_of_other_channels_is_refused() -> None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 in flight: the F-4C of the tutorial in an ideal loop, under gains that meet each condition."""
+"""Theorem 1 in flight: the F-4C of the tutorial in an ideal loop, under gains that meet each
+condition.
+"""
 
 import re
 from pathlib import Path
@@ -30,12 +32,16 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
     folder = tmp_path_factory.mktemp("theorem")
     for name, text in FILES.items():
         (folder / name).write_text(text, encoding="utf-8")
-    return folder, select_gains(folder / "f4c.yaml", "osprey_gust", lag=0.0, delay=0.0, rate=100.0, samples=20)
+    return folder, select_gains(
+        folder / "f4c.yaml", "osprey_gust", lag=0.0, delay=0.0, rate=100.0, samples=20
+    )
 
 
 def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> FloatArray:
     """The largest errors, law's order, under the gains of Theorem 1 as written, at a rate in Hz."""
-    written = gain_yaml.as_yaml(selected, theorem=True).replace("rate: 100.0  # Hz", f"rate: {rate}  # Hz")
+    written = gain_yaml.as_yaml(selected, theorem=True).replace(
+        "rate: 100.0  # Hz", f"rate: {rate}  # Hz"
+    )
     path = folder / f"ideal_{rate:g}.yaml"
     path.write_text(FILES["sections.yaml"] + written, encoding="utf-8")
     _, error = best_error(simulate(load_scenario(path)))
@@ -54,7 +60,9 @@ def test_half_the_period_quarters_the_error(
     assert ((ratio > 3.5) & (ratio < 4.5)).all(), ratio
 
 
-def test_written_gains_are_those_of_the_theorem(selection: tuple[Path, gain_selection.Selection]) -> None:
+def test_written_gains_are_those_of_the_theorem(
+    selection: tuple[Path, gain_selection.Selection],
+) -> None:
     _, selected = selection
     text = gain_yaml.as_yaml(selected, theorem=True)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
@@ -75,4 +83,8 @@ def test_limits_outside_end_stops_are_named() -> None:
     assert beyond(lower=[-0.4, -0.523599, -0.523599, -0.5]) == ()  # a tighter limit is the user's
     none = beyond(lower=None, upper=None)
     assert len(none) == 8
-    assert none[0] == "controller.lower of elevator: found -inf, expected the end stop -0.523599 or less far out"
+    assert (
+        none[0]
+        == "controller.lower of elevator: found -inf, expected the end stop -0.523599 or less "
+        "far out"
+    )

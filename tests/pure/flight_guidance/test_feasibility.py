@@ -18,7 +18,8 @@ from flight_guidance.path import Arc, Line, Route, along, route_outline
 from flight_guidance.route_file import Waypoint, read_route
 
 CAN = Performance(
-    speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.45, climb=2.5, sink=4.0, wind=10.0
+    speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.45, climb=2.5, sink=4.0,
+    wind=10.0
 )  # fmt: skip
 CORNER = (Waypoint(0, 0, 1000), Waypoint(3000, 0, 1050), Waypoint(3000, 3000, 1000))
 RADIUS, PERIOD = 580.0, 14.0  # m: (40 + 10)^2 / (g tan(24 deg)) = 572.6; s
@@ -26,7 +27,9 @@ RADIUS, PERIOD = 580.0, 14.0  # m: (40 + 10)^2 / (g tan(24 deg)) = 572.6; s
 STRAIGHT = 3000.0 - RADIUS * math.tan((math.pi / 2.0 - math.asin(RADIUS / 3000.0)) / 2.0)
 
 
-def refusal(waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any) -> str:
+def refusal(
+    waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any
+) -> str:
     with pytest.raises(ParameterError) as refused:
         flyable(waypoints, radius, period, CAN._replace(**can))
     return str(refused.value)
@@ -52,14 +55,20 @@ def test_a_speed_lasts_until_the_next_one() -> None:
 
 def test_radius_too_small_for_wind_refused() -> None:
     sentence = refusal(CORNER, radius=400.0)
-    assert sentence == "guidance.radius: found 400 m, expected at least 573 m at this speed, wind and bank"
+    assert (
+        sentence
+        == "guidance.radius: found 400 m, expected at least 573 m at this speed, wind and bank"
+    )
     assert flyable(CORNER, number(sentence), PERIOD, CAN)
     assert flyable(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
 
 
 def test_a_period_below_the_rule_is_refused() -> None:
     sentence = refusal(CORNER, roll_rate=0.15)  # 11 * 30 deg / 0.15 = 38.40
-    assert sentence == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
+    assert (
+        sentence
+        == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
+    )
     assert flyable(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
 
 
@@ -70,18 +79,30 @@ def test_a_speed_below_the_floor_is_refused() -> None:
     assert flyable((*CORNER[:2], CORNER[2]._replace(speed=number(sentence))), RADIUS, PERIOD, CAN)
 
 
-@pytest.mark.parametrize(("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
+@pytest.mark.parametrize(
+    ("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)]
+)
 def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate: float) -> None:
-    """A climb is flown before the leg, a descent after the leg: clear of what the higher waypoint was meant to clear."""
-    route = (CORNER[0], CORNER[1]._replace(altitude=altitude), CORNER[2]._replace(altitude=altitude))
+    """A climb is flown before the leg, a descent after the leg: clear of what the higher waypoint
+    was meant to clear.
+    """
+    route = (
+        CORNER[0],
+        CORNER[1]._replace(altitude=altitude),
+        CORNER[2]._replace(altitude=altitude),
+    )
     legs, waypoints, (note,) = flyable(route, RADIUS, PERIOD, CAN)
     reach = math.floor(rate * STRAIGHT / 50.0)  # the straight part, with the wind from behind
-    assert note.startswith(f"route[1]: 300 m {side} the waypoint before, flown on circles round the waypoint")
+    assert note.startswith(
+        f"route[1]: 300 m {side} the waypoint before, flown on circles round the waypoint"
+    )
     assert note.endswith(f"takes {reach} m")
     circles = [leg for leg in legs[:-1] if isinstance(leg, Arc) and leg.loiter]
     assert [circle.centre for circle in circles] == [route[0 if altitude > 1000.0 else 1].point]
     assert [waypoint.departure for waypoint in waypoints[:2]] == [max(altitude, 1000.0), altitude]
-    named = tuple(waypoint._replace(leave=waypoint.altitude) for waypoint in route)  # as a scenario writes each waypoint
+    named = tuple(
+        waypoint._replace(leave=waypoint.altitude) for waypoint in route
+    )  # as a scenario writes each waypoint
     assert flyable(named, RADIUS, PERIOD, CAN).legs == legs
     within = tuple(
         waypoint._replace(altitude=1000.0 + math.copysign(reach, altitude - 1000.0) * (k > 0))
@@ -91,15 +112,28 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
 
 
 def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
-    """Two corners 300 m apart: the nearer one to the line of its neighbours goes, and the note tells the distance."""
-    near = (Waypoint(0, 0, 0), Waypoint(4000, 0, 0), Waypoint(4200, 200, 0), Waypoint(4200, 4000, 0))
+    """Two corners 300 m apart: the nearer one to the line of its neighbours goes, and the note
+    tells the distance.
+    """
+    near = (
+        Waypoint(0, 0, 0),
+        Waypoint(4000, 0, 0),
+        Waypoint(4200, 200, 0),
+        Waypoint(4200, 4000, 0),
+    )
     legs, waypoints, (note,) = flyable(near, RADIUS, PERIOD, CAN)
     assert len(waypoints) == 3
     match = re.search(r"route\[(\d)\]: corner cut, (\d+) m from the waypoint", note)
     assert match
     point = near[int(match[1])].point
-    drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[:-38]  # without the last orbit
-    between = [along(*ends, k / 500) for ends in pairwise([place[:2] for place in drawn]) for k in range(501)]
+    drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[
+        :-38
+    ]  # without the last orbit
+    between = [
+        along(*ends, k / 500)
+        for ends in pairwise([place[:2] for place in drawn])
+        for k in range(501)
+    ]
     nearest = min(math.dist(place, point) for place in between)
     assert float(match[2]) == pytest.approx(nearest, abs=2.0)
     far = (Waypoint(0, 0, 0), Waypoint(4000, 0, 0), Waypoint(4000, 600, 0), Waypoint(0, 600, 0))
@@ -107,7 +141,9 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
 
 
 def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
-    """The triangle of the tutorial is planned, the short route refused with the sentence on the page."""
+    """The triangle of the tutorial is planned, the short route refused with the sentence on the
+    page.
+    """
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
@@ -122,7 +158,9 @@ def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
 
 
 def test_route_file_replaces_program_of_targets() -> None:
-    turns = find_scenario("osprey_route").vary(guidance={"program": {"heading": {"start": [2.0], "value": [1.0]}}})
+    turns = find_scenario("osprey_route").vary(
+        guidance={"program": {"heading": {"start": [2.0], "value": [1.0]}}}
+    )
     flown = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
     assert flown is not None
     assert flown.program == {}
@@ -136,6 +174,8 @@ def test_route_of_scenario_not_checked_where_file_replaces_it(tmp_path: Path) ->
     path.write_text(text.replace("    wind: 3.0", "    wind: 18.0"), encoding="utf-8")
     with pytest.raises(ParameterError, match=r"guidance\.route\["):
         find_scenario(path)
-    scenario = with_route(find_scenario(path, with_route=False), [Waypoint(0.0, 0.0, 0.0), Waypoint(3000.0, 0.0, 0.0)])
+    scenario = with_route(
+        find_scenario(path, with_route=False), [Waypoint(0.0, 0.0, 0.0), Waypoint(3000.0, 0.0, 0.0)]
+    )
     assert scenario.guidance is not None
     assert (scenario.guidance.wind, len(scenario.guidance.waypoints())) == (18.0, 2)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fence: distances and predicted turns against closed forms, flights that would leave, a fleet, refusals."""
+"""The fence: distances and predicted turns against closed forms, flights that would leave, a fleet,
+refusals.
+"""
 
 import math
 from dataclasses import replace
@@ -24,7 +26,17 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
-from flight_guidance.fence import BACK, HOME, LEFT, RIGHT, SHARES, Escape, Motion, last_safe_turn, turn_clearance
+from flight_guidance.fence import (
+    BACK,
+    HOME,
+    LEFT,
+    RIGHT,
+    SHARES,
+    Escape,
+    Motion,
+    last_safe_turn,
+    turn_clearance,
+)
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.modes import holding, motion_of
@@ -49,16 +61,26 @@ def at(zones: tuple[Zone, ...], *points: tuple[float, float]) -> FloatArray:
 
 
 def test_clearance_is_distance_from_border() -> None:
-    assert at((SQUARE,), (0.0, 0.0), (90.0, 0.0), (130.0, 140.0), (100.0, 0.0)) == pytest.approx([100.0, 10.0, -50.0, 0.0])
+    assert at((SQUARE,), (0.0, 0.0), (90.0, 0.0), (130.0, 140.0), (100.0, 0.0)) == pytest.approx(
+        [100.0, 10.0, -50.0, 0.0]
+    )
     # In the concave corner at (100, 100) the nearest border is the corner itself.
-    assert at((ELL,), (70.0, 60.0), (150.0, 150.0), (50.0, 200.0)) == pytest.approx([50.0, -50.0, 50.0])
-    assert at((TOWER,), (300.0, 0.0), (360.0, 0.0), (300.0, -80.0)) == pytest.approx([-50.0, 10.0, 30.0])
+    assert at((ELL,), (70.0, 60.0), (150.0, 150.0), (50.0, 200.0)) == pytest.approx(
+        [50.0, -50.0, 50.0]
+    )
+    assert at((TOWER,), (300.0, 0.0), (360.0, 0.0), (300.0, -80.0)) == pytest.approx(
+        [-50.0, 10.0, 30.0]
+    )
 
 
 def test_clearance_of_several_zones() -> None:
-    """An aircraft stays in one of the zones to stay in, and out of each excluded zone. An edge inside the other is none."""
+    """An aircraft stays in one of the zones to stay in, and out of each excluded zone. An edge
+    inside the other is none.
+    """
     second = SQUARE._replace(north=tuple(value + 150.0 for value in SQUARE.north))
-    assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == pytest.approx([100.0, 10.0, 10.0])
+    assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == pytest.approx(
+        [100.0, 10.0, 10.0]
+    )
     hole = Zone((20.0,), (0.0,), 10.0, exclude=True)
     assert at((SQUARE, hole), (0.0, 0.0), (20.0, 0.0)) == pytest.approx([10.0, -10.0])
 
@@ -70,7 +92,9 @@ EDGE_EAST = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-2000.0, -2000.0, 500.0, 5
 @pytest.mark.parametrize(("edge", "course"), [(EDGE_NORTH, 0.0), (EDGE_EAST, math.pi / 2.0)])
 @pytest.mark.parametrize("wind", [0.0, 7.5, -7.5])
 def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float) -> None:
-    """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t = acos(-W / V)."""
+    """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t =
+    acos(-W / V).
+    """
     speed, bank = 25.0, math.radians(30.0)
     rate = min(SHARES) * GRAVITY * math.tan(bank) / speed  # the wider of the two turns
     turned = math.acos(-wind / speed)
@@ -87,33 +111,59 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("wind", [5.0, -5.0])
 def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> None:
-    """Along an edge, a turn towards the edge: nearest is R (1 - cos(w t)) + W t, where V sin(w t) = -W."""
+    """Along an edge, a turn towards the edge: nearest is R (1 - cos(w t)) + W t, where V sin(w t) =
+    -W.
+    """
     speed, bank, gap = 25.0, math.radians(30.0), 600.0
     rate = min(SHARES) * GRAVITY * math.tan(bank) / speed
     turned = math.pi + math.asin(wind / speed)
     nearest = gap - speed / rate * (1.0 - math.cos(turned)) - wind * turned / rate
-    edge = Zone((-4000.0, 4000.0, 4000.0, -4000.0), (-side * 6000.0, -side * 6000.0, side * gap, side * gap))
+    edge = Zone(
+        (-4000.0, 4000.0, 4000.0, -4000.0), (-side * 6000.0, -side * 6000.0, side * gap, side * gap)
+    )
     phi = np.float64(side * bank)
-    motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, speed, (0.0, side * wind), bank, 1e9, 0.0)
-    right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), motion)  # home is beyond the nearest point
+    motion = Motion(
+        np.float64(0.0), np.float64(0.0), phi, 0.0, speed, (0.0, side * wind), bank, 1e9, 0.0
+    )
+    right, left = turn_clearance(
+        Fence((edge,), (-3000.0, -side * 5500.0)), motion
+    )  # home is beyond the nearest point
     assert float(right if side > 0.0 else left) == pytest.approx(nearest, abs=0.5)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("phi", [0.0, -0.3])
 def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None:
-    """The course points home all the time, 15 deg to the side: the turn is flown until the bank is there, no longer.
+    """The course points home all the time, 15 deg to the side: the turn is flown until the bank is
+    there, no longer.
 
-    That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a step of the prediction.
+    That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a
+    step of the prediction.
     """
     speed, bank, lag, roll_rate = 25.0, math.radians(30.0), 3.0, 0.35
     edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
-    bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)  # the bank to the other side turns by 10 deg before
+    bearing = (
+        math.radians(15.0) if phi == 0.0 else math.radians(4.0)
+    )  # the bank to the other side turns by 10 deg before
     home = (900.0, side * 900.0 * math.tan(bearing))
-    motion = Motion(np.float64(0.0), np.float64(0.0), np.float64(side * phi), 0.0, speed, (0.0, 0.0), bank, roll_rate, lag)
+    motion = Motion(
+        np.float64(0.0),
+        np.float64(0.0),
+        np.float64(side * phi),
+        0.0,
+        speed,
+        (0.0, 0.0),
+        bank,
+        roll_rate,
+        lag,
+    )
     right, left = turn_clearance(Fence((edge,), home), motion)
     rolled = lag + (bank - phi) / roll_rate
-    longest = lag + 2.0 * bank / roll_rate + 1.95 * math.pi / (min(SHARES) * GRAVITY * math.tan(bank) / speed)
+    longest = (
+        lag
+        + 2.0 * bank / roll_rate
+        + 1.95 * math.pi / (min(SHARES) * GRAVITY * math.tan(bank) / speed)
+    )
     ahead = 1000.0 - float(right if side > 0.0 else left)
     slowed = 0.97  # the cosine of the course on the way, at least
     assert slowed * speed * rolled < ahead < speed * (rolled + longest / 63.0)
@@ -123,12 +173,23 @@ def test_turn_begins_at_last_moment() -> None:
     fence, bank = Fence((FIELD,), (200.0, 0.0)), math.radians(30.0)
 
     def motion(north: float, east: float, course: float = 0.0) -> Motion:
-        return Motion(np.float64(north), np.float64(east), np.float64(0.0), course, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
+        return Motion(
+            np.float64(north),
+            np.float64(east),
+            np.float64(0.0),
+            course,
+            25.0,
+            (0.0, 0.0),
+            bank,
+            0.35,
+            0.4,
+        )
 
     def action(north: float, before: float = 0.0, course: float = 0.0) -> float:
         return float(last_safe_turn(fence, before, motion(north, 0.0, course)).action)
 
-    # The wider turn has R = 138 m, after 10 m of lag and at most 37 m of roll (1.5 s). The edge is at 1300 m, margin 12.5 m.
+    # The wider turn has R = 138 m, after 10 m of lag and at most 37 m of roll (1.5 s). The edge is
+    # at 1300 m, margin 12.5 m.
     assert action(1300.0 - 12.5 - 138.0 - 10.0 - 37.0) == 0.0
     assert action(1300.0 - 12.5 - 138.0 - 10.0) == RIGHT  # both turns are equal
     assert action(1150.0, LEFT, math.radians(-170.0)) == HOME  # 10 deg before the course to home
@@ -147,7 +208,9 @@ def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
     params = scenario.guidance.params()
     pose, y = dict.fromkeys(POSE, 0.0), {"q": 0.0, "V": 0.0, "p": 0.3, "r": 0.0}
     level = holding(0, pose, 25.0, params)
-    assert motion_of(level, pose, y, 25.0, params).phi == pytest.approx(0.3 * 2.0 * 0.9 / 5.0, rel=0.15)
+    assert motion_of(level, pose, y, 25.0, params).phi == pytest.approx(
+        0.3 * 2.0 * 0.9 / 5.0, rel=0.15
+    )
     assert motion_of(level, pose, y | {"p": 9.0}, 25.0, params).phi <= params.limits.bank
 
 
@@ -155,7 +218,13 @@ def calm(duration: float, wind: tuple[float, float] = (0.0, 0.0), **section: Any
     """The osprey without noise, in larger steps than the scenario's."""
     return find_scenario("osprey_route").vary(
         flight={"duration": duration},
-        aircraft={"rate": 100.0, "step": 0.005, "wind": list(wind), "turbulence": None, "sensors": {}},
+        aircraft={
+            "rate": 100.0,
+            "step": 0.005,
+            "wind": list(wind),
+            "turbulence": None,
+            "sensors": {},
+        },
         reference_model={"rate": 100.0},
         guidance={"route": None, "wind": math.hypot(*wind)} | section,
     )
@@ -167,49 +236,95 @@ LEAST_RADIUS = 282.0
 
 @pytest.mark.parametrize("name", benchmark.OUTSIDE)
 def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
-    """A point that banks at 0.35 rad/s and turns by g tan(phi) / V, in winds of 0.4 V from four sides, heading four ways."""
+    """A point that banks at 0.35 rad/s and turns by g tan(phi) / V, in winds of 0.4 V from four
+    sides, heading four ways.
+    """
     scaled = benchmark.OUTSIDE[name]
-    fence = Fence(benchmark.of_radius(scaled.zones, LEAST_RADIUS), benchmark.at(scaled.home, LEAST_RADIUS), LEAST_RADIUS)
+    fence = Fence(
+        benchmark.of_radius(scaled.zones, LEAST_RADIUS),
+        benchmark.at(scaled.home, LEAST_RADIUS),
+        LEAST_RADIUS,
+    )
     speed, bank, dt = 25.0, math.radians(30.0), 0.5
     wind = 0.4 * speed * np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0]])
-    north, east, phi, psi, action = np.zeros(4), np.zeros(4), np.zeros(4), np.array([0.0, 1.5, 3.0, -1.5]), np.zeros(4)
+    north, east, phi, psi, action = (
+        np.zeros(4),
+        np.zeros(4),
+        np.zeros(4),
+        np.array([0.0, 1.5, 3.0, -1.5]),
+        np.zeros(4),
+    )
     has_been_inside, has_left = np.zeros(4, dtype=bool), np.zeros(4, dtype=bool)
-    for _ in range(math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)):  # the longest way round against the wind
+    for _ in range(
+        math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)
+    ):  # the longest way round against the wind
         v_north, v_east = speed * np.cos(psi) + wind[0], speed * np.sin(psi) + wind[1]
         course, ground_speed = np.arctan2(v_east, v_north), np.hypot(v_north, v_east)
-        motion = Motion(north, east, phi, psi, np.full(4, speed), (wind[0], wind[1]), np.full(4, bank), 0.35, 0.4)
+        motion = Motion(
+            north,
+            east,
+            phi,
+            psi,
+            np.full(4, speed),
+            (wind[0], wind[1]),
+            np.full(4, bank),
+            0.35,
+            0.4,
+        )
         escape = last_safe_turn(fence, action, motion)
         action = np.asarray(escape.action)
         has_left |= has_been_inside & (escape.clearance < 0.0)
         has_been_inside |= escape.clearance >= 0.0
         off = np.remainder(escape.course - course + math.pi, 2.0 * math.pi) - math.pi
-        wanted = np.where(abs(action) == RIGHT, action * bank, np.arctan(0.36 * ground_speed * off / GRAVITY))
+        wanted = np.where(
+            abs(action) == RIGHT, action * bank, np.arctan(0.36 * ground_speed * off / GRAVITY)
+        )
         phi = phi + np.clip(np.clip(wanted, -bank, bank) - phi, -0.35 * dt, 0.35 * dt)
         psi = psi + dt * GRAVITY * np.tan(phi) / speed
         north, east = north + dt * v_north, east + dt * v_east
     assert has_been_inside.all()
     assert not has_left.any()
-    assert (np.hypot(north - fence.home[0], east - fence.home[1]) < benchmark.HOME_RADII * LEAST_RADIUS).all()
+    assert (
+        np.hypot(north - fence.home[0], east - fence.home[1]) < benchmark.HOME_RADII * LEAST_RADIUS
+    ).all()
 
 
 def test_outside_is_a_state_of_its_own() -> None:
-    """Outside the aircraft flies the course of the shortest way inside, until it is half a second of flight inside."""
+    """Outside the aircraft flies the course of the shortest way inside, until it is half a second
+    of flight inside.
+    """
     fence, bank = Fence((FIELD,), (0.0, 0.0)), math.radians(30.0)
 
     def escape(north: float, before: float, heading: float = 0.0) -> Escape:
-        motion = Motion(np.float64(north), np.float64(0.0), np.float64(0.0), heading, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
+        motion = Motion(
+            np.float64(north),
+            np.float64(0.0),
+            np.float64(0.0),
+            heading,
+            25.0,
+            (0.0, 0.0),
+            bank,
+            0.35,
+            0.4,
+        )
         return last_safe_turn(fence, before, motion)
 
     assert (float(escape(1400.0, 0.0).action), bool(escape(1400.0, 0.0).begins)) == (BACK, True)
-    assert abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2  # south
+    assert (
+        abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2
+    )  # south
     assert float(escape(1400.0, HOME).action) == BACK
     assert float(escape(1290.0, BACK, math.pi).action) == BACK  # 10 m inside: less than 12.5 m
     assert float(escape(1280.0, BACK, math.pi).action) == HOME
-    assert float(escape(1290.0, HOME, math.pi).action) == HOME  # on the way home the clearance of now is enough
+    assert (
+        float(escape(1290.0, HOME, math.pi).action) == HOME
+    )  # on the way home the clearance of now is enough
 
 
 def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
-    """In a funnel of 80 to 18 m, home at its narrow end: the way keeps 9 m, less than 12.5 m, and a turn leaves by 200 m."""
+    """In a funnel of 80 to 18 m, home at its narrow end: the way keeps 9 m, less than 12.5 m, and a
+    turn leaves by 200 m.
+    """
     funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
     phi, bank = np.float64(0.0), math.radians(30.0)
     motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
@@ -219,7 +334,9 @@ def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
 
 
 def test_way_home_leads_round_a_zone() -> None:
-    """A slot of a U between the aircraft and home: the way leads to the closed end, and has a turn's room there."""
+    """A slot of a U between the aircraft and home: the way leads to the closed end, and has a
+    turn's room there.
+    """
     arms = Zone(
         (-600.0, 2600.0, 2600.0, -600.0, -600.0, 1600.0, 1600.0, -600.0),
         (-500.0,) * 2 + (1700.0,) * 2 + (700.0,) * 2 + (500.0,) * 2,
@@ -228,17 +345,30 @@ def test_way_home_leads_round_a_zone() -> None:
     chart, place, least, length = ways(fence), np.array([0.0, 0.0]), math.inf, 0.0
     while not chart.aim(fence, *place)[2]:
         north, east, _ = chart.aim(fence, *place)
-        step = 20.0 * np.array([north - place[0], east - place[1]]) / math.hypot(north - place[0], east - place[1])
+        step = (
+            20.0
+            * np.array([north - place[0], east - place[1]])
+            / math.hypot(north - place[0], east - place[1])
+        )
         place, length = place + step, length + 20.0
         least = min(least, float(clearance(fence.zones, *place)))
-        assert length < 3000.0  # the corners at 1600 m, past which the way is 3000 m at least in right angles
+        assert (
+            length < 3000.0
+        )  # the corners at 1600 m, past which the way is 3000 m at least in right angles
     assert least > 75.0  # half of a radius
 
 
 def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
     """Two zones with a gap between: from the one without home no way leads out."""
     fence = Fence(
-        (SQUARE, SQUARE._replace(north=(150.0, 750.0, 750.0, 150.0), east=(-300.0, -300.0, 300.0, 300.0))), (0.0, 0.0), 30.0
+        (
+            SQUARE,
+            SQUARE._replace(
+                north=(150.0, 750.0, 750.0, 150.0), east=(-300.0, -300.0, 300.0, 300.0)
+            ),
+        ),
+        (0.0, 0.0),
+        30.0,
     )
     chart, place = ways(fence), np.array([200.0, -200.0])
     for _ in range(60):
@@ -251,13 +381,20 @@ def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
 
 def test_zones_that_touch_are_one_region() -> None:
     """A shared edge is no border, where one zone is larger too; a gap is one."""
-    north_of = SQUARE._replace(north=(100.0, 300.0, 300.0, 100.0), east=(-50.0, -50.0, 100.0, 100.0))
-    assert at((SQUARE, north_of), (100.0, 0.0), (100.0, -60.0), (95.0, 20.0)) == pytest.approx([50.0, 0.0, 70.18], abs=0.01)
+    north_of = SQUARE._replace(
+        north=(100.0, 300.0, 300.0, 100.0), east=(-50.0, -50.0, 100.0, 100.0)
+    )
+    assert at((SQUARE, north_of), (100.0, 0.0), (100.0, -60.0), (95.0, 20.0)) == pytest.approx(
+        [50.0, 0.0, 70.18], abs=0.01
+    )
     apart = north_of._replace(north=(100.5, 300.0, 300.0, 100.5))
     assert at((SQUARE, apart), (99.0, 0.0), (100.25, 0.0)) == pytest.approx([1.0, -0.25])
     disc = Zone((100.0,), (0.0,), 80.0)
-    # The circle of 180 chords: 0.15 thousandths of the radius. At the centre of the edge the corners of the square are nearer.
-    assert at((SQUARE, disc), (100.0, 0.0), (170.0, 0.0), (185.0, 0.0)) == pytest.approx([80.0, 10.0, -5.0], abs=0.02)
+    # The circle of 180 chords: 0.15 thousandths of the radius. At the centre of the edge the
+    # corners of the square are nearer.
+    assert at((SQUARE, disc), (100.0, 0.0), (170.0, 0.0), (185.0, 0.0)) == pytest.approx(
+        [80.0, 10.0, -5.0], abs=0.02
+    )
 
 
 def test_aircraft_stays_inside_every_zone_of_one_group() -> None:
@@ -266,7 +403,9 @@ def test_aircraft_stays_inside_every_zone_of_one_group() -> None:
     both = (SQUARE._replace(group=0), half)
     assert at(both, (50.0, 0.0), (-50.0, 0.0), (-10.0, 0.0)) == pytest.approx([-50.0, 50.0, 10.0])
     third = Zone((200.0,), (0.0,), 60.0, group=1)
-    assert at((*both, third), (-50.0, 0.0), (200.0, 0.0), (50.0, 0.0)) == pytest.approx([50.0, 60.0, -50.0], abs=0.02)
+    assert at((*both, third), (-50.0, 0.0), (200.0, 0.0), (50.0, 0.0)) == pytest.approx(
+        [50.0, 60.0, -50.0], abs=0.02
+    )
 
 
 def commanded(course: float) -> dict[str, Any]:
@@ -282,7 +421,13 @@ def distances(tape: Tape, scenario: Scenario) -> FloatArray:
 
 
 NEAR = {"field": {"north": [-400.0, 550.0, 550.0, -400.0], "east": [-500.0, -500.0, 500.0, 500.0]}}
-HOLE = {"hole": {"north": [300.0, 500.0, 500.0, 300.0], "east": [-150.0, -150.0, 150.0, 150.0], "exclude": True}}
+HOLE = {
+    "hole": {
+        "north": [300.0, 500.0, 500.0, 300.0],
+        "east": [-150.0, -150.0, 150.0, 150.0],
+        "exclude": True,
+    }
+}
 
 
 @pytest.mark.parametrize(
@@ -295,10 +440,13 @@ HOLE = {"hole": {"north": [300.0, 500.0, 500.0, 300.0], "east": [-150.0, -150.0,
 def test_flight_towards_fence_stays_inside(
     duration: float, wind: tuple[float, float], zones: dict[str, Any], margin: float
 ) -> None:
-    scenario = calm(duration, wind, program=commanded(0.0), fence=NEAR | zones, home={"north": -50.0})
+    scenario = calm(
+        duration, wind, program=commanded(0.0), fence=NEAR | zones, home={"north": -50.0}
+    )
     tape = simulate(scenario)
     least = distances(tape, scenario).min()
-    # Half a second over ground. The predicted turn is the wider one, of 138 m at V0 in place of 110 m, and 2.1 s longer.
+    # Half a second over ground. The predicted turn is the wider one, of 138 m at V0 in place of 110
+    # m, and 2.1 s longer.
     assert margin - 3.0 < least < margin + 28.0 + 2.1 * math.hypot(*wind), least
     log = tape["guidance"]
     assert log["fence.action"][-1] == HOME
@@ -316,7 +464,9 @@ class Fenced(Guidance):
         self._params = self._params._replace(fence=FLEET_FENCE)
 
 
-FLEET_FENCE = Fence((Zone((-400.0, 250.0, 250.0, -400.0), (-500.0, -500.0, 500.0, 500.0)),), (0.0, 0.0))
+FLEET_FENCE = Fence(
+    (Zone((-400.0, 250.0, 250.0, -400.0), (-500.0, -500.0, 500.0, 500.0)),), (0.0, 0.0)
+)
 
 
 def test_fleet_keeps_fence_as_one_process_does() -> None:
@@ -333,12 +483,16 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
     mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
     control_law, params = scenario.controller.tuned_law()
     assembled = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
-    result = batch.fly(assembled, batch.vehicle(scenario), course, control_law, batch.shared(params), mission)
+    result = batch.fly(
+        assembled, batch.vehicle(scenario), course, control_law, batch.shared(params), mission
+    )
     assert result.mission is not None
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)
     assert tape["guidance"]["fence.action"][-1] != 0.0
     bank = float(np.abs(tape["guidance"]["pose.phi"]).max())
-    assert float(result.mission["max.phi"][1]) == pytest.approx(bank, abs=1e-3)  # the turn may begin a step apart
+    assert float(result.mission["max.phi"][1]) == pytest.approx(
+        bank, abs=1e-3
+    )  # the turn may begin a step apart
     assert tape["guidance"]["fence.clearance"].min() > 0.0
     assert np.asarray(result.mission["max.breach"]).tolist() == [0.0, 0.0]
 
@@ -347,19 +501,34 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
     ("section", "sentence"),
     [
         (
-            {"route": {"north": [0.0, 1250.0, 1250.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0] * 3}},
-            r"guidance.route: found leg 1, 9 m inside of the fence at north 1291 m, east 75 m, expected at least 12 m inside",
+            {
+                "route": {
+                    "north": [0.0, 1250.0, 1250.0],
+                    "east": [0.0, 0.0, 300.0],
+                    "altitude": [0.0] * 3,
+                }
+            },
+            (
+                r"guidance.route: found leg 1, 9 m inside of the fence at north 1291 m, east 75 m, "
+                r"expected at least 12 m inside"
+            ),
         ),
         (
             {"home": {"north": 1200.0}},
             r"guidance.home: found home 100 m inside of the fence, expected at least 15. m",
         ),
-        ({"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0]}}}, r"fence.a.north: found 2 points without a radius"),
+        (
+            {"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0]}}},
+            r"fence.a.north: found 2 points without a radius",
+        ),
         (
             {"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0], "radius": 9.0}}},
             r"found 2 points with a radius",
         ),
-        ({"fence": {"a": {"north": [0.0, 0.0, 9.0], "east": [1.0, 1.0, 9.0]}}}, r"found the corner .* twice in succession"),
+        (
+            {"fence": {"a": {"north": [0.0, 0.0, 9.0], "east": [1.0, 1.0, 9.0]}}},
+            r"found the corner .* twice in succession",
+        ),
     ],
 )
 def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: str) -> None:
@@ -368,13 +537,20 @@ def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: st
 
 
 def test_start_outside_of_fence_refused() -> None:
-    scenario = calm(5.0, program=commanded(0.0), fence=BOX).vary(aircraft={"start": {"east": 510.0}})
-    with pytest.raises(ParameterError, match=r"guidance\.fence: found the start 10 m outside of the fence, at north 0 m"):
+    scenario = calm(5.0, program=commanded(0.0), fence=BOX).vary(
+        aircraft={"start": {"east": 510.0}}
+    )
+    with pytest.raises(
+        ParameterError,
+        match=r"guidance\.fence: found the start 10 m outside of the fence, at north 0 m",
+    ):
         simulate(scenario)
 
 
 def test_lost_link_flies_home() -> None:
-    """Without a message of an operator the route ends after the limit, which log, replay, notice and outcome know."""
+    """Without a message of an operator the route ends after the limit, which log, replay, notice
+    and outcome know.
+    """
     route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario = calm(5.0, route=route, home={"east": 300.0, "link_timeout": 3.0})
     tape, section = simulate(scenario), scenario.guidance
@@ -406,12 +582,19 @@ def test_kept_link_ends_no_command() -> None:
 
 def test_home_is_target_and_choice_after_loss() -> None:
     home = {"north": 300.0, "east": -40.0, "altitude": 80.0, "after_loss": True}
-    made = Guidance(GuidanceConfig.validate_mapping(SECTION | {"home": home, "hold": 0.1}, "guidance"))
+    made = Guidance(
+        GuidanceConfig.validate_mapping(SECTION | {"home": home, "hold": 0.1}, "guidance")
+    )
 
     def step(k: int, *, with_pose: bool = True) -> dict[str, float]:
         now = 20 * MS * k
         if with_pose:
-            made.take_pose(StampedVector(now, np.array([0.0, 0.0, 0.0, 0.5 * k, 0.0, 50.0, 25.0, 0.0, 0.0, 0.0])), now)
+            made.take_pose(
+                StampedVector(
+                    now, np.array([0.0, 0.0, 0.0, 0.5 * k, 0.0, 50.0, 25.0, 0.0, 0.0, 0.0])
+                ),
+                now,
+            )
         made.take_y(StampedVector(now, np.zeros(4)), now)
         output = made.step(now, now)
         assert output is not None
@@ -420,7 +603,12 @@ def test_home_is_target_and_choice_after_loss() -> None:
     assert step(0)["mode.lateral"] == Lateral.HEADING
     assert made.home()
     log = step(1)
-    assert [log[f"target.{name}"] for name in ("north", "east", "radius", "altitude")] == [300.0, -40.0, 144.0, 80.0]
+    assert [log[f"target.{name}"] for name in ("north", "east", "radius", "altitude")] == [
+        300.0,
+        -40.0,
+        144.0,
+        80.0,
+    ]
     made.take_target({"heading": 0.0})
     assert step(2)["mode.lateral"] == Lateral.HEADING
     for k in range(3, 40):

@@ -30,7 +30,14 @@ from flight_guidance.lateral import (
 )
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
-from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
+from flight_guidance.vertical import (
+    VerticalParams,
+    alpha_estimate,
+    climb_for,
+    path_lag,
+    pitch_for,
+    slewed,
+)
 
 SPEED = 40.0  # m/s
 HOLD = AttitudeParams(k_phi=1.25, k_theta=1.0, roll_rate=0.3, load=0.5, n_alpha=1e9, k_beta=0.0)
@@ -46,7 +53,8 @@ def loop_damping(gain: float, frequency: float, damping: float) -> float:
 
 def test_bank_loop_has_damping_0_74() -> None:
     """The gain is a quarter of the bandwidth of p."""
-    # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on (Hurwitz).
+    # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on
+    # (Hurwitz).
     assert loop_damping(5.0 / 4.0, 5.0, 0.9) == pytest.approx(0.74, abs=0.01)
     assert loop_damping(2.0, 5.0, 0.9) == pytest.approx(0.48, abs=0.01)
     assert loop_damping(9.0, 5.0, 0.9) == pytest.approx(0.0, abs=1e-9)
@@ -60,13 +68,16 @@ def test_held_bank_gives_level_turn_rates(phi: float) -> None:
 
 
 def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
-    # With r as commanded, a rotation by the body rates changes (phi, theta) by k times the errors and psi by the level turn.
+    # With r as commanded, a rotation by the body rates changes (phi, theta) by k times the errors
+    # and psi by the level turn.
     phi, theta, phi_c, theta_c = 0.4, 0.1, 0.5, 0.15
     turn = GRAVITY * math.tan(phi) / SPEED
     r = turn * math.cos(phi) * math.cos(theta) - HOLD.k_theta * (theta_c - theta) * math.sin(phi)
     rates, dt = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD), 1e-6
     assert rates.r == pytest.approx(r, rel=1e-12)
-    moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(np.array(rates) * dt)
+    moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
+        np.array(rates) * dt
+    )
     psi_after, theta_after, phi_after = moved.as_euler("ZYX")
     assert (phi_after - phi) / dt == pytest.approx(HOLD.k_phi * (phi_c - phi), abs=1e-6)
     assert (theta_after - theta) / dt == pytest.approx(HOLD.k_theta * (theta_c - theta), abs=1e-6)
@@ -79,7 +90,9 @@ def test_roll_rate_and_load_are_limited() -> None:
 
 
 def test_sideslip_to_right_turns_nose_right() -> None:
-    assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == pytest.approx(0.1)
+    assert body_rates(
+        0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)
+    ).r == pytest.approx(0.1)
 
 
 def test_climb_rate_is_smooth_and_brakes() -> None:
@@ -90,7 +103,9 @@ def test_climb_rate_is_smooth_and_brakes() -> None:
     slope = (climb_for(near + 2.0 * step, free) - climb_for(near + step, free)) / step
     assert slope == pytest.approx(0.2, abs=1e-4)
     far = 100.0  # d(climb)/dt = -climb d(climb)/de = -a/2
-    assert climb_for(far, free) * (climb_for(far + step, free) - climb_for(far, free)) / step == pytest.approx(0.5, abs=1e-4)
+    assert climb_for(far, free) * (
+        climb_for(far + step, free) - climb_for(far, free)
+    ) / step == pytest.approx(0.5, abs=1e-4)
     assert climb_for(-far, free) == -climb_for(far, free)
     assert (climb_for(far, CLIMB), climb_for(-far, CLIMB)) == (5.0, -4.0)
 
@@ -98,14 +113,21 @@ def test_climb_rate_is_smooth_and_brakes() -> None:
 @pytest.mark.parametrize("stall_speed", [20.0, 60.0, 121.9, 133.0])
 def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
     """The altitude loop has a gain margin of 2.5 where the flight path lags the pitch."""
-    # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma. JSBSim's f16 at 154 m/s and
-    # 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h = 0.2 and T = 2 s.
+    # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma.
+    # JSBSim's f16 at 154 m/s and 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h =
+    # 0.2 and T = 2 s.
     frequencies = (4.0, 1.2, 5.0, 4.0)
-    loop = GuidanceConfig(natural_frequency=frequencies, speed=154.0, stall_speed=stall_speed).params().vertical
+    loop = (
+        GuidanceConfig(natural_frequency=frequencies, speed=154.0, stall_speed=stall_speed)
+        .params()
+        .vertical
+    )
     lag, time = path_lag(stall_speed, 154.0), loop.alpha_time
     poles = Polynomial([1.0, time, lag * time]).roots()
     assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
-    assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0  # a gain margin of 2.5
+    assert (
+        np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0
+    )  # a gain margin of 2.5
 
 
 def test_pitch_settles_where_angle_of_attack_estimated() -> None:
@@ -119,7 +141,9 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
 
 def test_course_approached_on_shorter_side() -> None:
     """Beyond 90 degrees the turn is the largest turn."""
-    assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0  # to the right, over south
+    assert (
+        course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
+    )  # to the right, over south
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
     assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == pytest.approx(0.2 * SPEED)
     assert bank_for(GRAVITY, 0.0, 1.0) == pytest.approx(math.pi / 4.0)
@@ -127,22 +151,29 @@ def test_course_approached_on_shorter_side() -> None:
 
 
 def cross_track(e_0: float, times: FloatArray) -> FloatArray:
-    """Cross-track error of a point with the acceleration of `path_acceleration` beside a line to the north."""
+    """Cross-track error of a point with the acceleration of `path_acceleration` beside a line to
+    the north.
+    """
 
     def derivative(_: float, z: FloatArray) -> list[float]:
         e, course = z
         a = path_acceleration(PathError(float(e), 0.0, 0.0), float(course), SPEED, FOLLOW)
         return [SPEED * math.sin(course), a / SPEED]
 
-    solution = solve_ivp(derivative, (0.0, times[-1]), [e_0, 0.0], t_eval=times, rtol=1e-9, atol=1e-9, max_step=0.5)
+    solution = solve_ivp(
+        derivative, (0.0, times[-1]), [e_0, 0.0], t_eval=times, rtol=1e-9, atol=1e-9, max_step=0.5
+    )
     return np.asarray(solution.y[0])
 
 
 def test_error_near_line_is_second_order() -> None:
-    # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000 of v_g P zeta.
+    # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000
+    # of v_g P zeta.
     times, zeta, w = np.linspace(0.0, 40.0, 81), 0.75, 2.0 * math.pi / 20.0
     damped = w * math.sqrt(1.0 - zeta**2)
-    exact = np.exp(-zeta * w * times) * (np.cos(damped * times) + zeta * w / damped * np.sin(damped * times))
+    exact = np.exp(-zeta * w * times) * (
+        np.cos(damped * times) + zeta * w / damped * np.sin(damped * times)
+    )
     assert cross_track(0.1, times) / 0.1 == pytest.approx(exact, abs=2e-3)
 
 
@@ -151,7 +182,9 @@ def test_line_captured_from_far_at_capture_angle() -> None:
     e = cross_track(2000.0, times)
     assert np.diff(e)[100] / 0.5 == pytest.approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
     assert abs(e[-1]) < 0.01
-    assert e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping  # no limit cycle, small overshoot
+    assert (
+        e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping
+    )  # no limit cycle, small overshoot
 
 
 @pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
@@ -159,14 +192,18 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
     """An aircraft on the course opposite to a line turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
-    assert turn == pytest.approx(math.copysign(full, -away), rel=1e-9)  # a sine would leave 0.2 % of it at 179.9 deg
+    assert turn == pytest.approx(
+        math.copysign(full, -away), rel=1e-9
+    )  # a sine would leave 0.2 % of it at 179.9 deg
 
 
 @pytest.mark.parametrize("radius", [300.0, -300.0])
 def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
     """On a circle the acceleration is centripetal, and drives an offset back."""
     orbit = Arc((0.0, 0.0), radius)
-    on = path.error(orbit, (300.0, 0.0))  # to the north of the centre: east on a right turn, west on a left one
+    on = path.error(
+        orbit, (300.0, 0.0)
+    )  # to the north of the centre: east on a right turn, west on a left one
     assert on == pytest.approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
     assert path_acceleration(on, on.track, SPEED, FOLLOW) == pytest.approx(SPEED**2 / radius)
     outside = path.error(orbit, (320.0, 0.0))
@@ -175,7 +212,9 @@ def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
 
 
 def offset_from_a_circle(*, estimated: bool) -> float:
-    """Radius of the orbit in m beyond that asked for, of an aircraft that slips: a tenth of its bank's turn is missing."""
+    """Radius of the orbit in m beyond that asked for, of an aircraft that slips: a tenth of its
+    bank's turn is missing.
+    """
     speed, radius, dt = 50.0, 800.0, 0.05
     north, east, course, slip = 0.0, -radius, 0.0, 0.0
     params = PathParams(20.0, 0.75, 0.5)
@@ -192,29 +231,41 @@ def offset_from_a_circle(*, estimated: bool) -> float:
 
 
 def test_aircraft_that_slips_flies_on_circle() -> None:
-    # Without the estimate e'' + 2 zeta w e' + w^2 e = 0.1 V^2 / R near the circle: an offset of 3.2 m; measured 3.5 m.
-    assert offset_from_a_circle(estimated=False) == pytest.approx(0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15)
-    assert abs(offset_from_a_circle(estimated=True)) < 0.01  # m, of the integration in steps of 50 ms
+    # Without the estimate e'' + 2 zeta w e' + w^2 e = 0.1 V^2 / R near the circle: an offset of 3.2
+    # m; measured 3.5 m.
+    assert offset_from_a_circle(estimated=False) == pytest.approx(
+        0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15
+    )
+    assert (
+        abs(offset_from_a_circle(estimated=True)) < 0.01
+    )  # m, of the integration in steps of 50 ms
 
 
 def test_roll_is_no_sideslip() -> None:
     """In a roll the turn lags the bank; the estimate of the sideslip stays."""
     assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
-    assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12)
+    assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(
+        0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12
+    )
 
 
 def test_gyro_bias_is_no_sideslip() -> None:
     """In straight flight a bias of the gyro of r gives no sideslip."""
-    # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m beside a leg.
+    # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m
+    # beside a leg.
     slip = 0.0
     for _ in range(1000):
         slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
     assert slip == 0.0
-    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(0.4)  # a fifth of the turn of a bank to the left
+    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(
+        0.4
+    )  # a fifth of the turn of a bank to the left
 
 
 def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
-    """T = 2 s at 50 Hz. A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 - exp(-dt/T): 0.07 deg of 1."""
+    """T = 2 s at 50 Hz. A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 -
+    exp(-dt/T): 0.07 deg of 1.
+    """
     dt, noise = 0.02, np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)
     psi, off = math.radians(170.0), []
     for k, error in enumerate(noise.tolist()):
@@ -263,11 +314,21 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
     [
         ([(0.0, 0.0)], 200.0, "route: found 1 waypoints, expected two or more"),
         ([(0.0, 0.0), (1000.0, 0.0)], 90.0, "guidance.radius: found 90 m, expected at least 100 m"),
-        ([(0.0, 0.0), (150.0, 0.0), (150.0, 900.0)], 200.0, r"route\[1\]: found 150 m .* expected more than 200 m"),
-        ([(0.0, 0.0), (900.0, 0.0), (900.0, 300.0), (0.0, 300.0)], 200.0, r"route\[2\]: found 300 m .* more than 400 m"),
+        (
+            [(0.0, 0.0), (150.0, 0.0), (150.0, 900.0)],
+            200.0,
+            r"route\[1\]: found 150 m .* expected more than 200 m",
+        ),
+        (
+            [(0.0, 0.0), (900.0, 0.0), (900.0, 300.0), (0.0, 300.0)],
+            200.0,
+            r"route\[2\]: found 300 m .* more than 400 m",
+        ),
     ],
 )
-def test_infeasible_route_refused_with_mend(waypoints: list[tuple[float, float]], radius: float, sentence: str) -> None:
+def test_infeasible_route_refused_with_mend(
+    waypoints: list[tuple[float, float]], radius: float, sentence: str
+) -> None:
     """The sentence names a value that would do."""
     with pytest.raises(ParameterError, match=sentence):
         path.route(waypoints, radius, 100.0)
@@ -276,7 +337,9 @@ def test_infeasible_route_refused_with_mend(waypoints: list[tuple[float, float]]
 def test_rules_of_radius_and_period() -> None:
     bank = math.radians(30.0)
     # A circle of the least radius asks for 0.8 of the bank at the speed with the wind from behind.
-    assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == pytest.approx(0.8 * bank)
+    assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == pytest.approx(
+        0.8 * bank
+    )
     assert least_period(46.0, bank, 0.15) == pytest.approx(11.0 * bank / 0.15)
     assert least_period(25.0, bank, 1.0) == 14.0
 
@@ -299,11 +362,15 @@ def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None
     params, altitude, dt = section.params(), 250.0, 0.02
     pose = {**dict.fromkeys(POSE, 0.0), "altitude": altitude, "v_north": SPEED}
     state = modes.holding(0, pose, SPEED, params)
-    vertical = {"climb": Vertical.CLIMB, "theta": Vertical.THETA, "altitude": Vertical.ALTITUDE}[next(iter(command))]
+    vertical = {"climb": Vertical.CLIMB, "theta": Vertical.THETA, "altitude": Vertical.ALTITUDE}[
+        next(iter(command))
+    ]
     state = state._replace(vertical=vertical, target=state.target._replace(**command))
     highest = altitude
     for _ in range(3000):
-        state, commands = modes.command(state, pose, dict.fromkeys(section.outputs, 0.0), 0.0, dt, params)
+        state, commands = modes.command(
+            state, pose, dict.fromkeys(section.outputs, 0.0), 0.0, dt, params
+        )
         climb = SPEED * math.sin(commands.theta_c - state.alpha)
         altitude += dt * climb
         pose = pose | {"altitude": altitude, "climb": climb, "theta": commands.theta_c}

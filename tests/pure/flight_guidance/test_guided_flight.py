@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guided flights in one process: holds, routes, protection, failsafe, refusals, and the log from which each step follows."""
+"""Guided flights in one process: holds, routes, protection, failsafe, refusals, and the log from
+which each step follows.
+"""
 
 import math
 from pathlib import Path
@@ -34,16 +36,39 @@ from flight_log.tape_reader import read_run
 pytestmark = pytest.mark.slow
 
 ROUTE = find_scenario("osprey_route")
-SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}
+SECTION: dict[str, Any] = {
+    "natural_frequency": [4.0, 1.2, 5.0, 4.0],
+    "speed": 25.0,
+    "throttle_authority": [3.0, 3.0],
+}
 MS = 1_000_000  # ns
-BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)  # a bank of 0.1 rad
+BANKED = (
+    0.1,
+    0.05,
+    0.3,
+    0.0,
+    0.0,
+    100.0,
+    25.0 * math.cos(0.3),
+    25.0 * math.sin(0.3),
+    0.0,
+    0.0,
+)  # a bank of 0.1 rad
 
 
 def calm(duration: float, **section: Any) -> Scenario:
-    """The osprey in calm air without noise, with a section of guidance, in larger steps than the scenario's."""
+    """The osprey in calm air without noise, with a section of guidance, in larger steps than the
+    scenario's.
+    """
     return ROUTE.vary(
         flight={"duration": duration},
-        aircraft={"rate": 100.0, "step": 0.005, "wind": [0.0, 0.0], "turbulence": None, "sensors": {}},
+        aircraft={
+            "rate": 100.0,
+            "step": 0.005,
+            "wind": [0.0, 0.0],
+            "turbulence": None,
+            "sensors": {},
+        },
         reference_model={"rate": 100.0},
         guidance={"route": None, "wind": 0.0} | section,
     )
@@ -64,7 +89,9 @@ def after(tape: Tape, seconds: float) -> FloatArray:
 
 def test_heading_altitude_and_airspeed_reached_and_held() -> None:
     tape = simulate(calm(45.0, program=program(heading=math.pi / 2.0, altitude=20.0, V=27.0)))
-    psi, altitude, V, phi = channels(tape["guidance"], "pose.psi", "pose.altitude", "y.V", "pose.phi")
+    psi, altitude, V, phi = channels(
+        tape["guidance"], "pose.psi", "pose.altitude", "y.V", "pose.phi"
+    )
     end = after(tape, 40.0)
     assert np.degrees(np.abs(psi[end] - math.pi / 2.0).max()) < 1.0
     assert np.abs(altitude[end] - 20.0).max() < 0.5
@@ -82,16 +109,25 @@ def test_route_flown_and_ends_in_orbit() -> None:
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
     assert np.unique(leg).tolist() == [0.0, 1.0, 2.0, 3.0]
     assert (np.diff(leg) >= 0.0).all()
-    assert np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0  # 0.35 s of flight, the acceptance of a route in calm air
+    assert (
+        np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0
+    )  # 0.35 s of flight, the acceptance of a route in calm air
     assert altitude[-1] == pytest.approx(10.0, abs=1.0)
 
 
 def test_small_corner_flown_with_small_bank() -> None:
     """A corner of half a degree takes a bank of about a degree."""
-    # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the osprey banked by 17 deg.
-    points = {"north": [0.0, 400.0, 900.0, 3000.0], "east": [0.0, 0.0, 5.0, 26.0], "altitude": [0.0] * 4}
+    # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the
+    # osprey banked by 17 deg.
+    points = {
+        "north": [0.0, 400.0, 900.0, 3000.0],
+        "east": [0.0, 0.0, 5.0, 26.0],
+        "altitude": [0.0] * 4,
+    }
     phi, xtrack = channels(simulate(calm(22.0, route=points))["guidance"], "pose.phi", "xtrack")
-    assert np.degrees(np.abs(phi).max()) < 2.0  # 0.8 deg; half a degree in the 1.1 s asks for 1.2 deg at most
+    assert (
+        np.degrees(np.abs(phi).max()) < 2.0
+    )  # 0.8 deg; half a degree in the 1.1 s asks for 1.2 deg at most
     assert np.abs(xtrack).max() < 1.0  # 0.4 m, in place of 6.9 m
 
 
@@ -101,9 +137,14 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
     assert section is not None
     params, state = section.params(), None
     for stamp_ns, values in zip(signal.stamp_ns.tolist(), signal.values, strict=True):
-        inputs, logged = guidance.restored(stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs)
+        inputs, logged = guidance.restored(
+            stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
+        )
         state, commands = modes.step(state, inputs, None, params)
-        assert guidance.row(inputs, state, commands, guidance.digest(None), 0.0).tobytes() == values.tobytes()
+        assert (
+            guidance.row(inputs, state, commands, guidance.digest(None), 0.0).tobytes()
+            == values.tobytes()
+        )
         assert state == logged
         state = logged
 
@@ -166,8 +207,12 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
 )
 def test_leg_that_route_does_not_have_refused(leg: float) -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
-    with pytest.raises(ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"):
+    made.take_route(
+        section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)])
+    )  # a line and the orbit
+    with pytest.raises(
+        ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"
+    ):
         made.take_target({"leg": leg})
     assert run(made, 1, 2)["leg"][0] == 0.0
 
@@ -175,8 +220,13 @@ def test_leg_that_route_does_not_have_refused(leg: float) -> None:
 def test_new_route_voids_legs_of_program() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
-    made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
+    made, section = (
+        flying(route=route, program=steps),
+        GuidanceConfig.validate_mapping(SECTION, "guidance"),
+    )
+    made.take_route(
+        section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)])
+    )  # a line and the orbit
     signal = run(made, 1, 5)
     assert signal["leg"].tolist() == [0.0] * 4
     assert signal["target.V"][-1] == 26.0
@@ -204,7 +254,10 @@ def test_route_waits_for_engagement(by: str) -> None:
     switch(on=True)
     signal = run(made, 3, 4)
     assert (signal["mode.lateral"][0], signal["leg"][0]) == (guidance_state.Lateral.ROUTE, 0.0)
-    assert (signal["target.altitude"][0], signal["target.V"][0]) == (100.0, 25.0)  # at the begin of the leg
+    assert (signal["target.altitude"][0], signal["target.V"][0]) == (
+        100.0,
+        25.0,
+    )  # at the begin of the leg
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
@@ -298,18 +351,39 @@ def test_refused_command_changes_nothing(values: dict[str, float], sentence: str
     ("section", "sentence"),
     [
         ({"period": 13.0}, r"guidance.period: found 13.0 s, expected at least 16.5 s: max\(14 s"),
-        ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
-        ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.523599 to 0.523599 rad"),
-        ({"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}}, "expected times in rising order"),
         (
-            {"route": {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": [25.0, 36.0]}},
+            {"program": program(bank=0.1)},
+            r"guidance.program.bank: found a channel, expected one of phi",
+        ),
+        (
+            {"program": program(phi=0.9)},
+            r"guidance.program at 1 s.phi: found 0.9, expected -0.523599 to 0.523599 rad",
+        ),
+        (
+            {"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}},
+            "expected times in rising order",
+        ),
+        (
+            {
+                "route": {
+                    "north": [0.0, 9e3],
+                    "east": [0.0, 0.0],
+                    "altitude": [0.0, 0.0],
+                    "V": [25.0, 36.0],
+                }
+            },
             r"guidance.route\[1\].V: found 36 m/s, expected at most 35 m/s",
         ),
-        ({"altitude_floor": 50.0, "ceiling": 40.0}, "guidance.ceiling: found 40 m, expected more than altitude_floor, 50 m"),
+        (
+            {"altitude_floor": 50.0, "ceiling": 40.0},
+            "guidance.ceiling: found 40 m, expected more than altitude_floor, 50 m",
+        ),
         ({"lockstep": True}, "guidance.y_rate: found 0 Hz, expected the rate of y in lockstep"),
     ],
 )
-def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], sentence: str) -> None:
+def test_parameters_that_cannot_be_flown_are_refused(
+    section: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         GuidanceConfig.validate_mapping(SECTION | section, "guidance")
 
@@ -319,9 +393,15 @@ def test_omitted_numbers_follow_from_sections() -> None:
     section = ROUTE.guidance
     assert section is not None
     assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
-    assert section.throttle_authority == pytest.approx((3.0, 3.0), rel=1e-3)  # 6 m/s^2 a unit of thrust, +-0.5
+    assert section.throttle_authority == pytest.approx(
+        (3.0, 3.0), rel=1e-3
+    )  # 6 m/s^2 a unit of thrust, +-0.5
     params = section.params()
-    assert (params.attitude.k_phi, params.attitude.k_theta, params.limits.floor) == (1.25, 1.0, 20.0)
+    assert (params.attitude.k_phi, params.attitude.k_theta, params.limits.floor) == (
+        1.25,
+        1.0,
+        20.0,
+    )
     assert (params.vertical.climb, params.path.period) == (2.5, section.least_period())
     assert params.attitude.k_beta == pytest.approx(5.0 / 14.0 * 25.0 * math.radians(1.0) / 1.5)
     assert params.attitude.roll_rate == 0.35  # 45 rad/s^2 of aileron would permit more
@@ -336,7 +416,10 @@ def test_omitted_numbers_follow_from_sections() -> None:
             {"guidance": {"speed": 30.0, "route": None}},
             "guidance.speed: found 30.0, expected 25.0, as the other sections have it",
         ),
-        ({"guidance": {"rate": 40.0}}, r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)"),
+        (
+            {"guidance": {"rate": 40.0}},
+            r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)",
+        ),
     ],
 )
 def test_sections_that_do_not_fit_guidance_refused(changes: dict[str, Any], sentence: str) -> None:
@@ -354,7 +437,11 @@ def test_replay_names_first_different_step() -> None:
     changed = replay_guidance(tape, scenario.guidance)
     assert changed.differing == 1
     assert changed.first is not None
-    assert (changed.first.number, changed.first.channel, changed.first.ulps) == (101, "published.p", 1)
+    assert (changed.first.number, changed.first.channel, changed.first.ulps) == (
+        101,
+        "published.p",
+        1,
+    )
 
 
 class RoutedInFlight(Guidance):
@@ -385,7 +472,11 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
         for points in ([(0.0, 0.0, 0.0)], WAYPOINTS):  # the first one is refused
             bag.write(topic, 1, path(*points))
     read = read_run(tmp_path / "bag").tape["route"]
-    assert read.values.tolist() == [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [1.0, 800.0, 0.0, 10.0]]
+    assert read.values.tolist() == [
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0],
+        [1.0, 800.0, 0.0, 10.0],
+    ]
     tape = Tape({**flown.signals, "route": read})
     result = replay_guidance(tape, section)
     assert (result.steps, result.checked, result.differing) == (151, 151, 0)
@@ -399,20 +490,31 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     scenario = written(with_route(ROUTE, read_route(file)), tmp_path / "osprey_route.yaml")
     section = load_scenario(scenario.path).guidance
     assert section is not None
-    assert section.waypoints() == (Waypoint(0, 0, 0, 25.0), Waypoint(800, 0, 10, 26.5), Waypoint(800, 900, 10, 26.5))
-    with pytest.raises(ParameterError, match=r"guidance\.route: found 1 waypoints, expected two or more"):
+    assert section.waypoints() == (
+        Waypoint(0, 0, 0, 25.0),
+        Waypoint(800, 0, 10, 26.5),
+        Waypoint(800, 900, 10, 26.5),
+    )
+    with pytest.raises(
+        ParameterError, match=r"guidance\.route: found 1 waypoints, expected two or more"
+    ):
         with_route(ROUTE, [Waypoint(0.0, 0.0, 0.0)])
     with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
         simulate(ROUTE.vary(aircraft={"kinematics": "linear"}))
     with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
         second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}))
-    assert GUIDANCE in second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True)  # the autopilot flies
+    assert GUIDANCE in second_stage(
+        ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True
+    )  # the autopilot flies
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["guide", "bank=3"], "guide: found 'bank=3', expected NAME=VALUE with one of phi, heading"),
+        (
+            ["guide", "bank=3"],
+            "guide: found 'bank=3', expected NAME=VALUE with one of phi, heading",
+        ),
         (["guide", "V=30", "V=31"], "guide: found a command twice, or two, expected each once"),
         (
             ["fly", "--in-process", "--set", "route.origin=47.4,8.5"],
@@ -429,10 +531,13 @@ def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: 
 def test_steep_climb_slows_and_keeps_airspeed() -> None:
     """A climb beyond the throttle becomes slower, and the airspeed stays."""
     # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
-    weak = calm(40.0, program=program(climb=2.5)).vary(aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}})
+    weak = calm(40.0, program=program(climb=2.5)).vary(
+        aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}}
+    )
     tape = simulate(weak)
     V, limited, climb = (
-        channel[after(tape, 25.0)] for channel in channels(tape["guidance"], "y.V", "limited.climb", "pose.climb")
+        channel[after(tape, 25.0)]
+        for channel in channels(tape["guidance"], "y.V", "limited.climb", "pose.climb")
     )
     assert limited.all()
     assert V.min() > -3.5  # without the limit V falls by 5.1 m/s, below the floor of 20 m/s
@@ -441,8 +546,13 @@ def test_steep_climb_slows_and_keeps_airspeed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shortfall", "expected"), [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))]
+    ("shortfall", "expected"),
+    [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))],
 )
-def test_airspeed_error_limits_climb_and_sink(shortfall: float, expected: tuple[float, float]) -> None:
+def test_airspeed_error_limits_climb_and_sink(
+    shortfall: float, expected: tuple[float, float]
+) -> None:
     """The limits of climb and sink fall with the error of the airspeed."""
-    assert climb_range(2.0, 3.0, shortfall, 25.0) == pytest.approx(expected, abs=5e-3)  # d = 9.81 x 2 / (0.4 x 25) = 1.96
+    assert climb_range(2.0, 3.0, shortfall, 25.0) == pytest.approx(
+        expected, abs=5e-3
+    )  # d = 9.81 x 2 / (0.4 x 25) = 1.96

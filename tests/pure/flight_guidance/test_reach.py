@@ -37,13 +37,23 @@ CONFIG = GuidanceConfig.validate_mapping(
 OWN = CONFIG.params()
 
 
-def flown(target: dict[str, float], authority: Authority, **pose: float) -> tuple[GuidanceState, Commands]:
+def flown(
+    target: dict[str, float], authority: Authority, **pose: float
+) -> tuple[GuidanceState, Commands]:
     """The commands after 10 s at a constant pose, level but for `pose`."""
     values = dict.fromkeys(POSE, 0.0) | {"v_north": SPEED} | pose
     state = None
     for k in range(500):
         begin, given = (Begin.HOLD, target) if k == 0 else (Begin.NO, {})
-        inputs = Inputs(k * OWN.period_ns, begin, tuple(values[name] for name in POSE), 0, (0.0,) * 4, given, authority)
+        inputs = Inputs(
+            k * OWN.period_ns,
+            begin,
+            tuple(values[name] for name in POSE),
+            0,
+            (0.0,) * 4,
+            given,
+            authority,
+        )
         state, commands = modes.step(state, inputs, None, OWN)
     assert state is not None
     return state, commands
@@ -55,7 +65,8 @@ def test_inputs_that_are_as_strong_as_known_change_no_limit() -> None:
 
 
 def test_weak_throttle_limits_climb_and_sink_to_what_it_can_do() -> None:
-    # In a steady climb the weight along the path is g h_dot / V: what is left of the throttle holds the airspeed.
+    # In a steady climb the weight along the path is g h_dot / V: what is left of the throttle holds
+    # the airspeed.
     vertical = within_reach(OWN, Authority(down=0.6, up=0.5)).vertical
     assert GRAVITY * vertical.climb / SPEED == pytest.approx(0.7 * 0.5)
     assert GRAVITY * vertical.sink / SPEED == pytest.approx(0.5 * 0.6)
@@ -64,12 +75,15 @@ def test_weak_throttle_limits_climb_and_sink_to_what_it_can_do() -> None:
 
 def test_weak_aileron_limits_roll_rate_and_the_bank_that_can_be_reversed() -> None:
     now = within_reach(OWN, Authority(p=1.2))
-    # 0.37 is the largest w y_dot of a second-order step of damping 1, as of the rule, which counts 0.4
+    # 0.37 is the largest w y_dot of a second-order step of damping 1, as of the rule, which counts
+    # 0.4
     assert 0.37 * FREQUENCY * now.attitude.roll_rate < 1.2 / 3.0
     assert 11.0 * now.limits.bank / now.attitude.roll_rate == pytest.approx(now.path.period)
     assert now.limits.bank < OWN.limits.bank
     # An orbit at this bank needs V^2 / (g tan(0.8 bank))
-    assert now.limits.radius == pytest.approx(SPEED**2 / (GRAVITY * math.tan(0.8 * now.limits.bank)))
+    assert now.limits.radius == pytest.approx(
+        SPEED**2 / (GRAVITY * math.tan(0.8 * now.limits.bank))
+    )
 
 
 def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
@@ -80,22 +94,31 @@ def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
     bank = math.radians(10.0)
     assert u_m["r"] == pytest.approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
     held, _ = flown({"phi": 0.3}, Authority(p=0.0), phi=bank)
-    assert held.u_m[OWN.outputs.index("r")] == pytest.approx(GRAVITY * math.tan(bank) / SPEED)  # of a turn at this bank
-    # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank of 30 deg need not.
-    assert [flown({"phi": 0.0}, able, north=4800.0)[0].fence != 0.0 for able in (Authority(), Authority(p=0.0))] == [
+    assert held.u_m[OWN.outputs.index("r")] == pytest.approx(
+        GRAVITY * math.tan(bank) / SPEED
+    )  # of a turn at this bank
+    # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank
+    # of 30 deg need not.
+    assert [
+        flown({"phi": 0.0}, able, north=4800.0)[0].fence != 0.0
+        for able in (Authority(), Authority(p=0.0))
+    ] == [
         False,
         True,
     ]
 
 
 def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
-    # At a constant angle of attack the lift goes with V^2, so that 1 m/s more of V accelerates upwards with 2 g / V.
+    # At a constant angle of attack the lift goes with V^2, so that 1 m/s more of V accelerates
+    # upwards with 2 g / V.
     sinks, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=-1.0)
     assert sinks.u_m[OWN.outputs.index("q")] == 0.0
     assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == pytest.approx(0.4 * 1.0)
     climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
     assert climbs.V_c - SPEED == pytest.approx(SPEED - sinks.V_c)
-    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == pytest.approx(1.2)  # m/s^2, of 1.2 rad/s
+    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == pytest.approx(
+        1.2
+    )  # m/s^2, of 1.2 rad/s
 
 
 def test_limits_are_said_once_and_end_with_the_model() -> None:
@@ -125,5 +148,7 @@ def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
         output = guidance.step(now_ns, now_ns)
         assert output is not None
         logged = dict(zip(guidance.names, output.log.tolist(), strict=True))
-        assert tuple(logged[name] for name in LEARNED) == ((9.0, 1.0, 9.0, 2.0) if k else Authority())
+        assert tuple(logged[name] for name in LEARNED) == (
+            (9.0, 1.0, 9.0, 2.0) if k else Authority()
+        )
         guidance.take_authority(channels)

@@ -28,9 +28,18 @@ from flight_guidance.route_file import (
 )
 
 ZURICH = Origin(47.4, 8.5)
-SQUARE = [(8.5, 47.4, 500.0), (8.52, 47.4, 550.0), (8.52, 47.42, 600.5)]  # longitude, latitude, altitude
-PLACES = [pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE]  # north, east
-ROUTE = [pytest.approx((*place, altitude), abs=1e-6) for place, (_, _, altitude) in zip(PLACES, SQUARE, strict=True)]
+SQUARE = [
+    (8.5, 47.4, 500.0),
+    (8.52, 47.4, 550.0),
+    (8.52, 47.42, 600.5),
+]  # longitude, latitude, altitude
+PLACES = [
+    pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE
+]  # north, east
+ROUTE = [
+    pytest.approx((*place, altitude), abs=1e-6)
+    for place, (_, _, altitude) in zip(PLACES, SQUARE, strict=True)
+]
 
 
 def flown(path: Path, content: str | dict[str, Any], origin: Origin | None = ZURICH) -> list[Any]:
@@ -40,7 +49,10 @@ def flown(path: Path, content: str | dict[str, Any], origin: Origin | None = ZUR
 
 def kml(body: str, mode: str = "<altitudeMode>absolute</altitudeMode>", head: str = "") -> str:
     body = body.replace("<coordinates>", f"{mode}<coordinates>")
-    return f'<?xml version="1.0"?>{head}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{body}</Document></kml>'
+    return (
+        f'<?xml version="1.0"?>{head}<kml '
+        f'xmlns="http://www.opengis.net/kml/2.2"><Document>{body}</Document></kml>'
+    )
 
 
 def line(coordinates: Any = SQUARE) -> dict[str, Any]:
@@ -48,13 +60,20 @@ def line(coordinates: Any = SQUARE) -> dict[str, Any]:
 
 
 def point(coordinates: Any, **properties: Any) -> dict[str, Any]:
-    return {"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": coordinates}}
+    return {
+        "type": "Feature",
+        "properties": properties,
+        "geometry": {"type": "Point", "coordinates": coordinates},
+    }
 
 
 COORDINATES = "\n".join(f"{lon},{lat},{altitude}" for lon, lat, altitude in SQUARE)
-KML_LINE = f"<Placemark><LineString><coordinates>{COORDINATES}</coordinates></LineString></Placemark>"
+KML_LINE = (
+    f"<Placemark><LineString><coordinates>{COORDINATES}</coordinates></LineString></Placemark>"
+)
 KML_POINTS = "".join(
-    f"<Placemark><Point><coordinates>{lon},{lat},{altitude}</coordinates></Point></Placemark>" for lon, lat, altitude in SQUARE
+    f"<Placemark><Point><coordinates>{lon},{lat},{altitude}</coordinates></Point></Placemark>"
+    for lon, lat, altitude in SQUARE
 )
 
 
@@ -65,10 +84,14 @@ def test_north_and_east_of_tangent_plane(latitude: float, longitude: float) -> N
     for north, east in ((0.0, 0.0), (1e3, -2e3), (-5e4, 5e4)):
         lat, lon, up = pymap3d.enu2geodetic(east, north, 0.0, latitude, longitude, 0.0)
         expected = pymap3d.geodetic2enu(lat, lon, 0.0, latitude, longitude, 0.0)
-        assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx((expected[1], expected[0]), abs=1e-6)
+        assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx(
+            (expected[1], expected[0]), abs=1e-6
+        )
         # The position on the ground below a point of the plane is closer by up / R of its distance.
         share = 1.0 - up / 6.3e6
-        assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx((north * share, east * share), abs=0.5)
+        assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx(
+            (north * share, east * share), abs=0.5
+        )
 
 
 def test_plane_errs_by_4_m() -> None:
@@ -83,11 +106,24 @@ def test_plane_errs_by_4_m() -> None:
     [
         (".geojson", line()),
         (".json", {"type": "Feature", "properties": None, "geometry": line()}),
-        (".geojson", {"type": "FeatureCollection", "features": [point([0.0, 0.0, 0.0]), {"geometry": line()}]}),
+        (
+            ".geojson",
+            {
+                "type": "FeatureCollection",
+                "features": [point([0.0, 0.0, 0.0]), {"geometry": line()}],
+            },
+        ),
         (".geojson", {"type": "FeatureCollection", "features": [point(each) for each in SQUARE]}),
         (".KML", kml(KML_POINTS)),
         (".kml", kml(KML_LINE + KML_POINTS)),
-        (".yaml", {"route": [{"longitude": lon, "latitude": lat, "altitude": h} for lon, lat, h in SQUARE]}),
+        (
+            ".yaml",
+            {
+                "route": [
+                    {"longitude": lon, "latitude": lat, "altitude": h} for lon, lat, h in SQUARE
+                ]
+            },
+        ),
     ],
 )
 def test_each_format_holds_the_same_route(ending: str, content: Any, tmp_path: Path) -> None:
@@ -96,37 +132,59 @@ def test_each_format_holds_the_same_route(ending: str, content: Any, tmp_path: P
 
 def test_speed_read_where_format_has_one(tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
-    path.write_text("route: [[0, 0, 100], [500, 0, 120, 25.0], [900, -10, 120.5, 30]]", encoding="utf-8")
-    assert read_route(path) == (Waypoint(0, 0, 100), Waypoint(500, 0, 120, 25.0), Waypoint(900, -10, 120.5, 30))
+    path.write_text(
+        "route: [[0, 0, 100], [500, 0, 120, 25.0], [900, -10, 120.5, 30]]", encoding="utf-8"
+    )
+    assert read_route(path) == (
+        Waypoint(0, 0, 100),
+        Waypoint(500, 0, 120, 25.0),
+        Waypoint(900, -10, 120.5, 30),
+    )
     path = tmp_path / "r.geojson"
-    path.write_text(json.dumps({"features": [point(SQUARE[0]), point(SQUARE[1], V=31.5)]}), encoding="utf-8")
+    path.write_text(
+        json.dumps({"features": [point(SQUARE[0]), point(SQUARE[1], V=31.5)]}), encoding="utf-8"
+    )
     assert [waypoint.speed for waypoint in read_route(path, ZURICH)] == [None, 31.5]
 
 
 def gpx(body: str, head: str = "") -> str:
-    return f'<?xml version="1.0"?>{head}<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">{body}</gpx>'
+    return (
+        f'<?xml version="1.0"?>{head}<gpx version="1.1" '
+        f'xmlns="http://www.topografix.com/GPX/1/1">{body}</gpx>'
+    )
 
 
 def gpx_points(kind: str) -> str:
-    return "".join(f'<{kind} lat="{lat}" lon="{lon}"><ele>{h}</ele></{kind}>' for lon, lat, h in SQUARE)
+    return "".join(
+        f'<{kind} lat="{lat}" lon="{lon}"><ele>{h}</ele></{kind}>' for lon, lat, h in SQUARE
+    )
 
 
 SEGMENTS = """<trk><trkseg><trkpt lat="47.4" lon="8.5"><ele>500</ele></trkpt></trkseg>
-<trkseg><trkpt lat="{}" lon="8.5"><ele>500</ele></trkpt><trkpt lat="47.41" lon="8.5"><ele>500</ele></trkpt></trkseg></trk>"""
+<trkseg><trkpt lat="{}" lon="8.5"><ele>500</ele></trkpt><trkpt lat="47.41" lon="8.5"><ele>500</ele></trkpt></trkseg></trk>"""  # noqa: E501 - a text as it is written
 RTE, TRK, WPT = (gpx_points(kind) for kind in ("rtept", "trkpt", "wpt"))
 
 
-def mission_item(latitude: float, longitude: float, altitude: float, frame: int = 3, command: int = 16) -> dict[str, Any]:
+def mission_item(
+    latitude: float, longitude: float, altitude: float, frame: int = 3, command: int = 16
+) -> dict[str, Any]:
     params = [0, 0, 0, None, latitude, longitude, altitude]
     return {"type": "SimpleItem", "command": command, "frame": frame, "params": params}
 
 
-def plan(items: list[dict[str, Any]], home: Any = (47.4, 8.5, 400.0), **more: Any) -> dict[str, Any]:
-    return {"fileType": "Plan", "mission": {"items": items, "plannedHomePosition": list(home)}} | more
+def plan(
+    items: list[dict[str, Any]], home: Any = (47.4, 8.5, 400.0), **more: Any
+) -> dict[str, Any]:
+    return {
+        "fileType": "Plan",
+        "mission": {"items": items, "plannedHomePosition": list(home)},
+    } | more
 
 
 def wpl(*rows: tuple[float, ...]) -> str:
-    """Rows of frame, command, latitude, longitude, altitude, perhaps the first two parameters, after the home at 400 m."""
+    """Rows of frame, command, latitude, longitude, altitude, perhaps the first two parameters,
+    after the home at 400 m.
+    """
     lines = [(*row, 0.0, 0.0)[:7] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
     texts = [
         f"{k}\t0\t{frame}\t{command}\t{p}\t{q}\t0\t0\t{a}\t{b}\t{c}\t1"
@@ -136,7 +194,11 @@ def wpl(*rows: tuple[float, ...]) -> str:
 
 
 def survey(items: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"type": "ComplexItem", "complexItemType": "survey", "TransectStyleComplexItem": {"Items": items}}
+    return {
+        "type": "ComplexItem",
+        "complexItemType": "survey",
+        "TransectStyleComplexItem": {"Items": items},
+    }
 
 
 def zipped(**files: str) -> bytes:
@@ -147,8 +209,12 @@ def zipped(**files: str) -> bytes:
     return archive.getvalue()
 
 
-TRACK = "<gx:Track xmlns:gx='http://www.google.com/kml/ext/2.2'><altitudeMode>absolute</altitudeMode>" + "".join(
-    f"<when>2026-01-01T00:00:0{k}Z</when><gx:coord>{lon} {lat} {h}</gx:coord>" for k, (lon, lat, h) in enumerate(SQUARE)
+TRACK = (
+    "<gx:Track xmlns:gx='http://www.google.com/kml/ext/2.2'><altitudeMode>absolute</altitudeMode>"
+    + "".join(
+        f"<when>2026-01-01T00:00:0{k}Z</when><gx:coord>{lon} {lat} {h}</gx:coord>"
+        for k, (lon, lat, h) in enumerate(SQUARE)
+    )
 )
 ABSOLUTE = "<altitudeMode>absolute</altitudeMode>"
 RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
@@ -160,13 +226,28 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
         ("r.geojson", {"type": "MultiLineString", "coordinates": [SQUARE]}),
         ("r.geojson", {"type": "MultiPoint", "coordinates": SQUARE}),
         ("r.geojson", {"type": "GeometryCollection", "geometries": [line()]}),
-        ("r.geojson", {"features": [{"type": "Feature", "geometry": None}, point([8.5, 47.4]), {"geometry": line()}]}),
+        (
+            "r.geojson",
+            {
+                "features": [
+                    {"type": "Feature", "geometry": None},
+                    point([8.5, 47.4]),
+                    {"geometry": line()},
+                ]
+            },
+        ),
         ("r.geojson", line([SQUARE[0], *SQUARE])),  # a double click
         ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}}),
         ("r.kml", kml(f"<Placemark><MultiGeometry>{RING}</MultiGeometry></Placemark>{KML_POINTS}")),
-        ("r.kml", kml(f"<Polygon>{ABSOLUTE}<outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>", mode="")),
+        (
+            "r.kml",
+            kml(f"<Polygon>{ABSOLUTE}<outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>", mode=""),
+        ),
         ("r.kml", kml(f"<Placemark>{TRACK}</gx:Track></Placemark>{KML_POINTS}")),
-        ("r.kml", kml(f"<Placemark>{TRACK}<Model/></gx:Track></Placemark>")),  # whose sign is a model
+        (
+            "r.kml",
+            kml(f"<Placemark>{TRACK}<Model/></gx:Track></Placemark>"),
+        ),  # whose sign is a model
         ("r.kml", kml(KML_LINE.replace(",", ", "))),
         ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),
         ("r.kmz", zipped(route_kml=kml(KML_LINE), **{"__MACOSX/": "", "files/other_kml": "no"})),
@@ -191,27 +272,51 @@ def test_files_of_other_programs_hold_same_route(name: str, content: Any, tmp_pa
     ("name", "content", "heights"),
     [
         ("r.geojson", line([place[:2] for place in SQUARE]), [30.0, 30.0, 30.0]),
-        ("r.kml", kml(KML_LINE, mode=""), [30.0, 30.0, 30.0]),  # a path of Google Earth: clampToGround
-        ("r.kml", kml(KML_LINE, mode="<altitudeMode>relativeToGround</altitudeMode>"), [530.0, 580.0, 630.5]),
-        ("r.plan", plan([mission_item(lat, lon, h) for lon, lat, h in SQUARE]), [530.0, 580.0, 630.5]),
+        (
+            "r.kml",
+            kml(KML_LINE, mode=""),
+            [30.0, 30.0, 30.0],
+        ),  # a path of Google Earth: clampToGround
+        (
+            "r.kml",
+            kml(KML_LINE, mode="<altitudeMode>relativeToGround</altitudeMode>"),
+            [530.0, 580.0, 630.5],
+        ),
+        (
+            "r.plan",
+            plan([mission_item(lat, lon, h) for lon, lat, h in SQUARE]),
+            [530.0, 580.0, 630.5],
+        ),
     ],
 )
-def test_altitude_option_fills_what_file_lacks(name: str, content: Any, heights: list[float], tmp_path: Path) -> None:
+def test_altitude_option_fills_what_file_lacks(
+    name: str, content: Any, heights: list[float], tmp_path: Path
+) -> None:
     path = tmp_path / name
     path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
-    assert [waypoint.altitude for waypoint in read_route_file(path, ZURICH, 30.0).waypoints] == heights
+    assert [
+        waypoint.altitude for waypoint in read_route_file(path, ZURICH, 30.0).waypoints
+    ] == heights
 
 
 def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
     """The home is 400 m above the sea; its place is the origin where no origin is given."""
     path = tmp_path / "r.waypoints"
     path.write_text(wpl((3, 16, 47.4, 8.52, 50.0), (0, 16, 47.42, 8.52, 500.0)), encoding="utf-8")
-    assert [waypoint.altitude for waypoint in read_route_file(path, above_sea=True).waypoints] == [450.0, 500.0]
+    assert [waypoint.altitude for waypoint in read_route_file(path, above_sea=True).waypoints] == [
+        450.0,
+        500.0,
+    ]
     assert [waypoint.altitude for waypoint in read_route_file(path).waypoints] == [50.0, 100.0]
     assert read_route(path)[0].point == pytest.approx(PLACES[1], abs=1e-6)
     # The altitude of the home as the aircraft counts, where nothing else of the flight is known.
-    assert [waypoint.altitude for waypoint in read_route_file(path, ZURICH, 7.0, above_sea=None).waypoints] == [57.0, 107.0]
-    with pytest.raises(ParameterError, match=r"found an altitude above the home, expected --set route.altitude"):
+    assert [
+        waypoint.altitude
+        for waypoint in read_route_file(path, ZURICH, 7.0, above_sea=None).waypoints
+    ] == [57.0, 107.0]
+    with pytest.raises(
+        ParameterError, match=r"found an altitude above the home, expected --set route.altitude"
+    ):
         read_route_file(path, ZURICH, above_sea=None)
     with pytest.raises(ParameterError, match="expected an origin"):
         read_route_file(path, None, 7.0, above_sea=None)
@@ -220,7 +325,8 @@ def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
 def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) -> None:
     path = tmp_path / "r.waypoints"
     rows = [
-        (3, 22, 0.0, 0.0, 50.0), (3, 16, 47.4, 8.52, 50.0), (3, 31, 47.41, 8.52, 90.0), (3, 18, 47.42, 8.52, 90.0, 2.0),
+        (3, 22, 0.0, 0.0, 50.0), (3, 16, 47.4, 8.52, 50.0), (3, 31, 47.41, 8.52, 90.0),
+        (3, 18, 47.42, 8.52, 90.0, 2.0),
         (2, 177, 0.0, 0.0, 0.0), (3, 17, 47.43, 8.52, 90.0), (3, 16, 47.44, 8.52, 90.0),
     ]  # fmt: skip
     path.write_text(wpl(*rows), encoding="utf-8")
@@ -230,11 +336,16 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
     ]
     # A loiter without end is the last orbit.
     home = "item 0 is the home, at 47.4,8.5, and no waypoint"
-    assert route.notes == (home, "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)")
+    assert route.notes == (
+        home,
+        "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)",
+    )
 
 
 WPL_FENCE = [
-    *((3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))),  # of three corners
+    *(
+        (3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))
+    ),  # of three corners
     *((3, 5004, 47.41, 8.51, 0.0, 200.0), (3, 5100, 47.401, 8.5, 40.0)),
 ]
 A, B, C, D = ((3, 16, 47.4 + 0.01 * k, 8.52, 50.0) for k in range(4))
@@ -251,16 +362,28 @@ def jump(item: int, count: int) -> tuple[float, ...]:
         ((A, B, jump(1, 2), C), "ABABABC", ""),  # so often again (MAVLink, MAV_CMD_DO_JUMP)
         ((A, jump(4, -1), B, C), "AC", "NAV_WAYPOINT (item 3)"),
         ((A, B, jump(1, -1), C), "AB", "DO_JUMP (item 3), NAV_WAYPOINT (item 4)"),
-        ((A, B, (3, 20, 0.0, 0.0, 0.0), C), "AB", "NAV_RETURN_TO_LAUNCH (item 3), NAV_WAYPOINT (item 4)"),
+        (
+            (A, B, (3, 20, 0.0, 0.0, 0.0), C),
+            "AB",
+            "NAV_RETURN_TO_LAUNCH (item 3), NAV_WAYPOINT (item 4)",
+        ),
         ((A, B, (3, 21, 47.43, 8.52, 0.0), C), "AB", "NAV_LAND (item 3), NAV_WAYPOINT (item 4)"),
-        ((A, B, (3, 17, 0.0, 0.0, 0.0), C), "AB", "NAV_WAYPOINT (item 4)"),  # loiters where the aircraft is
+        (
+            (A, B, (3, 17, 0.0, 0.0, 0.0), C),
+            "AB",
+            "NAV_WAYPOINT (item 4)",
+        ),  # loiters where the aircraft is
     ],
 )
-def test_mission_is_flown_in_the_order_of_an_autopilot(rows: Any, places: str, skipped: str, tmp_path: Path) -> None:
+def test_mission_is_flown_in_the_order_of_an_autopilot(
+    rows: Any, places: str, skipped: str, tmp_path: Path
+) -> None:
     path = tmp_path / "r.waypoints"
     path.write_text(wpl(*rows), encoding="utf-8")
     route = read_route_file(path, ZURICH)
-    names = {local(row[2], row[3], ZURICH): name for row, name in zip((A, B, C, D), "ABCD", strict=True)}
+    names = {
+        local(row[2], row[3], ZURICH): name for row, name in zip((A, B, C, D), "ABCD", strict=True)
+    }
     assert "".join(names[waypoint.point] for waypoint in route.waypoints) == places
     assert route.notes[1:] == ((f"not flown: {skipped}",) if skipped else ())
 
@@ -273,38 +396,63 @@ def test_mission_is_flown_in_the_order_of_an_autopilot(rows: Any, places: str, s
         ((A, B, jump(1, 30000)), "more than 20000 items by the repetitions"),
     ],
 )
-def test_mission_that_is_no_route_is_refused_by_item(rows: Any, sentence: str, tmp_path: Path) -> None:
+def test_mission_that_is_no_route_is_refused_by_item(
+    rows: Any, sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         flown(tmp_path / "r.waypoints", wpl(*rows))
 
 
 def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
     """A survey takes an id for each of its items, so that positions in the list and ids differ."""
-    items = [survey([{**mission_item(47.4 + 0.01 * k, 8.52, 50.0), "doJumpId": 3 + k} for k in range(3)])]
-    items.append({**mission_item(0, 0, 0, frame=2, command=177), "params": [5, 1, 0, 0, 0, 0, 0], "doJumpId": 9})
+    items = [
+        survey([{**mission_item(47.4 + 0.01 * k, 8.52, 50.0), "doJumpId": 3 + k} for k in range(3)])
+    ]
+    items.append(
+        {
+            **mission_item(0, 0, 0, frame=2, command=177),
+            "params": [5, 1, 0, 0, 0, 0, 0],
+            "doJumpId": 9,
+        }
+    )
     places = flown(tmp_path / "r.plan", plan(items))
     assert len(places) == 3  # the last one twice is one waypoint
     items.append({**mission_item(47.45, 8.52, 50.0), "doJumpId": 10})
     items[1]["params"][0] = 4
     assert [
-        round((north - local(47.4, 8.52, ZURICH)[0]) / 1112.0) for north, _, _ in flown(tmp_path / "r.plan", plan(items))
+        round((north - local(47.4, 8.52, ZURICH)[0]) / 1112.0)
+        for north, _, _ in flown(tmp_path / "r.plan", plan(items))
     ] == [*(0, 1, 2, 1, 2, 5)]
 
 
 def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
     path.write_text(
-        "route:\n- [0, 0, 0]\n- [900, 0, 0]\n- {north: 900, east: 0, altitude: 80, turns: 2}\n- [1800, 0, 80]\n",
+        "route:\n- [0, 0, 0]\n- [900, 0, 0]\n- {north: 900, east: 0, altitude: 80, turns: 2}\n- "
+        "[1800, 0, 80]\n",
         encoding="utf-8",
     )
     assert read_route(path)[1] == Waypoint(900.0, 0.0, 0.0, None, 2.0, 0.0, 80.0)
-    path.write_text("route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]", encoding="utf-8")
-    assert [waypoint.speed for waypoint in read_route(path)] == [None, 26.0, 27.0, None]  # as on the leg before
+    path.write_text(
+        "route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]",
+        encoding="utf-8",
+    )
+    assert [waypoint.speed for waypoint in read_route(path)] == [
+        None,
+        26.0,
+        27.0,
+        None,
+    ]  # as on the leg before
     circle = "{{north: 900, east: 0, altitude: 0, turns: {}}}"
-    path.write_text(f"route: [[0, 0, 0], {circle.format(2)}, {circle.format(3)}, [900, 900, 0]]", encoding="utf-8")
+    path.write_text(
+        f"route: [[0, 0, 0], {circle.format(2)}, {circle.format(3)}, [900, 900, 0]]",
+        encoding="utf-8",
+    )
     assert read_route(path)[1].turns == 5.0
     path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: no}\n", encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"route\[0\].turns: found False, expected a finite number"):
+    with pytest.raises(
+        ParameterError, match=r"route\[0\].turns: found False, expected a finite number"
+    ):
         read_route(path)
     path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: -1}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=r"route\[0\].turns: found -1, expected at least 0"):
@@ -315,7 +463,10 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     ("command", "sentence"),
     [
         (179, "not flown: DO_SET_HOME (item 2)"),
-        (179, "heights above the home stay above the first home, and not above that of DO_SET_HOME"),
+        (
+            179,
+            "heights above the home stay above the first home, and not above that of DO_SET_HOME",
+        ),
         (601, "DO_JUMP_TAG repeats items, which are flown once here"),
         (30, "not flown: NAV_CONTINUE_AND_CHANGE_ALT (30) (item 2)"),
         (42702, "not flown: NAV_SCRIPT_TIME (42702) (item 2)"),
@@ -332,22 +483,35 @@ def test_command_has_its_number_where_pymavlink_is_absent(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
     items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0) for k in range(3)]
     items[1] |= {"command": 42702}
-    assert "not flown: MAV_CMD 42702 (item 2)" in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+    assert (
+        "not flown: MAV_CMD 42702 (item 2)"
+        in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+    )
 
 
 def test_numbers_with_decimal_commas_are_named(tmp_path: Path) -> None:
     text = wpl((3, 16, 47.41, 8.5, 50.0), (3, 16, 47.42, 8.5, 50.0)).replace("47.41", "47,41")
-    with pytest.raises(ParameterError, match=r"line 3: found .*, expected 12 numbers, .* with a point and no comma: 47,41$"):
+    with pytest.raises(
+        ParameterError,
+        match=r"line 3: found .*, expected 12 numbers, .* with a point and no comma: 47,41$",
+    ):
         route_formats.read(text.encode(), "r.waypoints", ".waypoints")
 
 
 @pytest.mark.parametrize("place", ["fence", "top"])
 def test_fence_of_version_1_is_named(place: str) -> None:
     first = {"polygon": [[47.39, 8.49], [47.42, 8.49], [47.42, 8.53]], "breachReturn": [47.4, 8.5]}
-    tree = plan([mission_item(47.41, 8.52, 50.0)], **({"geoFence": first} if place == "fence" else first))
+    tree = plan(
+        [mission_item(47.41, 8.52, 50.0)], **({"geoFence": first} if place == "fence" else first)
+    )
     content = json.dumps(tree).encode()
-    assert any("not read: the fence of version 1" in note for note in route_formats.read(content, "r.plan", ".plan").notes)
-    with pytest.raises(ParameterError, match=r"found the fence of version 1 .*, expected one of version 2"):
+    assert any(
+        "not read: the fence of version 1" in note
+        for note in route_formats.read(content, "r.plan", ".plan").notes
+    )
+    with pytest.raises(
+        ParameterError, match=r"found the fence of version 1 .*, expected one of version 2"
+    ):
         route_formats.read_fence(content, "r.plan", ".plan")
 
 
@@ -368,7 +532,9 @@ GEOJSON_FENCE: dict[str, Any] = {
             "type": "Feature",
             "geometry": {
                 "type": "Polygon",
-                "coordinates": [[[8.49, 47.39], [8.49, 47.42], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]],  # a double click
+                "coordinates": [
+                    [[8.49, 47.39], [8.49, 47.42], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]
+                ],  # a double click
             },
         },
         {
@@ -389,7 +555,9 @@ def test_segments_of_track_are_joined(tmp_path: Path) -> None:
 
 
 def named_lines(north: float, name: str) -> str:
-    points = "".join(f'<trkpt lat="{north + 0.01 * k}" lon="8.5"><ele>500</ele></trkpt>' for k in range(2))
+    points = "".join(
+        f'<trkpt lat="{north + 0.01 * k}" lon="8.5"><ele>500</ele></trkpt>' for k in range(2)
+    )
     return f"<trk><name>{name}</name><trkseg>{points}</trkseg></trk>"
 
 
@@ -400,12 +568,19 @@ def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> Non
     path.write_text(content, encoding="utf-8")
     route = read_route_file(path, ZURICH, line=line)
     north = pymap3d.geodetic2enu(47.45, 8.5, 0.0, *ZURICH, 0.0)[1]
-    assert [waypoint.north for waypoint in route.waypoints] == pytest.approx([north, north + 1112.0], abs=1.0)
+    assert [waypoint.north for waypoint in route.waypoints] == pytest.approx(
+        [north, north + 1112.0], abs=1.0
+    )
     assert route.notes == ("1 further lines and 3 wpt beside the trk: no part of the route",)
-    with pytest.raises(ParameterError, match=r"found 2 trk, expected one, or --set route.line=1 \(morning\), 2 \(evening\)"):
+    with pytest.raises(
+        ParameterError,
+        match=r"found 2 trk, expected one, or --set route.line=1 \(morning\), 2 \(evening\)",
+    ):
         read_route_file(path, ZURICH)
     with pytest.raises(
-        ParameterError, match=r"route.line: found '3', which names 0 lines, expected --set route.line=1 \(morning\)"
+        ParameterError,
+        match=r"route.line: found '3', which names 0 lines, expected --set route.line=1 "
+        r"\(morning\)",
     ):
         read_route_file(path, ZURICH, line="3")
     path = tmp_path / "r.plan"
@@ -418,51 +593,90 @@ def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> Non
 def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"fence{ending}"
     tree = PLAN_FENCE if ending == ".plan" else GEOJSON_FENCE
-    path.write_text(wpl(*WPL_FENCE) if ending == ".waypoints" else json.dumps(tree), encoding="utf-8")
+    path.write_text(
+        wpl(*WPL_FENCE) if ending == ".waypoints" else json.dumps(tree), encoding="utf-8"
+    )
     sections = read_fence_file(path, ZURICH)
     field, hole = sections["fence"].values()
     corners = [local(47.39, 8.49, ZURICH), local(47.42, 8.49, ZURICH), local(47.42, 8.53, ZURICH)]
-    assert (field["north"], field["east"]) == tuple([corner[k] for corner in corners] for k in (0, 1))
+    assert (field["north"], field["east"]) == tuple(
+        [corner[k] for corner in corners] for k in (0, 1)
+    )
     assert (field["exclude"], hole["exclude"], hole["radius"]) == (False, True, 200.0)
     if ending != ".geojson":  # the nearest rally point, above the home
         assert sections["home"] == pytest.approx(
-            {"north": local(47.401, 8.5, ZURICH)[0], "east": local(47.401, 8.5, ZURICH)[1], "altitude": 40.0}
+            {
+                "north": local(47.401, 8.5, ZURICH)[0],
+                "east": local(47.401, 8.5, ZURICH)[1],
+                "altitude": 40.0,
+            }
         )
 
 
 def test_inclusion_zones_of_an_autopilot_are_one_group(tmp_path: Path) -> None:
-    """MAVLink: inside all zones of a group. A plan has no groups; PX4 and ArduPilot stay inside all of its zones."""
+    """MAVLink: inside all zones of a group. A plan has no groups; PX4 and ArduPilot stay inside all
+    of its zones.
+    """
     path = tmp_path / "fence.plan"
     polygon = PLAN_FENCE["geoFence"]["polygons"][0]
     circle = {"circle": CENTRE, "inclusion": True}
-    tree = {"geoFence": {"polygons": [polygon, polygon], "circles": [circle, *PLAN_FENCE["geoFence"]["circles"]]}}
+    tree = {
+        "geoFence": {
+            "polygons": [polygon, polygon],
+            "circles": [circle, *PLAN_FENCE["geoFence"]["circles"]],
+        }
+    }
     path.write_text(json.dumps(PLAN_FENCE | tree), encoding="utf-8")
-    assert [zone.get("group") for zone in read_fence_file(path)["fence"].values()] == [0, 0, 0, None]
+    assert [zone.get("group") for zone in read_fence_file(path)["fence"].values()] == [
+        0,
+        0,
+        0,
+        None,
+    ]
     path = tmp_path / "fence.geojson"
     path.write_text(json.dumps(GEOJSON_FENCE), encoding="utf-8")
-    assert [zone.get("group") for zone in read_fence_file(path, ZURICH)["fence"].values()] == [None, None]
+    assert [zone.get("group") for zone in read_fence_file(path, ZURICH)["fence"].values()] == [
+        None,
+        None,
+    ]
 
 
 def test_home_is_return_point_of_fence_without_rally_points(tmp_path: Path) -> None:
     there = local(47.405, 8.5, ZURICH)
     path = tmp_path / "fence.plan"
     fence = PLAN_FENCE["geoFence"] | {"breachReturn": [47.405, 8.5, 60.0]}
-    path.write_text(json.dumps(PLAN_FENCE | {"rallyPoints": {}, "geoFence": fence}), encoding="utf-8")
-    assert read_fence_file(path)["home"] == pytest.approx({"north": there[0], "east": there[1], "altitude": 60.0})
+    path.write_text(
+        json.dumps(PLAN_FENCE | {"rallyPoints": {}, "geoFence": fence}), encoding="utf-8"
+    )
+    assert read_fence_file(path)["home"] == pytest.approx(
+        {"north": there[0], "east": there[1], "altitude": 60.0}
+    )
     path = tmp_path / "fence.waypoints"
-    path.write_text(wpl((0, 5000, 47.405, 8.5, 0.0), *WPL_FENCE[:3]), encoding="utf-8")  # which has no altitude
-    assert read_fence_file(path, ZURICH)["home"] == pytest.approx({"north": there[0], "east": there[1]})
+    path.write_text(
+        wpl((0, 5000, 47.405, 8.5, 0.0), *WPL_FENCE[:3]), encoding="utf-8"
+    )  # which has no altitude
+    assert read_fence_file(path, ZURICH)["home"] == pytest.approx(
+        {"north": there[0], "east": there[1]}
+    )
 
 
 @pytest.mark.parametrize(
     ("rows", "sentence"),
     [
         (WPL_FENCE[:2], "found 2 of the 3 corners of a polygon, expected all"),
-        ([*WPL_FENCE[:2], WPL_FENCE[4]], r"NAV_RALLY_POINT \(item 3\): found 0 corners, expected corners of a polygon"),
-        ([(3, 5001, 47.39, 8.49, 0.0, math.nan)], r"VERTEX_INCLUSION \(item 1\): found nan corners, expected corners"),
+        (
+            [*WPL_FENCE[:2], WPL_FENCE[4]],
+            r"NAV_RALLY_POINT \(item 3\): found 0 corners, expected corners of a polygon",
+        ),
+        (
+            [(3, 5001, 47.39, 8.49, 0.0, math.nan)],
+            r"VERTEX_INCLUSION \(item 1\): found nan corners, expected corners",
+        ),
     ],
 )
-def test_polygon_without_all_corners_is_no_smaller_fence(rows: Any, sentence: str, tmp_path: Path) -> None:
+def test_polygon_without_all_corners_is_no_smaller_fence(
+    rows: Any, sentence: str, tmp_path: Path
+) -> None:
     path = tmp_path / "fence.waypoints"
     path.write_text(wpl(*rows), encoding="utf-8")
     with pytest.raises(ParameterError, match=sentence):
@@ -485,13 +699,20 @@ def test_fence_is_read_wherever_a_geojson_may_have_it(tmp_path: Path) -> None:
     """RFC 7946, sections 3.1.8 and 3.2: a collection of geometries, and a Feature without one."""
     path = tmp_path / "fence.geojson"
     polygon = GEOJSON_FENCE["features"][0]["geometry"]
-    tree = {"features": [{"geometry": None}, {"geometry": {"type": "GeometryCollection", "geometries": [polygon]}}]}
+    tree = {
+        "features": [
+            {"geometry": None},
+            {"geometry": {"type": "GeometryCollection", "geometries": [polygon]}},
+        ]
+    }
     path.write_text(json.dumps(tree), encoding="utf-8")
     assert len(read_fence_file(path, ZURICH)["fence"]["zone_0"]["north"]) == 3
     path.write_text(json.dumps({"type": "FeatureCollection", "features": []}), encoding="utf-8")
     with pytest.raises(ParameterError, match="found no zone"):
         read_fence_file(path, ZURICH)
-    exchanged = polygon | {"coordinates": [[position[::-1] for position in polygon["coordinates"][0]]]}
+    exchanged = polygon | {
+        "coordinates": [[position[::-1] for position in polygon["coordinates"][0]]]
+    }
     path.write_text(json.dumps(exchanged), encoding="utf-8")
     with pytest.raises(ParameterError, match="latitude and longitude exchanged, by the origin"):
         read_fence_file(path, ZURICH)
@@ -499,8 +720,13 @@ def test_fence_is_read_wherever_a_geojson_may_have_it(tmp_path: Path) -> None:
 
 def test_file_without_fence_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.geojson"
-    path.write_text(json.dumps({"type": "LineString", "coordinates": [[8.5, 47.4], [8.51, 47.4]]}), encoding="utf-8")
-    with pytest.raises(ParameterError, match="found a 'LineString', expected Polygons, or Points with a radius"):
+    path.write_text(
+        json.dumps({"type": "LineString", "coordinates": [[8.5, 47.4], [8.51, 47.4]]}),
+        encoding="utf-8",
+    )
+    with pytest.raises(
+        ParameterError, match="found a 'LineString', expected Polygons, or Points with a radius"
+    ):
         read_fence_file(path, ZURICH)
     with pytest.raises(ParameterError, match=r"expected one that ends in \.plan"):
         read_fence_file(tmp_path / "r.kml", ZURICH)
@@ -509,9 +735,14 @@ def test_file_without_fence_refused(tmp_path: Path) -> None:
 def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
     """RFC 7946, section 3.1.9: a line over the antimeridian is cut there."""
     parts = [[[179.99, 0.0, 1.0], [180.0, 0.0, 1.0]], [[-180.0, 0.0, 1.0], [-179.99, 0.0, 1.0]]]
-    (tmp_path / "r.geojson").write_text(json.dumps({"type": "MultiLineString", "coordinates": parts}), encoding="utf-8")
+    (tmp_path / "r.geojson").write_text(
+        json.dumps({"type": "MultiLineString", "coordinates": parts}), encoding="utf-8"
+    )
     waypoints = read_route(tmp_path / "r.geojson", Origin(0.0, 180.0))
-    assert [round(waypoint.east) for waypoint in waypoints] == [-1113, 1113]  # 0.01 deg of the equator
+    assert [round(waypoint.east) for waypoint in waypoints] == [
+        -1113,
+        1113,
+    ]  # 0.01 deg of the equator
 
 
 def test_track_is_thinned_within_tolerance(tmp_path: Path) -> None:
@@ -541,10 +772,29 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("r.abc", "", r"route: found the file .*r\.abc, expected one that ends in \.geojson, \.json, \.kml, .*\.yaml, \.yml"),
-        ("r.yaml", "route: [[0, 0]]", r"route\[0\]: found \[0, 0\], expected \[north, east, altitude\], "),
-        ("r.yaml", "route: [[0, 0, .nan]]", r"route\[0\]\.altitude: found nan, expected a finite number"),
-        ("r.yaml", "route: [[0, 200000, 1]]", r"route\[0\]: found 200 km from the origin, expected at most 100 km"),
+        (
+            "r.abc",
+            "",
+            (
+                r"route: found the file .*r\.abc, expected one that ends in \.geojson, \.json, "
+                r"\.kml, .*\.yaml, \.yml"
+            ),
+        ),
+        (
+            "r.yaml",
+            "route: [[0, 0]]",
+            r"route\[0\]: found \[0, 0\], expected \[north, east, altitude\], ",
+        ),
+        (
+            "r.yaml",
+            "route: [[0, 0, .nan]]",
+            r"route\[0\]\.altitude: found nan, expected a finite number",
+        ),
+        (
+            "r.yaml",
+            "route: [[0, 200000, 1]]",
+            r"route\[0\]: found 200 km from the origin, expected at most 100 km",
+        ),
         ("r.yaml", "route: 5", "found another content, expected the key route alone, with a list"),
         ("r.geojson", "{", r"r\.geojson: not valid JSON .* expected a route file"),
         (
@@ -552,16 +802,32 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
             line([[-171.5, -47.4, 500.0]]),
             r"route\[0\]: found a position on the other half of the Earth, expected one near",
         ),
-        ("r.geojson", line([[47.4, 8.5, 500.0]]), "found latitude and longitude exchanged, by the origin"),
-        ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or --set route.line=1, 2"),
+        (
+            "r.geojson",
+            line([[47.4, 8.5, 500.0]]),
+            "found latitude and longitude exchanged, by the origin",
+        ),
+        (
+            "r.geojson",
+            {"features": [line(), line()]},
+            "found 2 LineStrings, expected one, or --set route.line=1, 2",
+        ),
         (
             "r.geojson",
             {"type": "Curve", "coordinates": SQUARE},
             "no Point, but 1 geometry of the type 'Curve'",
         ),
-        ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::2056"}}}, "the coordinate system 'urn:"),
+        (
+            "r.geojson",
+            line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::2056"}}},
+            "the coordinate system 'urn:",
+        ),
         ("r.kml", kml("<NetworkLink/>"), "found no LineString and no Point, but 1 NetworkLink"),
-        ("r.gpx", gpx(SEGMENTS.format(47.43)), r"found a gap of 3\.3 km between two trkseg, expected at most 1 km"),
+        (
+            "r.gpx",
+            gpx(SEGMENTS.format(47.43)),
+            r"found a gap of 3\.3 km between two trkseg, expected at most 1 km",
+        ),
         (
             "r.gpx",
             gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'),
@@ -580,32 +846,55 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ),
         ("r.txt", "QGC WPL 110\n0 1 2\n", "line 2: found '0 1 2', expected 12 numbers"),
         ("r.kmz", "hello", "cannot be unpacked .*, expected a KMZ archive"),
-        ("r.kml", kml(KML_LINE, mode=""), "found a LineString with the altitudeMode 'clampToGround', expected absolute"),
-        ("r.kml", kml("<Point><coordinates>&a;</coordinates></Point>", head=ENTITY), "found a document type, expected the XML"),
+        (
+            "r.kml",
+            kml(KML_LINE, mode=""),
+            "found a LineString with the altitudeMode 'clampToGround', expected absolute",
+        ),
+        (
+            "r.kml",
+            kml("<Point><coordinates>&a;</coordinates></Point>", head=ENTITY),
+            "found a document type, expected the XML",
+        ),
         # A line that holds nothing is not replaced by marks.
         (
             "r.geojson",
             {"features": [{"geometry": line([])}, point(SQUARE[0]), point(SQUARE[1])]},
             "1 LineString without a position",
         ),
-        ("r.geojson", '{"type": "LineString", "type": "Point", "coordinates": [8.5, 47.4, 1]}', "the member 'type' twice"),
-        ("r.kml", kml(KML_POINTS + '<a:height xmlns:a="http://www.dji.com/wpmz/1.0.2">50</a:height>'), "a mission of DJI"),
+        (
+            "r.geojson",
+            '{"type": "LineString", "type": "Point", "coordinates": [8.5, 47.4, 1]}',
+            "the member 'type' twice",
+        ),
+        (
+            "r.kml",
+            kml(KML_POINTS + '<a:height xmlns:a="http://www.dji.com/wpmz/1.0.2">50</a:height>'),
+            "a mission of DJI",
+        ),
     ],
 )
-def test_what_is_no_route_refused_with_one_sentence(name: str, content: Any, sentence: str, tmp_path: Path) -> None:
+def test_what_is_no_route_refused_with_one_sentence(
+    name: str, content: Any, sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         flown(tmp_path / name, content)
 
 
 def test_latitudes_need_an_origin(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=r"route\[0\]: found a latitude and a longitude, expected an origin"):
+    with pytest.raises(
+        ParameterError, match=r"route\[0\]: found a latitude and a longitude, expected an origin"
+    ):
         flown(tmp_path / "r.geojson", line(), origin=None)
 
 
 def test_document_type_refused_before_entities_read(tmp_path: Path) -> None:
-    # Nested entities that would expand to a billion characters, and one that would fetch a file of this machine.
+    # Nested entities that would expand to a billion characters, and one that would fetch a file of
+    # this machine.
     nested = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(9))
     for entities in (f'<!ENTITY a0 "0">{nested}', '<!ENTITY a9 SYSTEM "file:///etc/hostname">'):
-        text = kml("<Point><coordinates>&a9;</coordinates></Point>", head=f"<!DOCTYPE kml [{entities}]>")
+        text = kml(
+            "<Point><coordinates>&a9;</coordinates></Point>", head=f"<!DOCTYPE kml [{entities}]>"
+        )
         with pytest.raises(ParameterError, match="found a document type"):
             flown(tmp_path / "r.kml", text)

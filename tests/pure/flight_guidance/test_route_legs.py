@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Legs of a route are flown or said to be missed: joining circles, tangents, the wind, against closed forms of geometry."""
+"""Legs of a route are flown or said to be missed: joining circles, tangents, the wind, against
+closed forms of geometry.
+"""
 
 import math
 from typing import Any
@@ -31,7 +33,11 @@ from flight_guidance.wind import WIND_TIME, wind_estimate, wind_of
 
 SPEED, R = 25.0, 144.0  # m/s and m, of the osprey by rule
 FOLLOW = PathParams(period=16.5, damping=0.75, capture=math.radians(30.0))
-SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": SPEED, "throttle_authority": [3.0, 3.0]}
+SECTION: dict[str, Any] = {
+    "natural_frequency": [4.0, 1.2, 5.0, 4.0],
+    "speed": SPEED,
+    "throttle_authority": [3.0, 3.0],
+}
 CONFIG = GuidanceConfig.validate_mapping(SECTION, "guidance")
 MS = 1_000_000  # ns
 
@@ -42,12 +48,20 @@ def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) 
 
     def derivative(_: float, z: Any) -> list[float]:
         north, east, course = map(float, z)
-        a = path_acceleration(path.error(Arc((distance, 0.0), radius), (north, east)), course, SPEED, FOLLOW)
+        a = path_acceleration(
+            path.error(Arc((distance, 0.0), radius), (north, east)), course, SPEED, FOLLOW
+        )
         limit = GRAVITY * math.tan(math.radians(30.0))
-        return [SPEED * math.cos(course), SPEED * math.sin(course), min(max(a, -limit), limit) / SPEED]
+        return [
+            SPEED * math.cos(course),
+            SPEED * math.sin(course),
+            min(max(a, -limit), limit) / SPEED,
+        ]
 
     times = np.arange(0.0, distance / SPEED + 60.0, 0.25)
-    north, east, course = solve_ivp(derivative, (0.0, times[-1]), [0.0, 0.0, 0.0], t_eval=times, max_step=0.25).y
+    north, east, course = solve_ivp(
+        derivative, (0.0, times[-1]), [0.0, 0.0, 0.0], t_eval=times, max_step=0.25
+    ).y
     off = np.hypot(north - distance, east) - abs(radius)
     joined = int(np.flatnonzero(np.abs(off) < 0.05 * abs(radius))[0])
     tangent = math.sqrt(distance**2 - radius**2)
@@ -70,7 +84,9 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     assert isinstance(line, Line)
     assert isinstance(orbit, Arc)
     error = path.error(line, orbit.centre)
-    assert error.e == pytest.approx(200.0)  # the centre is one radius to the right of the line: a clockwise orbit
+    assert error.e == pytest.approx(
+        200.0
+    )  # the centre is one radius to the right of the line: a clockwise orbit
     touching = path.error(orbit, line.end)
     assert touching.e == pytest.approx(0.0, abs=1e-9)
     assert math.cos(touching.track - error.track) == pytest.approx(1.0)
@@ -88,7 +104,9 @@ def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
     # On the opposite course beside the circle: down the tangent, and half of the circle.
     assert length((1000.0, side * 2.0 * R), math.pi) == pytest.approx(1000.0 + math.pi * R)
     # Across: the circle is touched at the point behind the centre, and a quarter of it is left.
-    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(1000.0 + R * math.pi / 2.0)
+    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(
+        1000.0 + R * math.pi / 2.0
+    )
     # A turn to the tangent costs R times the angle.
     assert length((-1000.0, 0.0), 0.5) == pytest.approx(1000.0 + 0.5 * R)
 
@@ -105,7 +123,9 @@ def test_wind_is_velocity_over_ground_less_through_air() -> None:
 def test_largest_wind_takes_whole_bank() -> None:
     bank, wind = math.radians(30.0), 3.0
     largest = largest_wind(SPEED, wind, bank)
-    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == pytest.approx(GRAVITY * math.tan(bank))
+    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == pytest.approx(
+        GRAVITY * math.tan(bank)
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,12 +134,21 @@ def test_largest_wind_takes_whole_bank() -> None:
         (
             30.0,
             (),
-            r"route\[0\].V: found 25 m/s in a wind of 30 m/s, expected more than 36 m/s, or a guidance.wind below 20.8 m/s",
+            (
+                r"route\[0\].V: found 25 m/s in a wind of 30 m/s, expected more than 36 m/s, or a "
+                r"guidance.wind below 20.8 m/s"
+            ),
         ),
-        (22.0, (30.0, 25.0), r"route\[1\].V: found 25 m/s in a wind of 22 m/s, expected more than 26.4 m/s"),
+        (
+            22.0,
+            (30.0, 25.0),
+            r"route\[1\].V: found 25 m/s in a wind of 22 m/s, expected more than 26.4 m/s",
+        ),
     ],
 )
-def test_wind_that_airspeed_cannot_beat_refused(wind: float, V: tuple[float, ...], sentence: str) -> None:
+def test_wind_that_airspeed_cannot_beat_refused(
+    wind: float, V: tuple[float, ...], sentence: str
+) -> None:
     route = {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": V}
     with pytest.raises(ParameterError, match=sentence):
         GuidanceConfig.validate_mapping(SECTION | {"wind": wind, "route": route}, "guidance")
@@ -128,15 +157,25 @@ def test_wind_that_airspeed_cannot_beat_refused(wind: float, V: tuple[float, ...
 class Flown:
     """Guidance on a route, with poses as given."""
 
-    def __init__(self, *waypoints: tuple[Any, ...], start: path.Point = (0.0, 0.0), config: GuidanceConfig = CONFIG) -> None:
+    def __init__(
+        self,
+        *waypoints: tuple[Any, ...],
+        start: path.Point = (0.0, 0.0),
+        config: GuidanceConfig = CONFIG,
+    ) -> None:
         self.made, self._k = Guidance(config), 0
         self.made.take_route(config.plan([Waypoint(*waypoint) for waypoint in waypoints]))
         self.at(*start)
 
-    def at(self, north: float, east: float, course: float = 0.0, altitude: float = 100.0) -> dict[str, float]:
+    def at(
+        self, north: float, east: float, course: float = 0.0, altitude: float = 100.0
+    ) -> dict[str, float]:
         """The log of a step at a position, on a course through calm air, rad."""
         now, v = 20 * MS * self._k, (SPEED * math.cos(course), SPEED * math.sin(course))
-        self.made.take_pose(StampedVector(now, np.array([0.0, 0.0, course, north, east, altitude, *v, 0.0, 0.0])), now)
+        self.made.take_pose(
+            StampedVector(now, np.array([0.0, 0.0, course, north, east, altitude, *v, 0.0, 0.0])),
+            now,
+        )
         self.made.take_y(StampedVector(now, np.zeros(4)), now)
         output = self.made.step(now, now)
         assert output is not None
@@ -150,7 +189,8 @@ def test_first_waypoint_has_to_be_reached() -> None:
     log = flown.at(10.0, 0.0)
     assert (log["leg"], log["missed"], abs(log["joining"])) == (0.0, 0.0, 1.0)
     assert log["target.altitude"] == 150.0  # of the first waypoint
-    # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the tangent, and an arc of pi + 2 b.
+    # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the
+    # tangent, and an arc of pi + 2 b.
     assert log["to_go"] == pytest.approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
     log = flown.at(2499.0, 3.0, math.pi)
     assert (log["leg"], log["joining"]) == (0.0, 0.0)
@@ -158,8 +198,12 @@ def test_first_waypoint_has_to_be_reached() -> None:
 
 
 def test_leg_after_sharp_corner_is_joined() -> None:
-    """A turn of 174 deg has no fillet: the aircraft passes the waypoint, and a circle leads it onto the leg back."""
-    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0))
+    """A turn of 174 deg has no fillet: the aircraft passes the waypoint, and a circle leads it onto
+    the leg back.
+    """
+    flown = Flown(
+        (0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0)
+    )
     assert flown.at(990.0, 3.0)["leg"] == 0.0
     log = flown.at(1001.0, 3.0)
     assert (log["leg"], log["missed"], abs(log["joining"])) == (1.0, 0.0, 1.0)
@@ -168,7 +212,9 @@ def test_leg_after_sharp_corner_is_joined() -> None:
 
 
 def test_leg_passed_far_away_is_missed() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0))
+    flown = Flown(
+        (0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0)
+    )
     assert flown.at(990.0, 600.0)["leg"] == 0.0
     log = flown.at(1010.0, 600.0)
     end = flown.made.route.legs[0].end if flown.made.route else None
@@ -197,7 +243,10 @@ def test_leg_joined_at_a_point_along_it() -> None:
     assert (log["target.along"], abs(log["joining"])) == (900.0, 1.0)
     assert flown.at(905.0, 10.0)["joining"] == 0.0
     for values, sentence in (
-        ({"leg": 0.0, "along": 2500.0}, "target.along: found 2500 m, expected 0 to 1[0-9.]* m, the length of the leg"),
+        (
+            {"leg": 0.0, "along": 2500.0},
+            "target.along: found 2500 m, expected 0 to 1[0-9.]* m, the length of the leg",
+        ),
         ({"along": 10.0}, "found along without leg"),
     ):
         with pytest.raises(ChannelError, match=sentence):
@@ -205,7 +254,9 @@ def test_leg_joined_at_a_point_along_it() -> None:
 
 
 def test_skip_leaves_waypoint_ahead_out() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0))
+    flown = Flown(
+        (0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0)
+    )
     assert flown.made.skip()
     log, route = flown.at(100.0, 0.0), flown.made.route
     assert route is not None
@@ -236,12 +287,18 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
     assert flown.made.hold()
     assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
     flown.made.take_target({"leg": 0.0, "altitude": 120.0})
-    assert flown.at(540.0, 5.0)["target.altitude"] == 120.0  # a command of the user holds on the leg
+    assert (
+        flown.at(540.0, 5.0)["target.altitude"] == 120.0
+    )  # a command of the user holds on the leg
     assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
 
 
-def circling(flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0) -> dict[str, float]:
-    """The log after steps of flight clockwise round a centre, from a bearing of the centre in deg."""
+def circling(
+    flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0
+) -> dict[str, float]:
+    """The log after steps of flight clockwise round a centre, from a bearing of the centre in
+    deg.
+    """
     log: dict[str, float] = {}
     step = SPEED * 0.02 / R
     for k in range(1, int(turns * 2.0 * math.pi / step) + 1):
@@ -255,13 +312,17 @@ def circling(flown: Flown, centre: path.Point, turns: float, altitude: float = 1
 
 @pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
-    """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west."""
+    """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in
+    the west.
+    """
     centre = (2000.0, 0.0)
     flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
     route = flown.made.route
     assert route is not None
     circle = route.legs[1]
-    assert circle.end == pytest.approx((2000.0, -R), abs=10.0)  # the last line touches the orbit round the last waypoint
+    assert circle.end == pytest.approx(
+        (2000.0, -R), abs=10.0
+    )  # the last line touches the orbit round the last waypoint
     end = route.legs[0].end
     assert end is not None
     assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0
@@ -316,13 +377,18 @@ def log_of(count: int, **channels: ArrayLike) -> Tape:
         }
     )
     level |= {name.replace("__", "."): value for name, value in channels.items()}
-    values = np.column_stack([np.broadcast_to(np.asarray(level[name], dtype=float), count) for name in names])
+    values = np.column_stack(
+        [np.broadcast_to(np.asarray(level[name], dtype=float), count) for name in names]
+    )
     return Tape({"guidance": Signal(np.arange(count) * nanoseconds(1.0), names, values)}, 0)
 
 
 def test_summary_says_which_legs_were_flown() -> None:
     tape = log_of(
-        10, leg=[0, 0, 0, 1, 1, 2, 2, 2, 2, 2], joining=[1, 1, 0, 0, 0, 0, 0, 0, 0, 0], missed=[0] * 5 + [321.0] + [0] * 4
+        10,
+        leg=[0, 0, 0, 1, 1, 2, 2, 2, 2, 2],
+        joining=[1, 1, 0, 0, 0, 0, 0, 0, 0, 0],
+        missed=[0] * 5 + [321.0] + [0] * 4,
     )
     assert flown_legs(tape) == [
         FlownLeg(0, 0.0, 2.0, 3.0, "flown", 0.0),
@@ -330,7 +396,13 @@ def test_summary_says_which_legs_were_flown() -> None:
         FlownLeg(2, 5.0, 5.0, 9.0, "not ended", 0.0),
     ]
     assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
-    assert leg_results([leg._asdict() for leg in flown_legs(tape)]) == "legs: 0 flown, 1 missed by 321 m, 2 not ended"
+    assert (
+        leg_results([leg._asdict() for leg in flown_legs(tape)])
+        == "legs: 0 flown, 1 missed by 321 m, 2 not ended"
+    )
     outcome = final_outcome(COMPLETED, account(tape, None))
-    assert (outcome, exit_status(outcome)) == ("completed, missed leg 1 by 321 m", STATUS_INCOMPLETE)
+    assert (outcome, exit_status(outcome)) == (
+        "completed, missed leg 1 by 321 m",
+        STATUS_INCOMPLETE,
+    )
     assert final_outcome(outcome, account(tape, None)) == outcome

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
+"""Writing and reading bags: with independent readers, truncated and damaged files, bags of other
+recorders.
+"""
 
 import math
 import struct
@@ -50,8 +52,12 @@ def test_written_tape_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
         assert back[name].values.tobytes() == signal.values.tobytes()
 
 
-def test_log_has_bytes_that_library_writes_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    messages = [(k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)]  # not in order of time
+def test_log_has_bytes_that_library_writes_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = [
+        (k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)
+    ]  # not in order of time
     logs = []
     for name in ("ours", "library"):
         if name == "library":
@@ -89,18 +95,25 @@ def test_the_scenario_is_stored_unchanged(recorded: Path, osprey_gust: Scenario)
     assert read_run(recorded).scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
 
 
-def test_attachments_and_metadata_are_stored_unchanged(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_attachments_and_metadata_are_stored_unchanged(
+    tape: Tape, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
     attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
     metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n", encoding="utf-8")
     write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (attached,), metadata))
     back = read_run(tmp_path / "run")
     assert back.attachments == (("airframe.yaml", attached.read_bytes()),)
-    assert (back.metadata["host"], back.metadata["versions"]) == ({"cores": "2", "kernel": "6.1 #1"}, {})
+    assert (back.metadata["host"], back.metadata["versions"]) == (
+        {"cores": "2", "kernel": "6.1 #1"},
+        {},
+    )
 
 
 @pytest.mark.parametrize("text", ["host: 3\n", "- a\n", "host: {cores: 2}\n"])
-def test_metadata_other_than_strings_are_rejected(text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_metadata_other_than_strings_are_rejected(
+    text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     metadata = tmp_path / "metadata.yaml"
     metadata.write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a mapping of mappings of strings"):
@@ -109,9 +122,13 @@ def test_metadata_other_than_strings_are_rejected(text: str, tape: Tape, osprey_
 
 def test_rosbags_reads_every_topic(tape: Tape, recorded: Path) -> None:
     with AnyReader([recorded]) as reader:
-        counts = {connection.topic.lstrip("/"): connection.msgcount for connection in reader.connections}
+        counts = {
+            connection.topic.lstrip("/"): connection.msgcount for connection in reader.connections
+        }
         assert counts == {name: len(signal.stamp_ns) for name, signal in tape.signals.items()}
-        connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/y"]))
+        connection, _, raw = next(
+            reader.messages([c for c in reader.connections if c.topic == "/y"])
+        )
         message: Any = reader.deserialize(raw, connection.msgtype)
         assert message.name == ["q", "V", "p", "r"]
         assert message.position.tolist() == tape["y"].values[0].tolist()
@@ -136,19 +153,30 @@ def test_file_is_ros2_profile_with_installed_definitions_and_hashes(recorded: Pa
         0.9,
     ],
 )
-def test_truncated_file_read_up_to_last_complete_chunk(fraction: float, tape: Tape, run: Path) -> None:
+def test_truncated_file_read_up_to_last_complete_chunk(
+    fraction: float, tape: Tape, run: Path
+) -> None:
     truncate(run, fraction)
     back = read_run(run).tape
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
     end = max(back.time(name)[-1] for name in back.signals)
-    assert f"run_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s" in back.notes[0]
+    assert (
+        f"run_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
+        in back.notes[0]
+    )
     assert back.notes[1] == f"metadata.yaml is missing: rise-di report --repair {run}"
 
 
-@pytest.mark.parametrize("opcode", [None, Opcode.DATA_END, Opcode.FOOTER], ids=["content", "opcode of an end", "of a footer"])
+@pytest.mark.parametrize(
+    "opcode",
+    [None, Opcode.DATA_END, Opcode.FOOTER],
+    ids=["content", "opcode of an end", "of a footer"],
+)
 @pytest.mark.parametrize("number", [0, 1])
-def test_damaged_chunk_left_out_and_all_others_read(number: int, opcode: Opcode | None, tape: Tape, run: Path) -> None:
+def test_damaged_chunk_left_out_and_all_others_read(
+    number: int, opcode: Opcode | None, tape: Tape, run: Path
+) -> None:
     file = run / "run_0.mcap"
     chunks = sorted(summary_of(file).chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
     assert len(chunks) > 2
@@ -161,7 +189,9 @@ def test_damaged_chunk_left_out_and_all_others_read(number: int, opcode: Opcode 
     file.write_bytes(content)
     back = read_run(run).tape
     assert back.notes == ("run_0.mcap is damaged: 1 of its parts left out",)
-    begin, end = (np.array([getattr(chunks[number], f"message_{end}_time")]) for end in ("start", "end"))
+    begin, end = (
+        np.array([getattr(chunks[number], f"message_{end}_time")]) for end in ("start", "end")
+    )
     stamps, kept = tape["y"].stamp_ns, back["y"].stamp_ns  # the log times, in one process
     assert set(stamps[(stamps < begin) | (stamps > end)]) <= set(kept)
     assert len(kept) < len(stamps)
@@ -177,17 +207,24 @@ def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -
     assert bag.path.stat().st_size < count * size // 1000
     tracemalloc.start()
     try:
-        messages = sum(len(batch.data) for batch in Scan(bag.path).batches() if isinstance(batch, MessageBatch))
+        messages = sum(
+            len(batch.data) for batch in Scan(bag.path).batches() if isinstance(batch, MessageBatch)
+        )
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert messages == count
-    assert peak < 12 * size  # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
+    assert (
+        peak < 12 * size
+    )  # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
 
 
 def test_two_bags_in_a_folder_are_rejected(run: Path) -> None:
     (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
-    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files that are not parts of one bag, expected one bag"):
+    with pytest.raises(
+        ParameterError,
+        match=r"run: found 2 \.mcap files that are not parts of one bag, expected one bag",
+    ):
         read_run(run)
 
 
@@ -198,31 +235,47 @@ def test_a_folder_without_a_bag_is_rejected(tmp_path: Path) -> None:
 
 def test_definitions_include_all_referenced_types() -> None:
     lines = definition(JOINT_STATE).text.splitlines()
-    assert [line for line in lines if line.startswith("MSG: ")] == ["MSG: builtin_interfaces/Time", "MSG: std_msgs/Header"]
+    assert [line for line in lines if line.startswith("MSG: ")] == [
+        "MSG: builtin_interfaces/Time",
+        "MSG: std_msgs/Header",
+    ]
     with pytest.raises(ParameterError, match="install the package no_such_msgs"):
         definition("no_such_msgs/msg/Thing")
 
 
-@pytest.mark.parametrize("type_name", [JOINT_STATE, "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticArray"])
-def test_definitions_need_no_ros_package(type_name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "type_name", [JOINT_STATE, "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticArray"]
+)
+def test_definitions_need_no_ros_package(
+    type_name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Rosbags has the fields and the hash of the installed definition, without comments."""
     installed = definition(type_name)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     alone = definition.__wrapped__(type_name)
     assert alone.type_hash == installed.type_hash
-    assert get_types_from_msg(alone.text, type_name) == get_types_from_msg(installed.text, type_name)
+    assert get_types_from_msg(alone.text, type_name) == get_types_from_msg(
+        installed.text, type_name
+    )
 
 
 def record(
-    folder: Path, topics: dict[str, list[bytes]], storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
+    folder: Path,
+    topics: dict[str, list[bytes]],
+    storage: StoragePlugin,
+    compression: CompressionMode = CompressionMode.NONE,
 ) -> None:
-    """Write a bag with rosbags: the messages of each topic 1 ms apart, and a topic of another type."""
+    """Write a bag with rosbags: the messages of each topic 1 ms apart, and a topic of another
+    type.
+    """
     writer = Writer(folder, version=9, storage_plugin=storage)
     if compression is not CompressionMode.NONE:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        connections = {topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics}
+        connections = {
+            topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics
+        }
         other = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=STORE)
         text = STORE.types["std_msgs/msg/String"]("hello")
         writer.write(other, 1, STORE.serialize_cdr(text, "std_msgs/msg/String"))
@@ -234,7 +287,9 @@ def record(
 SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
 
 
-def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
     """As the launch files leave it: a log without messages, and the bag in a folder of its own."""
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(osprey_gust.path), 1)
@@ -246,8 +301,12 @@ def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(osprey_gust: 
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-@pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_bags_of_other_recorders_are_read(storage: StoragePlugin, compression: CompressionMode, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "compression", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE]
+)
+def test_bags_of_other_recorders_are_read(
+    storage: StoragePlugin, compression: CompressionMode, tmp_path: Path
+) -> None:
     record(tmp_path / "bag", {"/y": SAMPLES}, storage, compression)
     back = read_run(tmp_path / "bag").tape
     assert list(back.signals) == ["y"]
@@ -258,7 +317,9 @@ def test_bags_of_other_recorders_are_read(storage: StoragePlugin, compression: C
 
 @pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize("compression", [CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_bags_of_other_recorders_are_played(storage: StoragePlugin, compression: CompressionMode, tmp_path: Path) -> None:
+def test_bags_of_other_recorders_are_played(
+    storage: StoragePlugin, compression: CompressionMode, tmp_path: Path
+) -> None:
     record(tmp_path / "bag", {"/y": SAMPLES}, storage, compression)
     playback = read_playback(tmp_path / "bag", ["y"])
     assert [message.data for message in playback.messages] == SAMPLES
@@ -268,9 +329,13 @@ def test_bags_of_other_recorders_are_played(storage: StoragePlugin, compression:
 def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
     # more than ten, so that the order of numbers is not that of names
     for part in range(12):
-        record(tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]}, StoragePlugin.MCAP)
+        record(
+            tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]}, StoragePlugin.MCAP
+        )
         (tmp_path / "bag").mkdir(exist_ok=True)
-        (tmp_path / f"part{part}" / f"part{part}.mcap").rename(tmp_path / "bag" / f"bag_{part}.mcap")
+        (tmp_path / f"part{part}" / f"part{part}.mcap").rename(
+            tmp_path / "bag" / f"bag_{part}.mcap"
+        )
     files = [f"bag_{part}.mcap" for part in range(12)]
     information = yaml.safe_load((tmp_path / "part0" / "metadata.yaml").read_text(encoding="utf-8"))
     information["rosbag2_bagfile_information"]["relative_file_paths"] = files
@@ -281,14 +346,24 @@ def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
 
 
 def test_two_aircraft_in_one_bag_selected_by_namespace(tmp_path: Path) -> None:
-    topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[1:6]}
+    topics = {
+        "/one/y": SAMPLES,
+        "/fleet/two/y": SAMPLES[:7],
+        "/fleet/two/gps/speed": SAMPLES[:3],
+        "/one/u": SAMPLES[1:6],
+    }
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
     found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
     with pytest.raises(ParameterError, match=f"{found} that one of them"):
         read_run(tmp_path / "bag")
-    with pytest.raises(ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"):
+    with pytest.raises(
+        ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"
+    ):
         read_run(tmp_path / "bag", "/three")
-    for namespace, counts in (("/one", {"y": 50, "u": 5}), ("fleet/two/", {"y": 7, "gps/speed": 3})):
+    for namespace, counts in (
+        ("/one", {"y": 50, "u": 5}),
+        ("fleet/two/", {"y": 7, "gps/speed": 3}),
+    ):
         back = read_run(tmp_path / "bag", namespace)
         assert {name: len(signal.stamp_ns) for name, signal in back.tape.signals.items()} == counts
         assert back.namespace == f"/{namespace.strip('/')}"
@@ -306,19 +381,32 @@ def one_by_one(messages: Sequence[bytes]) -> list[tuple[tuple[str, ...], int, by
 
 
 MIXTURES = {
-    "a change of sender": [*SAMPLES[:5], *(vector(k, ("q", "V"), (k, 1.0), "/another#1") for k in range(5)), *SAMPLES[5:9]],
+    "a change of sender": [
+        *SAMPLES[:5],
+        *(vector(k, ("q", "V"), (k, 1.0), "/another#1") for k in range(5)),
+        *SAMPLES[5:9],
+    ],
     "missing samples": [SAMPLES[0], vector(1, (), ()), SAMPLES[1], vector(2, (), ())],
-    "other channels of the same length": [SAMPLES[0], vector(3, ("V", "q"), (1.0, 2.0)), SAMPLES[1]],
+    "other channels of the same length": [
+        SAMPLES[0],
+        vector(3, ("V", "q"), (1.0, 2.0)),
+        SAMPLES[1],
+    ],
     "velocities": [vector(k, ("q",), (k,), velocity=(1.0,)) for k in range(3)],
     "equal values": [vector(k, ("q", "V", "p"), (0.0, 0.0, 0.0)) for k in range(3)] + [SAMPLES[3]],
-    "before 1970 and not finite": [vector(-5 * NANOSECONDS, ("q",), (np.nan,)), vector(1, ("q",), (np.inf,))],
+    "before 1970 and not finite": [
+        vector(-5 * NANOSECONDS, ("q",), (np.nan,)),
+        vector(1, ("q",), (np.inf,)),
+    ],
     "no messages": [],
 }
 
 
 def index_of(places: Sequence[int]) -> bytes:
     """A message index with messages at `places`."""
-    return MESSAGE_INDEX.pack(1, 16 * len(places)) + b"".join(struct.pack("<Qq", 0, place) for place in places)
+    return MESSAGE_INDEX.pack(1, 16 * len(places)) + b"".join(
+        struct.pack("<Qq", 0, place) for place in places
+    )
 
 
 def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]:
@@ -327,7 +415,9 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
         (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
         for batch in decode_batches([Part(Opcode.CHUNK, chunk, [index])])
         if isinstance(batch, MessageBatch)
-        for message, log_ns, publish_ns in zip(batch.data, batch.log_ns, batch.publish_ns, strict=True)
+        for message, log_ns, publish_ns in zip(
+            batch.data, batch.log_ns, batch.publish_ns, strict=True
+        )
     ]
 
 
@@ -342,19 +432,25 @@ def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
         if opcode == Opcode.CHUNK:
             chunk = content
         elif opcode == Opcode.MESSAGE_INDEX and chunk:
-            places += [offset for _, offset in struct.iter_unpack("<QQ", content[MESSAGE_INDEX.size :])]
+            places += [
+                offset for _, offset in struct.iter_unpack("<QQ", content[MESSAGE_INDEX.size :])
+            ]
         place += RECORD.size + length
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_wrong_message_index_changes_no_message(data: st.DataObject, recorded: Path) -> None:
-    """The index saves the steps from message to message: it must agree with them, or they are taken."""
+    """The index saves the steps from message to message: it must agree with them, or they are
+    taken.
+    """
     chunk, places = first_chunk((recorded / "run_0.mcap").read_bytes())
     by_steps = messages_of(chunk, b"")
     assert messages_of(chunk, index_of(places)) == by_steps
     assert len(by_steps) == len(places) > 10
-    listed = st.lists(st.sampled_from(places) | st.integers(-(2**63), 2**63 - 1) | st.integers(0, 5000))
+    listed = st.lists(
+        st.sampled_from(places) | st.integers(-(2**63), 2**63 - 1) | st.integers(0, 5000)
+    )
     assert messages_of(chunk, data.draw(listed.map(index_of) | st.binary(max_size=40))) == by_steps
 
 
@@ -382,15 +478,28 @@ def test_other_types_have_no_decoder_and_malformed_messages_counted() -> None:
 
 
 def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_path: Path) -> None:
-    """Reports come at each change and once a second. The messages are written by the library rosbags."""
+    """Reports come at each change and once a second. The messages are written by the library
+    rosbags.
+    """
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")
     other = bag.add_topic("/y", JOINT_STATE, "")
     bag.write(other, 1, stamp_of(SAMPLES[0]), 1, SAMPLES[0])
     bag.flush()
     assert read_run(tmp_path / "run").engagements is None
-    channel, of_another = (bag.add_topic(f"{name}/bridge/engagement", kind, "") for name in ("", "/plane"))
-    reports = ["DISENGAGED", "ENGAGED", "ENGAGED", "RELEASE lost", "DISENGAGED lost", "ENGAGING mode", "ENGAGED", "ENGAGED"]
+    channel, of_another = (
+        bag.add_topic(f"{name}/bridge/engagement", kind, "") for name in ("", "/plane")
+    )
+    reports = [
+        "DISENGAGED",
+        "ENGAGED",
+        "ENGAGED",
+        "RELEASE lost",
+        "DISENGAGED lost",
+        "ENGAGING mode",
+        "ENGAGED",
+        "ENGAGED",
+    ]
     for number, report in enumerate(reports):
         key, _, value = report.partition(" ")
         data = bytes(STORE.serialize_cdr(STORE.types[kind](key=key, value=value), kind))
@@ -409,7 +518,9 @@ def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) 
         for k in range(20):
             q_first = k < 10
             names, values = (("q", "V"), (k, 50.0)) if q_first else (("V", "q"), (50.0, k))
-            bag.write(channel, k, k, k, vector(k, names, values, "/first" if q_first else "/second"))
+            bag.write(
+                channel, k, k, k, vector(k, names, values, "/first" if q_first else "/second")
+            )
     tape = read_run(tmp_path).tape
     assert (tape["y"].names, tape.notes) == (("q", "V"), ())
     assert tape["y"].values.tolist() == [[k, 50.0] for k in range(20)]
@@ -428,8 +539,12 @@ def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> Non
     assert set(tape.notes) == {f"y: 2 {why}", f"u: 4 {why}"}
 
 
-@pytest.mark.parametrize(("numbers", "lost"), [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)])
-def test_lost_messages_are_known_of_one_publisher_alone(numbers: list[int], lost: int | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("numbers", "lost"), [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)]
+)
+def test_lost_messages_are_known_of_one_publisher_alone(
+    numbers: list[int], lost: int | None, tmp_path: Path
+) -> None:
     """A restarted publisher counts from the begin again: what was not sent between is unknown."""
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
@@ -448,10 +563,15 @@ def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
         channel = bag.add_topic(topic, JOINT_STATE, "")
         later = 4 if topic == "/y" else 10
         for sender, stamps in ((first, np.arange(0, 10)), (second, np.arange(later, later + 3))):
-            for data in encoded(Samples(("q",), stamps * NANOSECONDS + 1, np.zeros((len(stamps), 1)), sender)):
+            for data in encoded(
+                Samples(("q",), stamps * NANOSECONDS + 1, np.zeros((len(stamps), 1)), sender)
+            ):
                 bag.write(channel, 1, 1, 1, data.tobytes())
     bag.close()
-    both = "y: samples of /aircraft#1, /aircraft#2: the figures are of all, the nodes refuse all but one"
+    both = (
+        "y: samples of /aircraft#1, /aircraft#2: the figures are of all, the nodes refuse "
+        "all but one"
+    )
     assert read_run(tmp_path / "run").tape.notes == (both,)
 
 
@@ -459,7 +579,10 @@ def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None
     """A bridge publishes y before the reference model starts, and commands count from its start."""
     bag = BagWriter(tmp_path / "run")
     for name, first in (("y", 3), ("y_m", 5)):
-        channel, stamps = bag.add_topic(f"/{name}", JOINT_STATE, ""), np.arange(first, 9) * NANOSECONDS
+        channel, stamps = (
+            bag.add_topic(f"/{name}", JOINT_STATE, ""),
+            np.arange(first, 9) * NANOSECONDS,
+        )
         samples = encoded(Samples(("q",), stamps, np.zeros((len(stamps), 1)), "/node#1"))
         for stamp_ns, data in zip(stamps.tolist(), samples, strict=True):
             bag.write(channel, stamp_ns, stamp_ns, 1, data.tobytes())

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Following a log that grows: the same values as reading it whole, in pieces of any size, also when it is hostile."""
+"""Following a log that grows: the same values as reading it whole, in pieces of any size, also when
+it is hostile.
+"""
 
 import math
 import struct
@@ -44,11 +46,15 @@ def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], Float
         for table in tables(messages.data)
         for part in decode(table).samples
     ]
-    return np.concatenate([part.stamp_ns for part in parts]), np.concatenate([part.values for part in parts])
+    return np.concatenate([part.stamp_ns for part in parts]), np.concatenate(
+        [part.values for part in parts]
+    )
 
 
 @pytest.mark.parametrize("piece", [997, 65_536, 10_000_000])
-def test_log_that_grows_in_pieces_gives_what_whole_log_holds(piece: int, recorded: Path, tape: Tape, tmp_path: Path) -> None:
+def test_log_that_grows_in_pieces_gives_what_whole_log_holds(
+    piece: int, recorded: Path, tape: Tape, tmp_path: Path
+) -> None:
     content = (recorded / "run_0.mcap").read_bytes()
     follower = Follower(tmp_path, all_of)
     assert list(follower.read()) == []  # the recorder has not begun
@@ -64,29 +70,44 @@ def test_log_that_grows_in_pieces_gives_what_whole_log_holds(piece: int, recorde
         stamps, values = vectors(messages, f"/{name}")
         assert stamps.tolist() == signal.stamp_ns.tolist()
         assert values.tobytes() == signal.values.tobytes()
-    assert next(record.name for record in found if isinstance(record, Attachment)) == "osprey_gust.yaml"
+    assert (
+        next(record.name for record in found if isinstance(record, Attachment))
+        == "osprey_gust.yaml"
+    )
     assert "rise_di_host" in [record.name for record in found if isinstance(record, Metadata)]
 
 
 def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
-    follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)  # y is sent at 500 Hz
-    stamps, _ = vectors([record for record in follower.read() if isinstance(record, Messages)], "/y")
+    follower = Follower(
+        recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0
+    )  # y is sent at 500 Hz
+    stamps, _ = vectors(
+        [record for record in follower.read() if isinstance(record, Messages)], "/y"
+    )
     assert stamps.tolist() == tape["y"].stamp_ns[::5].tolist()
     assert set(np.diff(stamps).tolist()) == {10_000_000}
 
 
 @pytest.mark.parametrize("options", [{"index_types": IndexType.NONE}, {"use_chunking": False}])
-def test_logs_without_message_indexes_or_chunks_read(options: dict[str, object], tmp_path: Path) -> None:
+def test_logs_without_message_indexes_or_chunks_read(
+    options: dict[str, object], tmp_path: Path
+) -> None:
     path, sent = tmp_path / "foreign.mcap", [vector(k, ["q"], [k / 7.0]) for k in range(50)]
     writer = Writer(str(path), chunk_size=2000, **options)  # type: ignore[arg-type]
     writer.start(profile="ros2", library="test")
-    channel = writer.register_channel("/y", "cdr", writer.register_schema(JOINT_STATE, "ros2msg", b""))
+    channel = writer.register_channel(
+        "/y", "cdr", writer.register_schema(JOINT_STATE, "ros2msg", b"")
+    )
     for k, data in enumerate(sent):
         writer.add_message(channel, k, data, k)
     writer.finish()  # type: ignore[no-untyped-call]
     whole, follower = list(Follower(path, all_of).read()), Follower(path, all_of)
-    assert [data for record in whole if isinstance(record, Messages) for data in record.data] == sent
-    assert [next(iter(follower.read())) for _ in whole] == whole  # an iteration that is left is continued here, too
+    assert [
+        data for record in whole if isinstance(record, Messages) for data in record.data
+    ] == sent
+    assert [
+        next(iter(follower.read())) for _ in whole
+    ] == whole  # an iteration that is left is continued here, too
 
 
 def write_chunk(bag: BagWriter, channel: BagChannel, number: int) -> None:
@@ -94,7 +115,9 @@ def write_chunk(bag: BagWriter, channel: BagChannel, number: int) -> None:
     bag.flush()
 
 
-def test_topic_whose_first_message_comes_after_the_chunk_with_its_channel_is_read(tmp_path: Path) -> None:
+def test_topic_whose_first_message_comes_after_the_chunk_with_its_channel_is_read(
+    tmp_path: Path,
+) -> None:
     with BagWriter(tmp_path) as bag:
         write_chunk(bag, early := bag.add_topic("/y", JOINT_STATE, ""), 1)
         late = bag.add_topic("/late", JOINT_STATE, "")
@@ -103,7 +126,11 @@ def test_topic_whose_first_message_comes_after_the_chunk_with_its_channel_is_rea
     follower = Follower(tmp_path, all_of)
     found = [record for record in follower.read() if isinstance(record, Messages)]
     assert follower.damaged == 0
-    assert [stamp for topic in ("/y", "/late") for stamp in vectors(found, topic)[0].tolist()] == [1, 2, 3]
+    assert [stamp for topic in ("/y", "/late") for stamp in vectors(found, topic)[0].tolist()] == [
+        1,
+        2,
+        3,
+    ]
 
 
 def test_all_files_of_split_bag_read_in_order(tmp_path: Path) -> None:
@@ -130,7 +157,9 @@ def test_hostile_log_ends_without_exception_and_without_much_memory(case: Path) 
     assert list(follower.read()) == []
 
 
-def test_endless_record_is_fault_and_chunk_in_progress_awaited(recorded: Path, tmp_path: Path) -> None:
+def test_endless_record_is_fault_and_chunk_in_progress_awaited(
+    recorded: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "endless.mcap"
     path.write_bytes(MCAP0_MAGIC + RECORD.pack(Opcode.CHUNK, 1 << 60) + bytes(100))
     follower = Follower(path, all_of)
@@ -146,7 +175,9 @@ def test_endless_record_is_fault_and_chunk_in_progress_awaited(recorded: Path, t
     assert follower.fault.endswith("does not begin as an MCAP file")
 
 
-def test_index_that_points_outside_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
+def test_index_that_points_outside_messages_counts_as_damage(
+    recorded: Path, tmp_path: Path
+) -> None:
     content = bytearray((recorded / "run_0.mcap").read_bytes())
     place, changed = 8, 0
     while content[place] != Opcode.DATA_END:
@@ -164,8 +195,12 @@ def test_index_that_points_outside_messages_counts_as_damage(recorded: Path, tmp
 
 @pytest.mark.parametrize("size", [1, 200, 20_000])
 @pytest.mark.parametrize("offset", [0, 100])
-def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(offset: int, size: int, run: Path) -> None:
-    """Bytes inverted in the head and in the content of a chunk, beside an intact index of the file."""
+def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(
+    offset: int, size: int, run: Path
+) -> None:
+    """Bytes inverted in the head and in the content of a chunk, beside an intact index of the
+    file.
+    """
     path = run / "run_0.mcap"
     content = path.read_bytes()
     with path.open("rb") as stream:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A full disk: the log is finished from the reserve, or stays readable up to its last complete chunk."""
+"""A full disk: the log is finished from the reserve, or stays readable up to its last complete
+chunk.
+"""
 
 import errno
 import os
@@ -35,10 +37,18 @@ RANDOM = np.random.default_rng(1)
 
 
 def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
-    """Write messages of 40 noisy channels, which do not compress; every tenth ends a chunk, as at 1 kHz and 0.1 s."""
+    """Write messages of 40 noisy channels, which do not compress; every tenth ends a chunk, as at 1
+    kHz and 0.1 s.
+    """
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)
-        bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, vector(stamp_ns, NAMES, RANDOM.normal(size=40).tolist()))
+        bag.write(
+            channel,
+            stamp_ns,
+            stamp_ns,
+            channel.messages + 1,
+            vector(stamp_ns, NAMES, RANDOM.normal(size=40).tolist()),
+        )
         if channel.messages % 10 == 0:
             bag.flush()
 
@@ -60,8 +70,11 @@ def test_log_on_full_disk_finished_without_loss(disk: Path) -> None:
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_log_whose_chunks_fill_up_between_two_flushes_finished_too(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Three messages a chunk: a reserve that did not grow with each of them would be too small for the index of a thousand.
+def test_log_whose_chunks_fill_up_between_two_flushes_finished_too(
+    disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Three messages a chunk: a reserve that did not grow with each of them would be too small for
+    # the index of a thousand.
     monkeypatch.setattr("flight_log.bag.CHUNK_BYTES", 4000)
     monkeypatch.setattr("flight_log.bag.END_BYTES", 8000)
     monkeypatch.setattr("flight_log.disk.RESERVE_STEP", 4096)
@@ -93,7 +106,9 @@ def test_log_closes_where_last_chunk_would_need_larger_reserve(
 def test_end_of_file_has_reserve_until_it_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES
-    assert SIZE - free_bytes(disk) < 50_000  # freed; a file without messages and metadata.yaml remain
+    assert (
+        SIZE - free_bytes(disk) < 50_000
+    )  # freed; a file without messages and metadata.yaml remain
 
 
 def test_log_finished_when_another_process_fills_disk(disk: Path) -> None:
@@ -119,11 +134,15 @@ def test_log_without_reserve_stays_readable_to_last_complete_chunk(disk: Path) -
         bag.close()
     back = read_run(disk / "run").tape
     assert len(back["y"].stamp_ns) >= written - 10
-    assert back["y"].stamp_ns.tolist() == [1_000_000 * (k + 1) for k in range(len(back["y"].stamp_ns))]
+    assert back["y"].stamp_ns.tolist() == [
+        1_000_000 * (k + 1) for k in range(len(back["y"].stamp_ns))
+    ]
     assert "run_0.mcap is truncated: read up to its last complete chunk" in back.notes[0]
 
 
-def test_input_output_error_is_not_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_output_error_is_not_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = ReservedFile(tmp_path / "file")
 
     def fails(descriptor: int, data: bytes) -> int:
@@ -136,7 +155,9 @@ def test_input_output_error_is_not_full_disk(tmp_path: Path, monkeypatch: pytest
     file.close()
 
 
-def test_what_kept_for_end_survives_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_kept_for_end_survives_disk_that_fills_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = ReservedFile(tmp_path / "file")
     file.keep(b"reserve")
 
@@ -160,7 +181,15 @@ def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "file").read_bytes() == b"0123456789"
 
 
-def test_flight_in_one_process_on_full_disk_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
+def test_flight_in_one_process_on_full_disk_is_one_sentence(
+    disk: Path, osprey_gust: Scenario
+) -> None:
     fill(disk / "other")
-    with pytest.raises(ParameterError, match=r"disk/run cannot be written \(No space left on device\)"):
-        write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", LogAttachments(osprey_gust.path))
+    with pytest.raises(
+        ParameterError, match=r"disk/run cannot be written \(No space left on device\)"
+    ):
+        write_run(
+            simulate(osprey_gust.vary(flight={"duration": 0.1})),
+            disk / "run",
+            LogAttachments(osprey_gust.path),
+        )

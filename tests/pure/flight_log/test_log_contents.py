@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The attachments, metadata and provenance of a log: they suffice to repeat the flight from the file alone."""
+"""The attachments, metadata and provenance of a log: they suffice to repeat the flight from the
+file alone.
+"""
 
 import math
 import os
@@ -17,7 +19,12 @@ from tests.conftest import REPOSITORY
 from tests.joint_states import vector
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import (
+    SCHEMAS,
+    ParameterOverrides,
+    Scenario,
+    load_scenario,
+)
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
@@ -43,7 +50,9 @@ def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) ->
 def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path:
     """An attachment as a file."""
     if isinstance(files, RecordedRun):
-        (folder / name).write_bytes(next(attachment.content for attachment in files.attachments if attachment.name == name))
+        (folder / name).write_bytes(
+            next(attachment.content for attachment in files.attachments if attachment.name == name)
+        )
         return folder / name
     return next(path for path in files.files if path.name == name)
 
@@ -56,7 +65,9 @@ def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) ->
     return LogAttachments(scenario.path, tuple(map(Path, map(str, attach))), Path(str(metadata)))
 
 
-def test_logged_parameters_are_scenario_of_that_flight(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_logged_parameters_are_scenario_of_that_flight(
+    recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     again = load_scenario(stored(recorded, "parameters.yaml", tmp_path))
     assert again.flight.duration == 0.5  # that of the flight, not of the file
     for name in SCHEMAS:
@@ -85,10 +96,16 @@ def test_parameters_include_overrides_of_nodes(osprey_gust: Scenario, tmp_path: 
         assert again.recorder.directory == str(tmp_path)
 
 
-def test_airframe_in_log_is_one_that_flew(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
-    assert load_airframe(str(stored(recorded, "airframe.yaml", tmp_path))) == load_airframe("osprey")
+def test_airframe_in_log_is_one_that_flew(
+    recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    assert load_airframe(str(stored(recorded, "airframe.yaml", tmp_path))) == load_airframe(
+        "osprey"
+    )
     sampled = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
-    again = load_airframe(str(stored(attachments_for(sampled, tmp_path), "airframe.yaml", tmp_path)))
+    again = load_airframe(
+        str(stored(attachments_for(sampled, tmp_path), "airframe.yaml", tmp_path))
+    )
     assert again.A == sampled.aircraft.sampled_airframe().A
     assert not np.array_equal(again.matrix_a(), load_airframe("osprey").matrix_a())
 
@@ -103,7 +120,9 @@ def test_the_metadata_hold_versions_command_and_host(recorded: RecordedRun) -> N
 
 
 def test_versions_cover_all_packages_of_stack() -> None:
-    assert set(STACK) == {path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml")}
+    assert set(STACK) == {
+        path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml")
+    }
 
 
 def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
@@ -116,7 +135,12 @@ def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
 
     def run(*words: str) -> str:
         identity = ("-c", "user.name=tester", "-c", "user.email=tester@example.com")
-        return subprocess.run([git, "-C", str(tmp_path), *identity, *words], check=True, capture_output=True, text=True).stdout
+        return subprocess.run(
+            [git, "-C", str(tmp_path), *identity, *words],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
 
     run("init")
     assert revision(source) == {}  # an untracked file inside a checkout
@@ -127,8 +151,13 @@ def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
     assert revision(source)["dirty"] == "true"
 
 
-def test_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
+def test_folder_that_cannot_be_written_is_one_sentence(
+    osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        ParameterError,
+        match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)",
+    ):
         attachments_for(osprey_gust, tmp_path / "nowhere")
 
 
@@ -137,7 +166,9 @@ def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> N
     with BagWriter(tmp_path / "run") as bag:
         topic = bag.add_topic("/pose", JOINT_STATE, "")
         for k in range(1, 7):
-            message = vector(k, ["phi"], [0.1]) if k < 3 else vector(k, ["phi", "climb"], [0.1, float(k)])
+            message = (
+                vector(k, ["phi"], [0.1]) if k < 3 else vector(k, ["phi", "climb"], [0.1, float(k)])
+            )
             bag.write(topic, k, k, k, message)
         for k in range(7, 17):  # of another publisher
             bag.write(topic, k, k, k, vector(k, ["z"], [0.1]))
@@ -147,13 +178,18 @@ def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> N
     assert tape.refused == {"pose": 12}
 
 
-def test_summary_of_log_whose_y_was_refused_names_the_refusal(tmp_path: Path, osprey_gust: Scenario) -> None:
+def test_summary_of_log_whose_y_was_refused_names_the_refusal(
+    tmp_path: Path, osprey_gust: Scenario
+) -> None:
     with BagWriter(tmp_path / "run") as bag:
         for name, value in (("y", math.nan), ("y_m", 0.0)):
             topic = bag.add_topic(f"/{name}", JOINT_STATE, "")
             for k in range(1, 4):
                 bag.write(topic, k, k, k, vector(k, ["q"], [value]))
-    refused = r"no sample of y \(y: 3 samples refused: damaged, not finite, or of other channels\), expected"
+    refused = (
+        r"no sample of y \(y: 3 samples refused: damaged, not finite, or of other "
+        r"channels\), expected"
+    )
     with pytest.raises(ParameterError, match=refused):
         summarise(read_run(tmp_path / "run").tape, osprey_gust)
 
@@ -163,7 +199,9 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
     recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, indexed: bool
 ) -> None:
     log = next(Path(str(recorded.path)).glob("*.mcap")).read_bytes()
-    (tmp_path / "log.mcap").write_bytes(log if indexed else log[: -len(log) // 20])  # cut: without the number of samples
+    (tmp_path / "log.mcap").write_bytes(
+        log if indexed else log[: -len(log) // 20]
+    )  # cut: without the number of samples
     plain = read_run(tmp_path / "log.mcap").tape
     monkeypatch.setattr(columns, "IN_MEMORY", 1000)
     tape = read_run(tmp_path / "log.mcap").tape
@@ -171,7 +209,11 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
         in_file, half_ns = tape[name], int(signal.stamp_ns[len(signal.stamp_ns) // 2])
         assert in_file.values.tobytes("F") == signal.values.tobytes("F")
         assert in_file[signal.names[-1]].tobytes() == signal[signal.names[-1]].tobytes()
-        assert in_file.until(half_ns).values.tobytes("F") == signal.until(half_ns).values.tobytes("F")
-    assert tape["truth"].group("x").values.tobytes("F") == plain["truth"].group("x").values.tobytes("F")
+        assert in_file.until(half_ns).values.tobytes("F") == signal.until(half_ns).values.tobytes(
+            "F"
+        )
+    assert tape["truth"].group("x").values.tobytes("F") == plain["truth"].group("x").values.tobytes(
+        "F"
+    )
     assert tape["truth"].group("x").names == plain["truth"].group("x").names
     assert not tape["truth"].values.flags.owndata  # mapped

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of all kinds under every command: read with the figures of the flight, or refused with what is there."""
+"""Logs of all kinds under every command: read with the figures of the flight, or refused with what
+is there.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -68,8 +70,12 @@ def whole(request: pytest.FixtureRequest, messages: list[Recorded], tmp_path: Pa
 def test_whole_flight_is_read_replayed_shown_and_played(
     whole: Path, messages: list[Recorded], figures: dict[str, Any], osprey_gust: Scenario
 ) -> None:
-    """The scenario comes from its file, as `--scenario` gives it: the bag has none, like those of `ros2 bag record`."""
-    with pytest.raises(ParameterError, match=r"a log without its scenario, expected .* --scenario FILE"):
+    """The scenario comes from its file, as `--scenario` gives it: the bag has none, like those of
+    `ros2 bag record`.
+    """
+    with pytest.raises(
+        ParameterError, match=r"a log without its scenario, expected .* --scenario FILE"
+    ):
         read_flight(whole)
     read = read_run(whole, scenario=osprey_gust.path)
     assert figures_of(read_flight(whole, scenario=osprey_gust.path).summary) == figures
@@ -77,12 +83,20 @@ def test_whole_flight_is_read_replayed_shown_and_played(
     assert (len(result.number), int(result.checked.sum()), result.equal()) == (TICKS, TICKS, True)
     flight = Flight(whole, scenario=read.scenario)
     flight.update()
-    assert (flight.state(), flight.faults(), flight.samples["internals"].count) == ("ended", [], TICKS)
+    assert (flight.state(), flight.faults(), flight.samples["internals"].count) == (
+        "ended",
+        [],
+        TICKS,
+    )
     assert flight.description["units"]
     playback = read_playback(whole, ["y"])
-    assert [message.data for message in playback.messages] == [m.data for m in messages if m.topic == "/y"]
+    assert [message.data for message in playback.messages] == [
+        m.data for m in messages if m.topic == "/y"
+    ]
     assert all(message.stamped for message in playback.messages)
-    assert {path.name for path in whole.parent.rglob("*.yaml")} <= {"metadata.yaml"}  # nothing is written
+    assert {path.name for path in whole.parent.rglob("*.yaml")} <= {
+        "metadata.yaml"
+    }  # nothing is written
 
 
 COMMANDS = {
@@ -120,26 +134,39 @@ def test_file_that_is_no_log_is_named(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_path_without_log_names_its_content(command: str, recorded: Path, tmp_path: Path) -> None:
-    assert refusal(command, str(tmp_path / "nowhere")).startswith(f"{tmp_path}/nowhere: found no such file or folder")
+    assert refusal(command, str(tmp_path / "nowhere")).startswith(
+        f"{tmp_path}/nowhere: found no such file or folder"
+    )
     assert refusal(command, str(tmp_path)).startswith(f"{tmp_path}: found no .mcap file, expected")
     (tmp_path / "a.ulg").write_bytes(FOREIGN_FILES["ULog"][0])
     assert "found no .mcap file, but a.ulg, a ULog of PX4" in refusal(command, str(tmp_path))
-    assert "found no .mcap file, but the folders of runs run" in refusal(command, str(recorded.parent))
+    assert "found no .mcap file, but the folders of runs run" in refusal(
+        command, str(recorded.parent)
+    )
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"play", "repair"}))
-def test_log_without_flight_names_its_topics(command: str, messages: list[Recorded], tmp_path: Path) -> None:
+def test_log_without_flight_names_its_topics(
+    command: str, messages: list[Recorded], tmp_path: Path
+) -> None:
     text = STORE.types["std_msgs/msg/String"]("a")
-    chatter = [Recorded("/chatter", EPOCH, EPOCH, bytes(STORE.serialize_cdr(text, "std_msgs/msg/String")))]
+    chatter = [
+        Recorded("/chatter", EPOCH, EPOCH, bytes(STORE.serialize_cdr(text, "std_msgs/msg/String")))
+    ]
     schema = ("std_msgs/msg/String", "ros2msg", b"string data")
     write_mcap(tmp_path / "talker", chatter, schema=schema)
     assert "among /chatter (std_msgs/msg/String)" in refusal(command, str(tmp_path / "talker"))
     floats = [message._replace(data=bytes(12)) for message in messages if message.topic == "/y"]
-    write_mcap(tmp_path / "float", floats, schema=("std_msgs/msg/Float64", "ros2msg", b"float64 data"))
+    write_mcap(
+        tmp_path / "float", floats, schema=("std_msgs/msg/Float64", "ros2msg", b"float64 data")
+    )
     assert "among /y (std_msgs/msg/Float64)" in refusal(command, str(tmp_path / "float"))
     write_mcap(tmp_path / "json", floats, encoding="json")
     assert f"among /y ({JOINT_STATE} in json)" in refusal(command, str(tmp_path / "json"))
-    arm = [Recorded("/joint_states", EPOCH + k * MS, EPOCH, vector(EPOCH + k * MS, ("a",), (k,))) for k in range(9)]
+    arm = [
+        Recorded("/joint_states", EPOCH + k * MS, EPOCH, vector(EPOCH + k * MS, ("a",), (k,)))
+        for k in range(9)
+    ]
     write_mcap(tmp_path / "arm", arm)
     assert "/joint_states" in refusal(command, str(tmp_path / "arm"))
 
@@ -152,40 +179,65 @@ def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
 ) -> None:
     names = {f"/{name}": topic for name, topic in REMAPS.items()}
     write_mcap(tmp_path / "plain", messages)
-    write_mcap(tmp_path / "bag", [message._replace(topic=names.get(message.topic, message.topic)) for message in messages])
+    write_mcap(
+        tmp_path / "bag",
+        [message._replace(topic=names.get(message.topic, message.topic)) for message in messages],
+    )
     words = [word for name, topic in REMAPS.items() for word in ("--remap", f"{name}:={topic}")]
     for command in ("report", "replay"):
         given = ["--scenario", "osprey_gust"]
         assert refusal(command, str(tmp_path / "bag"), *given)
-        assert "expected NAME:=/TOPIC" in refusal(command, str(tmp_path / "bag"), *given, "--remap", "y=/sensors/y")
+        assert "expected NAME:=/TOPIC" in refusal(
+            command, str(tmp_path / "bag"), *given, "--remap", "y=/sensors/y"
+        )
         results = [
-            CliRunner().invoke(application([command]), [command, str(tmp_path / folder), *given, *options, "--json"])
+            CliRunner().invoke(
+                application([command]),
+                [command, str(tmp_path / folder), *given, *options, "--json"],
+            )
             for folder, options in (("plain", []), ("bag", words))
         ]
-        assert results[1].stdout == results[0].stdout.replace(str(tmp_path / "plain"), str(tmp_path / "bag"))
+        assert results[1].stdout == results[0].stdout.replace(
+            str(tmp_path / "plain"), str(tmp_path / "bag")
+        )
         assert results[1].exit_code == results[0].exit_code == 0
 
 
-def test_two_aircraft_are_shown_one_at_time(messages: list[Recorded], osprey_gust: Scenario, tmp_path: Path) -> None:
-    bag, shorter = tmp_path / "bag", [message for message in messages if message.log_ns < EPOCH + 1000 * MS]
+def test_two_aircraft_are_shown_one_at_time(
+    messages: list[Recorded], osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    bag, shorter = (
+        tmp_path / "bag",
+        [message for message in messages if message.log_ns < EPOCH + 1000 * MS],
+    )
     both = [*in_namespace("/uav1", messages), *in_namespace("/uav2", shorter)]
     write_mcap(bag, sorted(both, key=lambda message: message.log_ns))
     for command in ("report", "replay", "check", "identify"):
-        given = ["--set", "scenario=osprey_gust"] if command == "identify" else ["--scenario", "osprey_gust"]
+        given = (
+            ["--set", "scenario=osprey_gust"]
+            if command == "identify"
+            else ["--scenario", "osprey_gust"]
+        )
         assert "aircraft in the namespaces /uav1, /uav2" in refusal(command, str(bag), *given)
         third = ["--set", "namespace=uav3"] if command == "identify" else ["--namespace", "uav3"]
         assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *third)
     assert "expected one in 'uav3'" in refusal("watch", str(bag), "--namespace", "uav3")
     assert "expected one in 'uav3'" in refusal("play", str(bag), "--namespace", "uav3")
     for name, duration in (("uav1", 2.0), ("uav2", 0.99)):  # by the last u
-        assert read_flight(bag, namespace=name, scenario=osprey_gust.path).summary["duration"] == pytest.approx(duration)
+        assert read_flight(bag, namespace=name, scenario=osprey_gust.path).summary[
+            "duration"
+        ] == pytest.approx(duration)
         flight = Flight(bag, namespace=name)
         flight.update()
         assert flight.end == pytest.approx(duration)
-        assert {*read_playback(bag, namespace=name).types} == {f"/{name}{topic}" for topic in {m.topic for m in messages}}
+        assert {*read_playback(bag, namespace=name).types} == {
+            f"/{name}{topic}" for topic in {m.topic for m in messages}
+        }
     first = Flight(bag)
     first.update()
-    assert first.faults() == ["another aircraft in the namespace /uav2 is not shown: --namespace /uav2"]
+    assert first.faults() == [
+        "another aircraft in the namespace /uav2 is not shown: --namespace /uav2"
+    ]
 
 
 def test_topics_without_cdr_are_skipped(messages: list[Recorded], tmp_path: Path) -> None:
@@ -204,7 +256,11 @@ MISSING = "bag_1.mcap: named in metadata.yaml and missing"
     [
         (["bag_0.mcap", "", "bag_2.mcap"], True, MISSING),
         (["", "bag_1.mcap", "bag_2.mcap"], True, MISSING.replace("_1", "_0")),
-        (["bag_0.mcap", "", "bag_2.mcap"], False, "bag_1.mcap: a number before the last and missing"),
+        (
+            ["bag_0.mcap", "", "bag_2.mcap"],
+            False,
+            "bag_1.mcap: a number before the last and missing",
+        ),
     ],
 )
 def test_missing_part_stays_named_after_repair(

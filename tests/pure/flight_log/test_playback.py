@@ -22,9 +22,13 @@ from flight_log.tape_writer import write_run
 
 @pytest.fixture(scope="module")
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, pose at 50 Hz, from t = 0 to 1 s."""
+    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, pose at 50
+    Hz, from t = 0 to 1 s.
+    """
     tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
-    return write_run(tape, tmp_path_factory.mktemp("playback") / "run", LogAttachments(osprey_gust.path)).parent
+    return write_run(
+        tape, tmp_path_factory.mktemp("playback") / "run", LogAttachments(osprey_gust.path)
+    ).parent
 
 
 def test_every_message_of_flight_in_one_process_is_due_at_stamp(run: Path) -> None:
@@ -51,11 +55,17 @@ def test_topics_selected_by_full_or_last_name_and_start_by_flight_time(run: Path
 @pytest.mark.parametrize(
     ("topics", "start", "sentence"),
     [
-        (["y", "z"], 0.0, r"run: found no message of z, expected some of /internals, /pose, /truth, /u, /y, /y_m"),
+        (
+            ["y", "z"],
+            0.0,
+            r"run: found no message of z, expected some of /internals, /pose, /truth, /u, /y, /y_m",
+        ),
         ([], 1.5, r"start: found 1.5 s, expected a flight time before the end of the log, 1 s"),
     ],
 )
-def test_topic_or_start_outside_log_rejected(topics: list[str], start: float, sentence: str, run: Path) -> None:
+def test_topic_or_start_outside_log_rejected(
+    topics: list[str], start: float, sentence: str, run: Path
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         read_playback(run, topics, start)
 
@@ -68,16 +78,23 @@ def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
 
 
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
-    """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the channel t."""
+    """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the
+    channel t.
+    """
     with BagWriter(folder) as bag:
-        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(row[0] for row in sent)}
+        channels = {
+            topic: bag.add_topic(topic, JOINT_STATE, "")
+            for topic in dict.fromkeys(row[0] for row in sent)
+        }
         for number, (topic, sent_ns, stamp_ns, value) in enumerate(sent, start=1):
             message = vector(stamp_ns, ["t" if topic == "/truth" else "q"], [value], "peer")
             bag.write(channels[topic], EPOCH + number * MS, sent_ns, number, message)
     return folder
 
 
-def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(tmp_path: Path) -> None:
+def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(
+    tmp_path: Path,
+) -> None:
     begin = EPOCH - 5_000 * MS  # t = 0
     sent = [
         ("/truth", begin + 2001 * MS, begin + 2000 * MS, 2.0),
@@ -85,18 +102,34 @@ def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(t
         ("/y", begin + 2003 * MS, begin + 1985 * MS, 0.1),
     ]
     playback = read_playback(bag_of(tmp_path / "run", sent))
-    assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [2.001, 2.003, 2.006]
+    assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [
+        2.001,
+        2.003,
+        2.006,
+    ]
 
 
 def test_message_without_stamp_is_due_when_it_was_sent(tmp_path: Path) -> None:
     """Of a driver that forgets the header: no sample has a stamp."""
-    sent = [(topic, EPOCH + k * NANOSECONDS, 0, 0.0) for k in range(3) for topic in ("/truth", "/y_m")]
+    sent = [
+        (topic, EPOCH + k * NANOSECONDS, 0, 0.0) for k in range(3) for topic in ("/truth", "/y_m")
+    ]
     playback = read_playback(bag_of(tmp_path / "run", sent))
-    assert [playback.t(message.due_ns) for message in playback.messages] == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+    assert [playback.t(message.due_ns) for message in playback.messages] == [
+        0.0,
+        0.0,
+        1.0,
+        1.0,
+        2.0,
+        2.0,
+    ]
 
 
-def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
-    # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's time.
+def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it(
+    tmp_path: Path,
+) -> None:
+    # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's
+    # time.
     sent = [
         ("/truth", EPOCH + MS, 0, 0.0),
         ("/y", EPOCH + 2 * MS, 0, 0.1),
@@ -116,25 +149,40 @@ def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it
 
 def test_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> None:
     topics = ("/clock", "/y", "/diagnostics", "/rosout")
-    bag = bag_of(tmp_path / "run", [(topic, EPOCH + k * MS, EPOCH + k * MS, 0.0) for k, topic in enumerate(topics)])
+    bag = bag_of(
+        tmp_path / "run",
+        [(topic, EPOCH + k * MS, EPOCH + k * MS, 0.0) for k, topic in enumerate(topics)],
+    )
     assert list(read_playback(bag).types) == ["/y"]
     assert list(read_playback(bag, ["y", "rosout"]).types) == ["/rosout", "/y"]
-    with pytest.raises(ParameterError, match="found no message of /clock, expected some of /diagnostics, /rosout, /y"):
+    with pytest.raises(
+        ParameterError,
+        match="found no message of /clock, expected some of /diagnostics, /rosout, /y",
+    ):
         read_playback(bag, ["/clock"])
 
 
 @pytest.mark.parametrize(
-    ("durability", "depth", "early"), [("transient_local", 1, 1), (1, 3, 2), ("volatile", 1, 0), (1, 20_000, 0)]
+    ("durability", "depth", "early"),
+    [("transient_local", 1, 1), (1, 3, 2), ("volatile", 1, 0), (1, 20_000, 0)],
 )
 def test_start_in_the_middle_sends_latched_messages_first(
     durability: str | int, depth: int, early: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     qos = f"- history: keep_last\n  depth: {depth}\n  durability: {durability}\n"
-    stored = [StoredMessage(topic, "x/msg/X", "", t, t, b"", qos=qos if topic == "/a" else "") for topic, t in LATCHED]
+    stored = [
+        StoredMessage(topic, "x/msg/X", "", t, t, b"", qos=qos if topic == "/a" else "")
+        for topic, t in LATCHED
+    ]
     monkeypatch.setattr(playback, "stored_messages", lambda run: iter(stored))
     played = read_playback(tmp_path, start=2.0).messages
     assert [message.topic for message in played] == ["/a"] * early + ["/y"]
     assert {message.due_ns for message in played[:early]} <= {LATCHED[0][1] + 2 * NANOSECONDS}
 
 
-LATCHED = [("/a", 10 * NANOSECONDS), ("/a", 11 * NANOSECONDS), ("/y", 11 * NANOSECONDS), ("/y", 13 * NANOSECONDS)]
+LATCHED = [
+    ("/a", 10 * NANOSECONDS),
+    ("/a", 11 * NANOSECONDS),
+    ("/y", 11 * NANOSECONDS),
+    ("/y", 13 * NANOSECONDS),
+]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A log of an earlier revision in tests/recorded: every sample is read, and every bit of u is computed again."""
+"""A log of an earlier revision in tests/recorded: every sample is read, and every bit of u is
+computed again.
+"""
 
 import shutil
 from pathlib import Path
@@ -21,7 +23,9 @@ TOPICS = {"y", "y_m", "u", "internals", "truth"}
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A copy of a run of osprey_servo in lockstep."""
-    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data")
+    shutil.unpack_archive(
+        REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data"
+    )
     return tmp_path / "osprey_servo"
 
 
@@ -29,16 +33,23 @@ def test_every_sample_is_that_of_independent_reader(run: Path) -> None:
     samples: dict[str, list[tuple[int, tuple[str, ...], bytes]]] = {name: [] for name in TOPICS}
     with next(run.glob("*.mcap")).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(topics=[f"/{name}" for name in TOPICS]):
+        for _, channel, _, message in reader.iter_decoded_messages(
+            topics=[f"/{name}" for name in TOPICS]
+        ):
             if message.name:
                 stamp_ns = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
-                samples[channel.topic[1:]].append((stamp_ns, tuple(message.name), np.array(message.position).tobytes()))
+                samples[channel.topic[1:]].append(
+                    (stamp_ns, tuple(message.name), np.array(message.position).tobytes())
+                )
     tape = read_run(run).tape
     assert tape.notes == ()
     for name in TOPICS:
         signal = tape.signals[name]
         stamps = signal.stamp_ns.tolist()
-        read = [(stamp, signal.names, row.tobytes()) for stamp, row in zip(stamps, signal.values, strict=True)]
+        read = [
+            (stamp, signal.names, row.tobytes())
+            for stamp, row in zip(stamps, signal.values, strict=True)
+        ]
         assert read == sorted(samples[name], key=lambda sample: sample[0]), name
         assert len(read) > 30  # ticks of 10 ms
 

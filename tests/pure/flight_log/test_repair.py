@@ -30,7 +30,9 @@ def unchanged(folder: Path) -> Iterator[None]:
     """Check that every file keeps its content and its modification time."""
 
     def state() -> dict[str, tuple[bytes, int]]:
-        return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+        return {
+            path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()
+        }
 
     before = state()
     yield
@@ -44,7 +46,9 @@ def last(run: Path) -> float:
 
 
 @pytest.mark.parametrize("fraction", [0.35, 0.999])
-def test_repaired_truncated_log_read_in_full_by_rosbags(fraction: float, recorded: Path, run: Path) -> None:
+def test_repaired_truncated_log_read_in_full_by_rosbags(
+    fraction: float, recorded: Path, run: Path
+) -> None:
     before = truncate(run, fraction)
     readable = read_run(run)
     done = repair(run)
@@ -74,7 +78,9 @@ def test_an_intact_or_repaired_log_is_unchanged(repaired: bool, run: Path) -> No
 
 
 @pytest.mark.parametrize("content", [None, "{"])
-def test_missing_or_damaged_metadata_yaml_restored(content: str | None, recorded: Path, run: Path) -> None:
+def test_missing_or_damaged_metadata_yaml_restored(
+    content: str | None, recorded: Path, run: Path
+) -> None:
     (run / "metadata.yaml").unlink()
     if content is not None:
         (run / "metadata.yaml").write_text(content, encoding="utf-8")
@@ -83,7 +89,9 @@ def test_missing_or_damaged_metadata_yaml_restored(content: str | None, recorded
     assert done.wrote_metadata
     assert done.files[0].damaged is None
     assert (run / "run_0.mcap").stat().st_mtime_ns == before
-    assert (run / "metadata.yaml").read_text("utf-8") == (recorded / "metadata.yaml").read_text("utf-8")
+    assert (run / "metadata.yaml").read_text("utf-8") == (recorded / "metadata.yaml").read_text(
+        "utf-8"
+    )
 
 
 def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
@@ -95,14 +103,19 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     assert repair(run).files[0].faults == "1 damaged parts"
     kept, every = set(messages(run)), set(messages(recorded))
     assert kept < every
-    assert all(chunk.message_start_time <= stamp_ns <= chunk.message_end_time for _, stamp_ns, _ in every - kept)
+    assert all(
+        chunk.message_start_time <= stamp_ns <= chunk.message_end_time
+        for _, stamp_ns, _ in every - kept
+    )
 
 
 def test_log_that_is_being_recorded_unchanged(run: Path) -> None:
     truncate(run, 0.5)
     with unchanged(run), (run / "run_0.mcap").open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        with pytest.raises(ParameterError, match="found a recorder that is writing it, expected one that has ended"):
+        with pytest.raises(
+            ParameterError, match="found a recorder that is writing it, expected one that has ended"
+        ):
             repair(run)
 
 
@@ -113,7 +126,10 @@ def test_a_failed_repair_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPa
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with unchanged(run), pytest.raises(ParameterError, match=r"cannot be repaired \(No space left on device\)"):
+    with (
+        unchanged(run),
+        pytest.raises(ParameterError, match=r"cannot be repaired \(No space left on device\)"),
+    ):
         repair(run)
 
 
@@ -150,7 +166,9 @@ def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, r
 
 
 def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
-    """A folder from elsewhere may hold links: also to nothing, in the place of the copy of the damaged file."""
+    """A folder from elsewhere may hold links: also to nothing, in the place of the copy of the
+    damaged file.
+    """
     target, precious = tmp_path / "target", tmp_path / "precious"
     precious.write_bytes(b"mine")
     first = truncate(run, 0.9)
@@ -170,18 +188,28 @@ def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
 def test_command_prints_kept_messages_and_missing_time(run: Path) -> None:
     def command() -> str:
         words = [sys.executable, "-m", "flight_cli.cli", "report", "--repair", "run"]
-        return subprocess.run(words, cwd=run.parent, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            words, cwd=run.parent, capture_output=True, text=True, check=True
+        ).stdout
 
     assert command() == "run is intact: nothing to repair\n"
     metadata = (run / "metadata.yaml").read_bytes()
     truncate(run, 0.5)
     end = last(run)
-    kept = r"run_0.mcap had a truncated end: (\d+) messages kept; the damaged file is run_0.mcap.damaged\n"
-    written = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s of the scenario\n"
+    kept = (
+        r"run_0.mcap had a truncated end: (\d+) messages kept; the damaged file is "
+        r"run_0.mcap.damaged\n"
+    )
+    written = (
+        rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s "
+        r"of the scenario\n"
+    )
     assert re.fullmatch(kept + written, command())
     truncate(run, 0.5)
     (run / "metadata.yaml").write_bytes(metadata)  # it holds the time of the last message
     end = last(run)
     assert f"{DURATION - end:.3f} s are missing at its end" in command()
-    information = yaml.safe_load((run / "metadata.yaml").read_text("utf-8"))["rosbag2_bagfile_information"]
+    information = yaml.safe_load((run / "metadata.yaml").read_text("utf-8"))[
+        "rosbag2_bagfile_information"
+    ]
     assert information["message_count"] == len(messages(run))

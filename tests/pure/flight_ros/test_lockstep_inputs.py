@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""y and a second signal of a lockstep flight come together whatever the order in which they arrive."""
+"""y and a second signal of a lockstep flight come together whatever the order in which they
+arrive.
+"""
 
 import numpy as np
 from hypothesis import given
@@ -22,7 +24,9 @@ class Arriving:
     def __init__(self) -> None:
         self.y: list[StampedVector | None] = []
         self.others: list[StampedVector | None] = []
-        self.inputs = LockstepInputs(Y_NS, STEP_NS, lambda: self._take(self.y), lambda: self._take(self.others))
+        self.inputs = LockstepInputs(
+            Y_NS, STEP_NS, lambda: self._take(self.y), lambda: self._take(self.others)
+        )
 
     @staticmethod
     def _take(arrived: list[StampedVector | None]) -> list[StampedVector | None]:
@@ -49,7 +53,10 @@ def test_step_waits_for_second_signal_of_instant_and_other_instants_do_not() -> 
     assert flight.inputs.has_y
     flight.others += [sample(STEP_NS), sample(STEP_NS + 1)]
     (instant,) = flight.instants()
-    assert (instant.now_ns, [sample.stamp_ns for sample in instant.others]) == (STEP_NS, [STEP_NS])  # the later one stays
+    assert (instant.now_ns, [sample.stamp_ns for sample in instant.others]) == (
+        STEP_NS,
+        [STEP_NS],
+    )  # the later one stays
     assert not flight.inputs.has_y
 
 
@@ -78,4 +85,6 @@ def test_instants_do_not_depend_on_order_of_arrival(order: list[bool]) -> None:
     assert all(sample.stamp_ns <= instant.now_ns for instant in found for sample in instant.others)
     received = [sample.stamp_ns for instant in found for sample in instant.others]
     assert received == [Y_NS * k for k in range(21)]
-    assert [instant.y.stamp_ns for instant in found if instant.y is not None] == [instant.now_ns for instant in found]
+    assert [instant.y.stamp_ns for instant in found if instant.y is not None] == [
+        instant.now_ns for instant in found
+    ]

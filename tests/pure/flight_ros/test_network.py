@@ -12,10 +12,16 @@ from flight_ros.network import addresses, network_profile, own_address, ports
 
 def test_profile_is_bound_to_own_address_and_knows_all_hosts() -> None:
     root = ElementTree.fromstring(network_profile("10.0.0.2", ("10.0.0.1", "10.0.0.2")))
-    assert [element.text for element in root.findall(".//{*}interfaceWhiteList/{*}address")] == ["10.0.0.2"]
-    assert [element.text for element in root.findall(".//{*}initialPeersList//{*}address")] == ["10.0.0.1", "10.0.0.2"]
+    assert [element.text for element in root.findall(".//{*}interfaceWhiteList/{*}address")] == [
+        "10.0.0.2"
+    ]
+    assert [element.text for element in root.findall(".//{*}initialPeersList//{*}address")] == [
+        "10.0.0.1",
+        "10.0.0.2",
+    ]
     assert "127.0.0.1" not in ElementTree.tostring(root, encoding="unicode")
-    # Five participants announce themselves to 20 places of a host twice a second: 200 packets a second.
+    # Five participants announce themselves to 20 places of a host twice a second: 200 packets a
+    # second.
     announcement = float(root.findtext(".//{*}leaseAnnouncement/{*}nanosec") or 0) / 1e9
     assert int(root.findtext(".//{*}maxInitialPeersRange") or 0) / announcement == 40.0
 

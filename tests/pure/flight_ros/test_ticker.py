@@ -48,13 +48,17 @@ def test_wait_ends_at_deadline_or_at_limit() -> None:
     assert time.thread_time() < begin + 0.5  # s: it does not wait for a deadline in the past
 
 
-@pytest.mark.parametrize(("period_ns", "spin_time"), [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)])
+@pytest.mark.parametrize(
+    ("period_ns", "spin_time"), [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)]
+)
 def test_busy_wait_before_deadline_limited_to_fraction_of_period(
     period_ns: int, spin_time: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept: list[float] = []
     monkeypatch.setattr(time, "sleep", slept.append)  # returns at once
-    monkeypatch.setattr(time, "monotonic_ns", iter(range(0, 10 * period_ns, period_ns // 20)).__next__)
+    monkeypatch.setattr(
+        time, "monotonic_ns", iter(range(0, 10 * period_ns, period_ns // 20)).__next__
+    )
     ticker = Ticker(period_ns, 0)
     ticker.due()
     ticker.wait(1.0)

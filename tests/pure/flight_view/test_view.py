@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page without a browser: a followed flight, what the server answers, and clients that it refuses."""
+"""The live page without a browser: a followed flight, what the server answers, and clients that it
+refuses.
+"""
 
 import asyncio
 import io
@@ -51,10 +53,14 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
-INTACT = {"zstd_of_fifty_thousand_messages"}  # valid, and too large for a reader that allocates as it is told
+INTACT = {
+    "zstd_of_fifty_thousand_messages"
+}  # valid, and too large for a reader that allocates as it is told
 
 
-def decoded(content: bytes) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
+def decoded(
+    content: bytes,
+) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
     """Head of an answer, and times (N,) and values (N, k) of its topics."""
     (size,) = struct.unpack_from("<I", content)
     head, place = json.loads(content[4 : 4 + size]), 4 + size
@@ -63,13 +69,18 @@ def decoded(content: bytes) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.
         count, k = topic["count"], len(topic["channels"])
         t = np.frombuffer(content, "<f8", count, place)
         place += 8 * count
-        columns[topic["name"]] = t, np.frombuffer(content, "<f4", count * k, place).reshape(k, count).T
+        columns[topic["name"]] = (
+            t,
+            np.frombuffer(content, "<f4", count * k, place).reshape(k, count).T,
+        )
         place += -(-4 * count * k // 8) * 8
     assert place == len(content)
     return head, columns
 
 
-def followed(flight: Flight) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
+def followed(
+    flight: Flight,
+) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
     """All that a browser gets, request by request."""
     known: dict[str, str] = {}
     parts: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float32]]]] = {}
@@ -78,9 +89,17 @@ def followed(flight: Flight) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np
         for name, part in columns.items():
             parts.setdefault(name, []).append(part)
         rows = {name: str(sum(len(t) for t, _ in pieces)) for name, pieces in parts.items()}
-        known = {"epoch": head["epoch"], "state": head["state"], "described": str(head["described"]), **rows}
+        known = {
+            "epoch": head["epoch"],
+            "state": head["state"],
+            "described": str(head["described"]),
+            **rows,
+        }
         if not columns:
-            return head, {name: tuple(map(np.concatenate, zip(*pieces, strict=True))) for name, pieces in parts.items()}  # type: ignore[misc]
+            return head, {
+                name: tuple(map(np.concatenate, zip(*pieces, strict=True)))  # type: ignore[misc]
+                for name, pieces in parts.items()
+            }
 
 
 def test_page_gets_ticks_of_flight_to_value(recorded: Path, tape: Tape) -> None:
@@ -151,7 +170,9 @@ def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("backlog", "state"), [(0, "reading"), (10**9, "recording")])
-def test_long_logs_read_in_slices(backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_logs_read_in_slices(
+    backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A short backlog counts as live."""
     monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
     flight, slices = Flight(recorded), 0
@@ -161,7 +182,10 @@ def test_long_logs_read_in_slices(backlog: int, state: str, recorded: Path, monk
     assert slices > 10
     whole = Flight(recorded)
     whole.update()
-    assert followed(flight)[1]["internals"][1].tobytes() == followed(whole)[1]["internals"][1].tobytes()
+    assert (
+        followed(flight)[1]["internals"][1].tobytes()
+        == followed(whole)[1]["internals"][1].tobytes()
+    )
 
 
 def test_late_row_kept_and_old_row_refused() -> None:
@@ -175,7 +199,10 @@ def test_late_row_kept_and_old_row_refused() -> None:
 
 def test_long_flight_becomes_coarser_in_place() -> None:
     """A flight of any length needs no large temporary arrays."""
-    rows, channels = 100_000, 30  # 12 MB: tracemalloc counts what threads of other tests allocate meanwhile, up to 1 MB
+    rows, channels = (
+        100_000,
+        30,
+    )  # 12 MB: tracemalloc counts what threads of other tests allocate meanwhile, up to 1 MB
     samples, values = (
         Series(tuple(map(str, range(channels))), max_rows=rows),
         np.random.default_rng(1).normal(size=(rows, channels)),
@@ -185,7 +212,9 @@ def test_long_flight_becomes_coarser_in_place() -> None:
     samples.append(np.arange(rows, rows + 4), values[:4])
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < values.astype(np.float32).nbytes / 2  # of all rows at once it would be 1.5 times that
+    assert (
+        peak < values.astype(np.float32).nbytes / 2
+    )  # of all rows at once it would be 1.5 times that
     groups = values.astype(np.float32).reshape(-1, 4, channels)
     assert (samples.values[: rows // 2 : 2] == groups.min(axis=1)).all()
     assert (samples.values[1 : rows // 2 : 2] == groups.max(axis=1)).all()
@@ -197,10 +226,14 @@ def test_browser_gets_thinned_samples_again_from_start(recorded: Path) -> None:
     flight.update()
     head, _ = decoded(answer(flight, {}))
     known = {"epoch": head["epoch"], "internals": "50", "y": "not a number", "u": "-3"}
-    topics = {topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]}
+    topics = {
+        topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]
+    }
     assert (topics["internals"], topics["y"], topics["u"]) == (50, 0, 0)
     flight.samples["internals"].thinned += 1
-    topics = {topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]}
+    topics = {
+        topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]
+    }
     assert topics["internals"] == 0
 
 
@@ -231,7 +264,9 @@ def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
     flight.update()
     head, _ = decoded(answer(flight, {}))
     assert head["topics"][0]["channels"][0].startswith("<img src=x onerror=alert(1)>\\x1b[2J")
-    assert head["faults"] == ["another aircraft in the namespace /other is not shown: --namespace /other"]
+    assert head["faults"] == [
+        "another aircraft in the namespace /other is not shown: --namespace /other"
+    ]
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
@@ -240,18 +275,32 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run") as bag:
         events = bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
         for number, name in enumerate(("one", "two")):
-            bag.write(bag.add_topic(f"/{name}/y", JOINT_STATE, ""), number, number, 0, vector(number, ["q"], [0.0]))
+            bag.write(
+                bag.add_topic(f"/{name}/y", JOINT_STATE, ""),
+                number,
+                number,
+                0,
+                vector(number, ["q"], [0.0]),
+            )
             report = store.types[KEY_VALUE](key="ENGAGED", value=name)
             engagement = bag.add_topic(f"/{name}/bridge/engagement", KEY_VALUE, "")
             bag.write(engagement, number, number, 0, bytes(store.serialize_cdr(report, KEY_VALUE)))
-            bag.write(events, number, number, number, parameter_event(f"/{name}/controller", {"k_g": 2.5}))
+            bag.write(
+                events, number, number, number, parameter_event(f"/{name}/controller", {"k_g": 2.5})
+            )
     flight = Flight(tmp_path / "run")
     flight.update()
-    assert sorted(event[1:] for event in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
+    assert sorted(event[1:] for event in flight.events) == [
+        ("bridge", "ENGAGED one"),
+        ("parameter", "controller: k_g = 2.5"),
+    ]
 
 
 def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
-    scenario, points = find_scenario("osprey_route"), [(0.0, 0.0, 50.0), (600.0, 0.0, 55.0), (600.0, 400.0, 55.0)]
+    scenario, points = (
+        find_scenario("osprey_route"),
+        [(0.0, 0.0, 50.0), (600.0, 0.0, 55.0), (600.0, 400.0, 55.0)],
+    )
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(scenario.path), 0)
         route, other = (bag.add_topic(name, ROUTE_TYPE, "") for name in ("/route", "/other/route"))
@@ -275,7 +324,10 @@ def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
 
 
 def geojson(path: Path, *geometries: dict[str, Any], **members: Any) -> Path:
-    path.write_text(json.dumps({"type": "GeometryCollection", "geometries": geometries} | members), encoding="utf-8")
+    path.write_text(
+        json.dumps({"type": "GeometryCollection", "geometries": geometries} | members),
+        encoding="utf-8",
+    )
     return path
 
 
@@ -291,7 +343,8 @@ def test_background_in_plane_of_flight(tmp_path: Path) -> None:
         {"type": "MultiPoint", "coordinates": [[8.5, 47.4], [8.5, 47.41, 500.0]]},
     )
     line, polygon, *points = read_background(path, Origin(47.40, 8.50))
-    # A minute of arc of a meridian at 47.4 deg is 1853.1 m (WGS84), one of the parallel there 1258.1 m.
+    # A minute of arc of a meridian at 47.4 deg is 1853.1 m (WGS84), one of the parallel there
+    # 1258.1 m.
     assert line == pytest.approx(np.array([[0.0, 0.0], [1111.8, 0.0]]), abs=0.3)
     assert polygon[1] == pytest.approx((0.0, 754.9), abs=0.3)
     assert (len(polygon), [len(point) for point in points]) == (4, [1, 1])
@@ -302,8 +355,16 @@ def test_background_in_plane_of_flight(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("geometries", "members", "sentence"),
     [
-        ([LINE], {"crs": {"properties": {"name": "EPSG:2056"}}}, "the coordinate system 'EPSG:2056', expected WGS84"),
-        ([{"type": "Circle", "coordinates": []}], {}, "a geometry of the type 'Circle', expected one of Point"),
+        (
+            [LINE],
+            {"crs": {"properties": {"name": "EPSG:2056"}}},
+            "the coordinate system 'EPSG:2056', expected WGS84",
+        ),
+        (
+            [{"type": "Circle", "coordinates": []}],
+            {},
+            "a geometry of the type 'Circle', expected one of Point",
+        ),
         ([], {}, "no position, expected lines, polygons or points"),
         ([{"type": "Point", "coordinates": [47.4, 8.5]}], {}, "latitude and longitude exchanged"),
     ],
@@ -312,7 +373,9 @@ def test_background_that_is_no_map_refused(
     geometries: list[dict[str, Any]], members: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ParameterError, match=sentence):
-        read_background(geojson(tmp_path / "file.geojson", *geometries, **members), Origin(47.40, 8.50))
+        read_background(
+            geojson(tmp_path / "file.geojson", *geometries, **members), Origin(47.40, 8.50)
+        )
 
 
 # The server
@@ -343,7 +406,9 @@ def against(*runs: Path) -> Callable[[Callable[[Server], Coroutine[Any, Any, Non
     return start
 
 
-async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN, **headers: str) -> HTTPResponse:
+async def get(
+    server: Server, path: str, method: str = "GET", token: str = TOKEN, **headers: str
+) -> HTTPResponse:
     given = {http.TOKEN_HEADER: token} if token else {}
     return await AsyncHTTPClient(force_instance=True).fetch(
         f"http://127.0.0.1:{server.port}{path}",
@@ -360,7 +425,9 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     """The page asks no other host."""
 
     async def client(server: Server) -> None:
-        page = await get(server, "/", token="")  # a browser sends no header with the address of a page
+        page = await get(
+            server, "/", token=""
+        )  # a browser sends no header with the address of a page
         assert (page.code, page.body) == (200, FILES["index.html"].read_bytes())
         assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
         assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
@@ -373,7 +440,9 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
         head, _ = decoded((await get(server, "/data/0")).body)
         assert (head["flight"]["name"], head["ghost"]) == ("run", False)
         assert (await get(server, "/data/1")).code == 404
-        long = await get(server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}")  # more digits than Python converts
+        long = await get(
+            server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}"
+        )  # more digits than Python converts
         assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
     against(recorded)(client)
@@ -406,10 +475,13 @@ def test_foreign_host_another_path_and_another_method_refused(
 
 @pytest.mark.parametrize("path", ["/data/0", "/nothing", "/data/0?token=" + TOKEN])
 @pytest.mark.parametrize(
-    "headers", [{}, {"Cookie": f"token={TOKEN}"}, {http.TOKEN_HEADER: "another"}, {http.TOKEN_HEADER: "\xff"}]
+    "headers",
+    [{}, {"Cookie": f"token={TOKEN}"}, {http.TOKEN_HEADER: "another"}, {http.TOKEN_HEADER: "\xff"}],
 )
 def test_no_sample_served_without_token(path: str, headers: dict[str, str], recorded: Path) -> None:
-    """Neither the query, which a log of addresses may keep, nor a cookie, which goes to all ports of a host, has the token."""
+    """Neither the query, which a log of addresses may keep, nor a cookie, which goes to all ports
+    of a host, has the token.
+    """
 
     async def client(server: Server) -> None:
         response = await get(server, path, token="", **headers)
@@ -421,9 +493,13 @@ def test_no_sample_served_without_token(path: str, headers: dict[str, str], reco
 Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def connect(server: Server, request: bytes = b"", count: int = http.MAX_CONNECTIONS) -> list[Connection]:
+async def connect(
+    server: Server, request: bytes = b"", count: int = http.MAX_CONNECTIONS
+) -> list[Connection]:
     """Connections to a server, with what each sends."""
-    connections = [await asyncio.open_connection("127.0.0.1", server.port, limit=1024) for _ in range(count)]
+    connections = [
+        await asyncio.open_connection("127.0.0.1", server.port, limit=1024) for _ in range(count)
+    ]
     for _, writer in connections:
         writer.write(request)
     return connections
@@ -435,7 +511,9 @@ def end(*connections: Connection) -> None:
 
 
 def test_connections_without_token_leave_place(recorded: Path) -> None:
-    """A new connection takes the place of the oldest connection without the token; the page is served throughout."""
+    """A new connection takes the place of the oldest connection without the token; the page is
+    served throughout.
+    """
 
     async def client(server: Server) -> None:
         idle = await connect(server, count=1000)
@@ -450,7 +528,9 @@ def test_connections_without_token_leave_place(recorded: Path) -> None:
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
-    """What arrives until the server closes; it resets a connection of which it leaves bytes unread."""
+    """What arrives until the server closes; it resets a connection of which it leaves bytes
+    unread.
+    """
     try:
         return await reader.read()
     except ConnectionResetError:
@@ -480,7 +560,9 @@ def test_slow_or_long_request_closed(recorded: Path, monkeypatch: pytest.MonkeyP
     against(recorded)(client)
 
 
-def test_browser_waits_for_next_samples(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browser_waits_for_next_samples(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A browser that knows all rows gets the next samples as the answer."""
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
@@ -503,7 +585,9 @@ def test_browser_waits_for_next_samples(recorded: Path, tmp_path: Path, monkeypa
 async def stream(server: Server, token: str | bytes = TOKEN) -> WebSocketClientConnection:
     """A WebSocket as the page opens it."""
     address = f"127.0.0.1:{server.port}"
-    opened = await websocket_connect(HTTPRequest(f"ws://{address}/news/0", headers={"Origin": f"http://{address}"}))
+    opened = await websocket_connect(
+        HTTPRequest(f"ws://{address}/news/0", headers={"Origin": f"http://{address}"})
+    )
     await opened.write_message(token, binary=isinstance(token, bytes))
     return opened
 
@@ -520,7 +604,11 @@ async def left(server: Server) -> None:
         await asyncio.sleep(0.01)
 
 
-UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
 UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
 
 
@@ -535,7 +623,8 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
         assert await socket.read_message() == first
         head, columns = decoded(first)
         rows = "&".join(f"{name}={len(t)}" for name, (t, _) in columns.items())
-        known = f"epoch={head['epoch']}&state={head['state']}&described={head['described']}&events={len(head['events'])}&{rows}"
+        state = "&".join(f"{key}={head[key]}" for key in ("epoch", "state", "described"))
+        known = f"{state}&events={len(head['events'])}&{rows}"
         begin = time.monotonic()
         await socket.write_message(known)
         content = await socket.read_message()
@@ -558,18 +647,24 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
         ("/news/1", {}, 404),
     ],
 )
-def test_foreign_websocket_refused(path: str, headers: dict[str, str], expected: int, recorded: Path) -> None:
+def test_foreign_websocket_refused(
+    path: str, headers: dict[str, str], expected: int, recorded: Path
+) -> None:
     """A WebSocket of a foreign page or host is refused, and of an unknown flight."""
 
     async def client(server: Server) -> None:
         given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
-        assert (await get(server, path, **{name: text for name, text in given.items() if text})).code == expected
+        assert (
+            await get(server, path, **{name: text for name, text in given.items() if text})
+        ).code == expected
 
     against(recorded)(client)
 
 
 @pytest.mark.parametrize("token", ["", b"another", "epoch=&y=0"])
-def test_websocket_whose_first_message_is_not_the_token_closed(token: str | bytes, recorded: Path) -> None:
+def test_websocket_whose_first_message_is_not_the_token_closed(
+    token: str | bytes, recorded: Path
+) -> None:
     async def client(server: Server) -> None:
         socket = await stream(server, token)
         await socket.write_message("")
@@ -604,7 +699,9 @@ def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.M
 def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket asks and reads no answer: the server makes few answers, ends the WebSocket, and ends quietly."""
+    """A WebSocket asks and reads no answer: the server makes few answers, ends the WebSocket, and
+    ends quietly.
+    """
     made: list[bytes] = []
 
     def big(*_: object, **__: object) -> bytes:
@@ -617,9 +714,15 @@ def test_websocket_without_reader_gets_few_answers(
         browser.connect(("127.0.0.1", server.port))
         address = f"127.0.0.1:{server.port}"
         head = {"Host": address, "Origin": f"http://{address}"} | UPGRADE
-        browser.sendall("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
+        browser.sendall(
+            "\r\n".join(
+                ["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]
+            ).encode()
+        )
         browser.sendall(bytes([0x81, 0x80 | len(TOKEN), 0, 0, 0, 0]) + TOKEN.encode())
-        browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
+        browser.sendall(
+            bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000
+        )  # empty texts with a mask, RFC 6455, 5.2
         while not made:
             await asyncio.sleep(0.01)
         before = -1
@@ -666,11 +769,19 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
-    """The places of both are topics of one answer; the page of the second shows its samples alone, without a note."""
+    """The places of both are topics of one answer; the page of the second shows its samples alone,
+    without a note.
+    """
     with BagWriter(tmp_path) as bag:
         for name, east in (("uav1", 1.0), ("uav2", 2.0)):
             for topic, names in (("y", ["q", "V"]), ("pose", ["north", "east"])):
-                bag.write(bag.add_topic(f"/{name}/{topic}", JOINT_STATE, ""), 5, 5, 0, vector(5, names, [0.0, east]))
+                bag.write(
+                    bag.add_topic(f"/{name}/{topic}", JOINT_STATE, ""),
+                    5,
+                    5,
+                    0,
+                    vector(5, names, [0.0, east]),
+                )
     flights = [Flight(tmp_path, namespace=name) for name in namespaces(tmp_path)]
     server = Server(flights, TOKEN, fleet=True)
     for flight in flights:
@@ -679,7 +790,12 @@ def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
     assert (head["flight"], head["start"]) == ({"aircraft": [["uav1", 5e-9], ["uav2", 5e-9]]}, 5e-9)
     assert {name: values[0, 1] for name, (_, values) in columns.items()} == {"0": 1.0, "1": 2.0}
     head, columns = decoded(server.answer(server.flights[1], {}))
-    assert (head["fleet"], head["ghost"], head["faults"], columns["pose"][1][0, 1]) == (2, False, [], 2.0)
+    assert (head["fleet"], head["ghost"], head["faults"], columns["pose"][1][0, 1]) == (
+        2,
+        False,
+        [],
+        2.0,
+    )
 
 
 # The command
@@ -689,7 +805,9 @@ def command(*words: object) -> list[str]:
     return [sys.executable, "-m", "flight_cli.cli", *map(str, words)]
 
 
-@pytest.mark.parametrize("ignored", [False, True], ids=["in front", "in the background, with SIGINT ignored"])
+@pytest.mark.parametrize(
+    "ignored", [False, True], ids=["in front", "in the background, with SIGINT ignored"]
+)
 def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> None:
     """The command ends quietly with Ctrl-C."""
     before = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh"] if ignored else []
@@ -717,7 +835,11 @@ def test_terminal_shows_newest_values_in_units_of_report(recorded: Path, tape: T
     text = console.export_text()
     assert "run  WAITING" in text
     assert "run  ENDED  ENGAGED  t = 2.0 s" in text
-    rows = {line.split()[0]: line.split()[2:] for line in text.splitlines() if re.match(r" (q|elevator) ", line)}
+    rows = {
+        line.split()[0]: line.split()[2:]
+        for line in text.splitlines()
+        if re.match(r" (q|elevator) ", line)
+    }
     assert rows["q"][0] == f"{1e3 * tape['internals']['y.q'][-1]:.3f}"
     assert rows["elevator"][0] == f"{np.degrees(tape['internals']['u.elevator'][-1]):.3f}"
     assert "0.00 s  mode: ENGAGED" in text

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control from the page without ROS: who is refused, what is bounded, compare and set, undo, the lease."""
+"""Control from the page without ROS: who is refused, what is bounded, compare and set, undo, the
+lease.
+"""
 
 import asyncio
 import json
@@ -30,17 +32,28 @@ ALL = ("aircraft", "controller", "guidance")
 class Desk:
     """A control of a recorded flight, with its nodes in memory, at a time that a test sets."""
 
-    def __init__(self, run: Path, scenario: Scenario, *names: str, dry_run: bool = True, real: bool = False) -> None:
+    def __init__(
+        self, run: Path, scenario: Scenario, *names: str, dry_run: bool = True, real: bool = False
+    ) -> None:
         self.time = 0.0
-        self.flight, self.nodes = InTheAir(run), NodesInMemory(scenario, *(names or ALL), dry_run=dry_run)
+        self.flight, self.nodes = (
+            InTheAir(run),
+            NodesInMemory(scenario, *(names or ALL), dry_run=dry_run),
+        )
         self.flight.update()
-        self.control = Control(self.flight, self.nodes, KEY, real=real, assess=delay_margins, now=lambda: self.time)
+        self.control = Control(
+            self.flight, self.nodes, KEY, real=real, assess=delay_margins, now=lambda: self.time
+        )
         self.lease = ""
 
-    async def ask(self, do: str, key: str = KEY, lease: str | None = None, **request: Any) -> dict[str, Any]:
+    async def ask(
+        self, do: str, key: str = KEY, lease: str | None = None, **request: Any
+    ) -> dict[str, Any]:
         """The answer to a request, a second after the one before."""
         self.time += 1.0
-        found = await self.control.answer({"do": do, **request}, key, self.lease if lease is None else lease)
+        found = await self.control.answer(
+            {"do": do, **request}, key, self.lease if lease is None else lease
+        )
         self.lease = found.get("lease", self.lease)
         return found
 
@@ -70,17 +83,29 @@ def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scen
     async def steps(desk: Desk) -> None:
         state = await desk.ask("state")
         assert {gain["name"]: tuple(gain["values"]) for gain in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
-        assert {gain["name"]: gain["ranges"] for gain in state["gains"]}["k_g"] == [[0.5 * base.k_g, 2.0 * base.k_g]]  # type: ignore[attr-defined]
+        assert {gain["name"]: gain["ranges"] for gain in state["gains"]}["k_g"] == [
+            [0.5 * base.k_g, 2.0 * base.k_g]  # type: ignore[attr-defined]
+        ]
         assert state["digest"] == state["logged"] == f"{base.digest():012x}"
-        changed = await desk.ask("gains", digest=state["digest"], values={"k_g": [1.2 * base.k_g], "softening": [2.0]})  # type: ignore[attr-defined]
-        assert (changed["undo"], changed["logged"]) == (1, state["digest"])  # the log is that of before
+        changed = await desk.ask(
+            "gains",
+            digest=state["digest"],
+            values={"k_g": [1.2 * base.k_g], "softening": [2.0]},  # type: ignore[attr-defined]
+        )
+        assert (changed["undo"], changed["logged"]) == (
+            1,
+            state["digest"],
+        )  # the log is that of before
         assert changed["digest"] != state["digest"]
         assert desk.nodes.values["controller"]["k_g"] == 1.2 * base.k_g  # type: ignore[attr-defined]
         assert desk.nodes.notes[-1].startswith("control: ")
         assert "k_g" in desk.nodes.notes[-1]
         undone = await desk.ask("undo", digest=changed["digest"])
         assert (undone["undo"], undone["digest"]) == (0, state["digest"])
-        assert await desk.refused("undo", digest=undone["digest"]) == (422, "there is nothing to undo")
+        assert await desk.refused("undo", digest=undone["digest"]) == (
+            422,
+            "there is nothing to undo",
+        )
 
     with_desk(desk, steps)
 
@@ -92,8 +117,13 @@ def test_set_after_foreign_change_refused(desk: Desk) -> None:
         digest = (await desk.ask("state"))["digest"]
         desk.nodes.values["controller"]["k_g"] *= 1.1
         status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
-        assert (status, sentence) == (409, "the parameters have been changed meanwhile: look at them, then apply again")
-        assert desk.nodes.notes == [f"control: {{'do': 'gains', 'values': {{'k_g': [1.0]}}}} refused: {sentence}"]
+        assert (status, sentence) == (
+            409,
+            "the parameters have been changed meanwhile: look at them, then apply again",
+        )
+        assert desk.nodes.notes == [
+            f"control: {{'do': 'gains', 'values': {{'k_g': [1.0]}}}} refused: {sentence}"
+        ]
 
     with_desk(desk, steps)
 
@@ -105,7 +135,10 @@ def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
     async def steps(desk: Desk) -> None:
         digest, before = (await desk.ask("state"))["digest"], dict(desk.nodes.values["controller"])
         for values, expected in (
-            ({"k_g": [2.1 * k_g]}, f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}"),
+            (
+                {"k_g": [2.1 * k_g]},
+                f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}",
+            ),
             ({"k_g": [-1.0]}, "k_g: found -1, expected"),
             ({"k_g": [True]}, "'k_g': found True, expected a number"),
             ({"k_g": [k_g, k_g]}, "k_g: found 2 values, expected 1"),
@@ -154,11 +187,18 @@ def test_commands_reach_guidance(desk: Desk) -> None:
         await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
         await desk.ask("hold")
         assert desk.nodes.done == [
-            ("target", {"heading": 1.5, "altitude": 60.0}), ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
+            ("target", {"heading": 1.5, "altitude": 60.0}),
+            ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
         ]  # fmt: skip
         assert await desk.refused("skip") == (422, "no route with a further leg is flown")
         assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
-        for points in ([[0, 0, 0]], [[0, 0], [1, 1]], "north", [["a", 0, 0], [0, 0, 0]], [[0, 0, None], [0, 0, 0]]):
+        for points in (
+            [[0, 0, 0]],
+            [[0, 0], [1, 1]],
+            "north",
+            [["a", 0, 0], [0, 0, 0]],
+            [[0, 0, None], [0, 0, 0]],
+        ):
             assert (await desk.refused("route", points=points))[0] == 400
         assert (await desk.refused("fly"))[0] == 400
 
@@ -170,14 +210,23 @@ def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
         state = await desk.ask("state")
         assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
         stuck: list[float | None] = [0, None, None, None]
-        changed = await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+        changed = await desk.ask(
+            "fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2}
+        )
         assert changed["faults"]["sensors.dropout"] == 0.2
-        assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [0.0, math.inf, math.inf, math.inf]
+        assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [
+            0.0,
+            math.inf,
+            math.inf,
+            math.inf,
+        ]
         assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
         desk.nodes.values["aircraft"]["sensors.bias"] = [0.0, 0.0, 0.0, 0.3]  # by another program
         assert (await desk.ask("state"))["faults"]["sensors.bias"] == [0.0, 0.0, 0.0, 0.3]
         await desk.ask("gust", axis="lateral", speed=3, length=20)
-        assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(desk.flight.end + 0.2)
+        assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(
+            desk.flight.end + 0.2
+        )
         for do, request, expected in (
             ("fault", {"values": {"sensors.dropout": 2.0}}, 422),
             ("fault", {"values": {"rate": 100.0}}, 400),
@@ -190,12 +239,19 @@ def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_gains_of_bridge_that_sends_need_further_option(recorded: Path, osprey_gust: Scenario) -> None:
+def test_gains_of_bridge_that_sends_need_further_option(
+    recorded: Path, osprey_gust: Scenario
+) -> None:
     async def steps(desk: Desk) -> None:
         state = await desk.ask("state")
         assert state["bridge"] == {"map": "plane", "sends": True}
-        status, sentence = await desk.refused("gains", digest=state["digest"], values={"k_g": [1.0]})
-        assert (status, sentence) == (403, "the bridge sends to an autopilot: gains need rise-di watch --control --set real")
+        status, sentence = await desk.refused(
+            "gains", digest=state["digest"], values={"k_g": [1.0]}
+        )
+        assert (status, sentence) == (
+            403,
+            "the bridge sends to an autopilot: gains need rise-di watch --control --set real",
+        )
 
     async def allowed(desk: Desk) -> None:
         state = await desk.ask("state")
@@ -204,7 +260,9 @@ def test_gains_of_bridge_that_sends_need_further_option(recorded: Path, osprey_g
 
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False), steps)
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=True), allowed)
-    with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False, real=True), allowed)
+    with_desk(
+        Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False, real=True), allowed
+    )
 
 
 def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> None:
@@ -275,14 +333,23 @@ def test_action_by_key_lease_rate_and_state(
     state: str, action: str, recorded: Path, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each cell of the table: who asks for which action in which state of the flight."""
-    desk = Desk(recorded, osprey_gust, "aircraft", "controller", "guidance", *(["bridge"] if "engage" in action else []))
+    desk = Desk(
+        recorded,
+        osprey_gust,
+        "aircraft",
+        "controller",
+        "guidance",
+        *(["bridge"] if "engage" in action else []),
+    )
     monkeypatch.setattr(desk.flight, "state", lambda: state)
     monkeypatch.setattr(desk.nodes, "engage", lambda: "")
     digest = ""
 
     async def status(key: str = KEY, lease: str = "") -> int:
         try:
-            await desk.control.answer({"do": action, "digest": digest, **REQUESTS[action]}, key, lease or desk.lease)
+            await desk.control.answer(
+                {"do": action, "digest": digest, **REQUESTS[action]}, key, lease or desk.lease
+            )
         except RefusedError as error:
             return int(error.status)
         return 200
@@ -357,7 +424,9 @@ def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
             assert (good.code, json.loads(good.body)["nodes"]) == (200, list(ALL))
             held = await post(server, state)
             assert (held.code, "another page" in json.loads(held.body)["refused"]) == (423, True)
-            assert (await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})).code == 200
+            assert (
+                await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})
+            ).code == 200
         finally:
             await server.close()
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log of a flight over the Foxglove protocol, against a client of another library; the extra may be missing."""
+"""The log of a flight over the Foxglove protocol, against a client of another library; the extra
+may be missing.
+"""
 
 import asyncio
 import json
@@ -22,7 +24,9 @@ from tornado.websocket import websocket_connect
 
 from flight_core.tape import Tape
 
-needs_extra = pytest.mark.skipif(find_spec("foxglove") is None, reason="needs foxglove-sdk: make foxglove")
+needs_extra = pytest.mark.skipif(
+    find_spec("foxglove") is None, reason="needs foxglove-sdk: make foxglove"
+)
 PROTOCOL = "foxglove.sdk.v1"
 SUBSCRIBE, MESSAGE_DATA = "subscribe", 1
 HEAD = struct.Struct("<BIQ")  # MessageData: opcode, subscription, log time
@@ -33,7 +37,9 @@ def command(*words: object) -> list[str]:
 
 
 @needs_extra
-def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape, tmp_path: Path) -> None:
+def test_viewer_gets_messages_of_log_with_definitions(
+    recorded: Path, tape: Tape, tmp_path: Path
+) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
     rest = BytesIO(content[len(content) // 2 :])
@@ -61,8 +67,12 @@ def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape
             channels |= {channel["topic"]: channel for channel in message.get("channels", ())}
             assert message.get("capabilities", []) == []  # nothing can be sent
         subscription = {"id": 7, "channelId": channels["/y"]["id"]}
-        await connection.write_message(json.dumps({"op": SUBSCRIBE, "subscriptions": [subscription]}))
-        with path.open("ab") as log:  # the protocol does not acknowledge a subscription: the log grows until messages come
+        await connection.write_message(
+            json.dumps({"op": SUBSCRIBE, "subscriptions": [subscription]})
+        )
+        with (
+            path.open("ab") as log
+        ):  # the protocol does not acknowledge a subscription: the log grows until messages come
             while not received and (piece := rest.read(5000)):
                 log.write(piece)
                 log.flush()
@@ -74,14 +84,20 @@ def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape
         connection.close()
         return channels, received
 
-    with subprocess.Popen(command(tmp_path, "--foxglove", "--port", 0), stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command(tmp_path, "--foxglove", "--port", 0), stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         address = re.match(r"ws://127\.0\.0\.1:\d+", process.stdout.readline())
         assert address is not None
         channels, received = asyncio.run(asyncio.wait_for(view(address[0]), 60.0))
         assert process.wait(20.0) == 0  # with the recording
     y = channels["/y"]
-    assert (y["encoding"], y["schemaName"], y["schemaEncoding"]) == ("cdr", "sensor_msgs/msg/JointState", "ros2msg")
+    assert (y["encoding"], y["schemaName"], y["schemaEncoding"]) == (
+        "cdr",
+        "sensor_msgs/msg/JointState",
+        "ros2msg",
+    )
     decode = DecoderFactory().decoder_for(
         "cdr", Schema(data=y["schema"].encode(), encoding="ros2msg", id=1, name=y["schemaName"])
     )
@@ -93,15 +109,26 @@ def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape
 
 @needs_extra
 def test_ended_recording_opened_by_viewer_itself(recorded: Path) -> None:
-    ended = subprocess.run(command(recorded, "--foxglove"), capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        command(recorded, "--foxglove"), capture_output=True, text=True, check=False
+    )
     assert ended.returncode == 2
-    assert "found a recording that has ended, expected one in progress; viewers open its .mcap file" in ended.stderr
+    assert (
+        "found a recording that has ended, expected one in progress; viewers open its .mcap file"
+        in ended.stderr
+    )
 
 
 def test_a_missing_extra_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
-    (tmp_path / "foxglove.py").write_text("raise ModuleNotFoundError(name='foxglove')\n", encoding="utf-8")
+    (tmp_path / "foxglove.py").write_text(
+        "raise ModuleNotFoundError(name='foxglove')\n", encoding="utf-8"
+    )
     ended = subprocess.run(
-        command(recorded, "--foxglove"), capture_output=True, text=True, check=False, env={"PYTHONPATH": str(tmp_path)}
+        command(recorded, "--foxglove"),
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PYTHONPATH": str(tmp_path)},
     )
     expected = "error: --foxglove: found no Python package foxglove, expected it: make foxglove\n"
     assert (ended.returncode, ended.stderr) == (2, expected)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page in a browser: a flight that grows, replay, signs of the scene, states, hostile names, phone and dark scheme."""
+"""The live page in a browser: a flight that grows, replay, signs of the scene, states, hostile
+names, phone and dark scheme.
+"""
 
 import asyncio
 import math
@@ -46,7 +48,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False) -> Iterator[str]:
+def serving(
+    *runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False
+) -> Iterator[str]:
     """Serve runs from a thread of this process; the address with the token."""
     ready, address = threading.Event(), ""
     loop = asyncio.new_event_loop()
@@ -77,7 +81,10 @@ def serving(*runs: Path, control: Callable[[Flight], Control] | None = None, fle
 
 @contextmanager
 def shown(
-    browser: Browser, *runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False
+    browser: Browser,
+    *runs: Path,
+    control: Callable[[Flight], Control] | None = None,
+    fleet: bool = False,
 ) -> Iterator[str]:
     """Serve finished runs and open the page; leave it before the server ends."""
     with serving(*runs, control=control, fleet=fleet) as address:
@@ -101,7 +108,7 @@ def colours_of(browser: Browser, selector: str) -> int:
         const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {{willReadFrequently: true}});
         copy.drawImage(canvas, 0, 0);
         return new Set(new Uint32Array(copy.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
-    }})(document.querySelector('{selector}'))"""
+    }})(document.querySelector('{selector}'))"""  # noqa: E501 - a text as it is written
     return int(browser.run(script))
 
 
@@ -119,11 +126,13 @@ PIXELS = """((selector, name) => {
         found += data[k + 3] > 200 && [0, 1, 2].every(i => Math.abs(data[k + i] - wanted[i]) < 40);
     }
     return found;
-})"""
+})"""  # noqa: E501 - a text as it is written
 
 
 def pixels_of(browser: Browser, selector: str, name: str) -> int:
-    """Number of pixels of a canvas that have nearly the colour of that name, as the middle of a line has."""
+    """Number of pixels of a canvas that have nearly the colour of that name, as the middle of a
+    line has.
+    """
     return int(browser.run(f"{PIXELS}('{selector}', '{name}')"))
 
 
@@ -147,15 +156,31 @@ def press(browser: Browser, key: str, shift: bool = False) -> None:
 
 def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded: Path) -> None:
     with shown(browser, recorded) as address:
-        titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
-        assert titles[:5] == ["q: y over y_m", "p: y over y_m", "r: y over y_m", "V: y over y_m", "q: error e"]
+        titles = browser.run(
+            "[...document.querySelectorAll('#charts canvas')].map(one => "
+            "one.getAttribute('aria-label'))"
+        )
+        assert titles[:5] == [
+            "q: y over y_m",
+            "p: y over y_m",
+            "r: y over y_m",
+            "V: y over y_m",
+            "q: error e",
+        ]
         assert {"elevator", "gust", "altitude", "ticks: lateness"} <= set(titles)
         for selector in ("#scene", "#horizon", "#timeline", "#charts canvas"):
             assert colours_of(browser, selector) > 5
-        hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")
+        hosts = browser.run(
+            "[...new Set(performance.getEntriesByType('resource').map(one => new "
+            "URL(one.name).host))]"
+        )
         assert hosts == [address.split("/")[2]]
-        assert browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
-        assert browser.run("location.href") == f"{address.partition('#')[0]}#"  # the token is not in the history
+        assert (
+            browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
+        )
+        assert (
+            browser.run("location.href") == f"{address.partition('#')[0]}#"
+        )  # the token is not in the history
         assert browser.run("document.cookie") == ""
         browser.run("location.reload()")
         browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")  # the tab has the token
@@ -216,11 +241,20 @@ def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> 
     with BagWriter(tmp_path / hostile.replace("/", "")) as bag:
         y = bag.add_topic("/y", JOINT_STATE, "")
         for k in range(200):
-            bag.write(y, k * 10_000_000, k * 10_000_000, k, vector(k * 10_000_000, [hostile], [math.sin(k)]))
+            bag.write(
+                y,
+                k * 10_000_000,
+                k * 10_000_000,
+                k,
+                vector(k * 10_000_000, [hostile], [math.sin(k)]),
+            )
     with shown(browser, tmp_path / hostile):
         assert browser.run("document.getElementById('name').textContent") == hostile
         assert browser.run("document.querySelectorAll('img').length") == 0
-        assert browser.run("document.querySelector('#charts canvas').getAttribute('aria-label')") == hostile
+        assert (
+            browser.run("document.querySelector('#charts canvas').getAttribute('aria-label')")
+            == hostile
+        )
         assert browser.console == []
 
 
@@ -228,7 +262,9 @@ def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> 
 
 
 def seen(browser: Browser, expression: str) -> Any:
-    """An expression with scene.js as `m`, and `at`: the place on the screen of a body point of a pose, seen from behind."""
+    """An expression with scene.js as `m`, and `at`: the place on the screen of a body point of a
+    pose, seen from behind.
+    """
     at = """const at = (point, phi, theta, psi) => m.project(m.camera([-10, 0, -3], [10, 0, 3]),
         m.toWorld(m.rotation(phi, theta, psi), point), 500, 400, 400).slice(0, 2);"""
     return browser.run(f"import('./scene.js').then(m => {{ {at} return {expression} }})")
@@ -252,7 +288,8 @@ def test_attitude_drawn_with_right_signs(page: Browser) -> None:
 
 
 def test_rotation_is_euler_sequence_of_textbook(page: Browser) -> None:
-    # Stevens, Lewis, Aircraft Control and Simulation, eq. (1.3-20), here as a product of plane rotations.
+    # Stevens, Lewis, Aircraft Control and Simulation, eq. (1.3-20), here as a product of plane
+    # rotations.
     phi, theta, psi = 0.7, -0.4, 2.1
 
     def plane(i: int, j: int, angle: float) -> Any:
@@ -262,7 +299,9 @@ def test_rotation_is_euler_sequence_of_textbook(page: Browser) -> None:
         return matrix
 
     expected = plane(0, 1, psi) @ plane(2, 0, theta) @ plane(1, 2, phi)
-    assert np.array(seen(page, f"m.rotation({phi}, {theta}, {psi})")) == pytest.approx(expected, abs=1e-12)
+    assert np.array(seen(page, f"m.rotation({phi}, {theta}, {psi})")) == pytest.approx(
+        expected, abs=1e-12
+    )
 
 
 def test_surfaces_deflect_in_sense_of_input(page: Browser) -> None:
@@ -273,7 +312,9 @@ def test_surfaces_deflect_in_sense_of_input(page: Browser) -> None:
     up = np.array(seen(page, edges % "elevator: 0.3")) - still
     assert up[right_elevator, 2] < 0 > up[left_elevator, 2]  # nose up: both go up
     roll = np.array(seen(page, edges % "aileron: 0.3")) - still
-    assert roll[right_aileron, 2] < 0 < roll[left_aileron, 2]  # roll right: the right one goes up, the left one down
+    assert (
+        roll[right_aileron, 2] < 0 < roll[left_aileron, 2]
+    )  # roll right: the right one goes up, the left one down
     yaw = np.array(seen(page, edges % "rudder: 0.3")) - still
     assert yaw[rudder, 1] > 0  # nose right: it goes to the right
 
@@ -282,7 +323,9 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
     """The horizon falls when the nose rises, and turns left in a roll to the right."""
 
     def sky(pose: str, x: float, y: float) -> bool:
-        """Whether a point of the instrument shows the sky; x and y in fractions of its radius from its centre."""
+        """Whether a point of the instrument shows the sky; x and y in fractions of its radius from
+        its centre.
+        """
         script = f"""import('./scene.js').then(m => {{
             const canvas = document.createElement('canvas');
             canvas.style = 'width: 200px; height: 200px';
@@ -292,13 +335,19 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
             const [r, g, b] = canvas.getContext('2d').getImageData(column, row, 1, 1).data;
             canvas.remove();
             return b > g;
-        }})"""
+        }})"""  # noqa: E501 - a text as it is written
         return bool(page.run(script))
 
-    level, up, roll = (f"{{attitude: true, phi: {phi}, theta: {theta}}}" for phi, theta in ((0, 0), (0, 0.2), (0.5, 0)))
+    level, up, roll = (
+        f"{{attitude: true, phi: {phi}, theta: {theta}}}"
+        for phi, theta in ((0, 0), (0, 0.2), (0.5, 0))
+    )
     assert (sky(level, -0.6, -0.1), sky(level, -0.6, 0.1)) == (True, False)
     assert sky(up, -0.6, 0.1)
-    assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [True, True]  # the horizon falls on the left and rises on the right
+    assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [
+        True,
+        True,
+    ]  # the horizon falls on the left and rises on the right
     assert [sky(roll, 0.6, y) for y in (-0.1, 0.1)] == [False, False]
 
 
@@ -306,9 +355,22 @@ POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east",
 
 
 def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -> None:
-    names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude", "y.V")
+    names = (
+        "mode",
+        "mode.lateral",
+        "mode.vertical",
+        "leg",
+        "xtrack",
+        "to_go",
+        "phi_c",
+        "theta_c",
+        "target.altitude",
+        "y.V",
+    )
     stamps = np.arange(200, dtype=np.int64) * 20_000_000
-    guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0, 0.0], (200, 1)))
+    guidance = Signal(
+        stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0, 0.0], (200, 1))
+    )
     pose = np.tile([0.1, 0.02, 0.0, 0.0, 0.0, 30.0, 25.0, 0.0, 0.0], (200, 1))
     pose[:, POSE.index("north")] = 25.0 * stamps / 1e9
     pose[:, POSE.index("altitude")] += np.sin(stamps / 1e9)
@@ -317,9 +379,17 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
     write_run(Tape(flown), tmp_path / "other", LogAttachments(find_scenario("osprey_servo").path))
     with shown(browser, tmp_path / "run"):
         readouts = browser.run("document.getElementById('readouts').innerText")
-        for text in ("ENGAGED", "ROUTE, ALTITUDE", "3: 100 m, 0:04", "-2.5 m", "30.0 m"):  # 100 m at 25 m/s
+        for text in (
+            "ENGAGED",
+            "ROUTE, ALTITUDE",
+            "3: 100 m, 0:04",
+            "-2.5 m",
+            "30.0 m",
+        ):  # 100 m at 25 m/s
             assert text in readouts
-        assert browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"  # a guided flight shows its map
+        assert (
+            browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"
+        )  # a guided flight shows its map
         browser.run(SAID)
         set_camera(browser, "map")
         said = set(browser.run("said"))
@@ -340,11 +410,21 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
             "000",
         } <= said  # 3: the timeline
         browser.run("void (units.value = 'ft, kt', units.dispatchEvent(new Event('change')))")
-        browser.wait_for("['V (kt)', '48.6', '98'].every(text => said.includes(text))")  # 25 m/s and 30 m
+        browser.wait_for(
+            "['V (kt)', '48.6', '98'].every(text => said.includes(text))"
+        )  # 25 m/s and 30 m
         assert "98.4 ft" in browser.run("document.getElementById('readouts').innerText")
         browser.run("void (units.value = 'm, m/s', units.dispatchEvent(new Event('change')))")
-        titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
-        assert titles == ["phi over its command", "theta over its command", "cross-track", "altitude"]
+        titles = browser.run(
+            "[...document.querySelectorAll('#charts canvas')].map(one => "
+            "one.getAttribute('aria-label'))"
+        )
+        assert titles == [
+            "phi over its command",
+            "theta over its command",
+            "cross-track",
+            "altitude",
+        ]
         for colour in ("--plant", "--reference"):  # the altitude, and its command
             assert pixels_of(browser, "[aria-label=altitude]", colour) > 300
         set_camera(browser, "map")
@@ -352,7 +432,9 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
         assert browser.console == []
     with shown(browser, tmp_path / "other"):
         set_camera(browser, "map")
-        assert pixels_of(browser, "#scene", "--reference") == 0  # nothing but a route has its colour
+        assert (
+            pixels_of(browser, "#scene", "--reference") == 0
+        )  # nothing but a route has its colour
 
 
 SAID = """(() => {
@@ -380,7 +462,9 @@ def take(browser: Browser, key: str = "abcd-efgh") -> None:
     browser.run("void document.getElementById('control-take').click()")
 
 
-def test_desk_has_parts_of_nodes_that_run(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+def test_desk_has_parts_of_nodes_that_run(
+    browser: Browser, recorded: Path, osprey_gust: Scenario
+) -> None:
     nodes, controls = NodesInMemory(osprey_gust, "controller"), list[Control]()
 
     with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
@@ -388,12 +472,17 @@ def test_desk_has_parts_of_nodes_that_run(browser: Browser, recorded: Path, ospr
         browser.wait_for("document.getElementById('control-gains') !== null")
         assert browser.run("document.getElementById('control-map') === null")
         nodes.names[:] = ["bridge"]
-        browser.wait_for("document.getElementById('control-map') !== null && document.getElementById('control-gains') === null")
+        browser.wait_for(
+            "document.getElementById('control-map') !== null && "
+            "document.getElementById('control-gains') === null"
+        )
         assert browser.console == []
     controls[0].close()
 
 
-def test_gains_are_pending_until_applied(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+def test_gains_are_pending_until_applied(
+    browser: Browser, recorded: Path, osprey_gust: Scenario
+) -> None:
     """Applied gains can be undone."""
     nodes = NodesInMemory(osprey_gust, "aircraft", "controller", "guidance")
     controls: list[Control] = []
@@ -407,18 +496,29 @@ def test_gains_are_pending_until_applied(browser: Browser, recorded: Path, ospre
         assert browser.run("document.getElementById('control-desk').hidden")
         take(browser, "abcd-efgx")
         browser.wait_for(said("the control key is wrong"))
-        browser.wait_for("new Promise(resume => setTimeout(() => resume(true), 1000))")  # as long as the next key is refused
+        browser.wait_for(
+            "new Promise(resume => setTimeout(() => resume(true), 1000))"
+        )  # as long as the next key is refused
         take(browser)
         browser.wait_for("document.querySelectorAll('#control-gains tr').length > 10")
         slider = "document.querySelector('#control-gains [data-gain=k_g]')"
-        browser.run(f"{slider}.value = {1.5 * before}; void {slider}.dispatchEvent(new Event('input'))")
-        browser.wait_for("document.getElementById('control-margins').textContent.includes('pending: delay margin')")
+        browser.run(
+            f"{slider}.value = {1.5 * before}; void {slider}.dispatchEvent(new Event('input'))"
+        )
+        browser.wait_for(
+            "document.getElementById('control-margins').textContent.includes('pending: delay "
+            "margin')"
+        )
         assert browser.run("document.getElementById('control-apply').textContent") == "Apply 1"
         assert nodes.values["controller"]["k_g"] == before  # a slider sends nothing
         browser.run("void document.getElementById('control-apply').click()")
         browser.wait_for(said("applied"))
-        assert nodes.values["controller"]["k_g"] == pytest.approx(1.5 * before, rel=0.01)  # three digits
-        browser.wait_for("document.getElementById('control-logged').textContent === 'not in the log yet'")  # a recorded one
+        assert nodes.values["controller"]["k_g"] == pytest.approx(
+            1.5 * before, rel=0.01
+        )  # three digits
+        browser.wait_for(
+            "document.getElementById('control-logged').textContent === 'not in the log yet'"
+        )  # a recorded one
         browser.run("void document.getElementById('control-undo').click()")
         browser.wait_for(said("undone"))
         assert nodes.values["controller"]["k_g"] == before

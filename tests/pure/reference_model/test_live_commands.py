@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m: bounds, age limit, and the ending that levels the wings when their publisher is lost.
+"""Live commands u_m: bounds, age limit, and the ending that levels the wings when their publisher
+is lost.
 
-A stand-in for guidance rolls each aircraft into a bank: p_m = k (phi_c - phi), the turn coordinated. It ends at several
-instants of the roll-in.
+A stand-in for guidance rolls each aircraft into a bank: p_m = k (phi_c - phi), the turn
+coordinated. It ends at several instants of the roll-in.
 """
 
 import math
@@ -37,7 +38,9 @@ MS = 1_000_000  # ns
 
 
 def reference(**live: Any) -> Reference:
-    return Reference(ReferenceModelConfig.validate_mapping(SECTION | {"live": live}, "reference_model"))
+    return Reference(
+        ReferenceModelConfig.validate_mapping(SECTION | {"live": live}, "reference_model")
+    )
 
 
 def test_command_beyond_bound_refused_and_changes_nothing() -> None:
@@ -59,7 +62,9 @@ def test_command_acts_from_step_after_it_and_no_earlier() -> None:
     model = reference()
     before = model.sample(10)
     model.take(10 * 5 * MS, np.array([0.1, 0.0, 0.0, 0.0]))
-    assert np.array_equal(model.sample(10), before)  # y_m of the same instant has no knowledge of it
+    assert np.array_equal(
+        model.sample(10), before
+    )  # y_m of the same instant has no knowledge of it
     assert model.sample(11)[0] > 0.0
 
 
@@ -67,11 +72,14 @@ def test_bank_is_dead_reckoned_by_y_m_that_was_published_where_samples_skipped()
     model, bank, flown = reference(speed=25.0), math.radians(20.0), 0
     model.take(0, np.array([0.0, 0.0, 0.35, 0.0]), np.array([bank, 0.0]))
     p = model.sample(0)[2]
-    # Of the 0.3 s after sample 90 the reference rolls back without a y_m: the law tracks the roll rate of before.
+    # Of the 0.3 s after sample 90 the reference rolls back without a y_m: the law tracks the roll
+    # rate of before.
     for number in [*range(1, 91), *range(150, 2000)]:
         bank += (number - flown) / RATE * p
         p, flown = model.sample(number)[2], number
-    assert abs(math.degrees(bank)) < 1.0  # of an aircraft that tracks; 6 deg by the rates of the skipped samples
+    assert (
+        abs(math.degrees(bank)) < 1.0
+    )  # of an aircraft that tracks; 6 deg by the rates of the skipped samples
 
 
 def test_without_attitude_command_that_times_out_becomes_zero() -> None:
@@ -82,15 +90,22 @@ def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     held = model.sample(41)[2]
     assert model.source() == "ending"
     assert held > 0.05  # rad/s: 0.2 s of a reference of 5 rad/s and a command of 0.2 rad/s
-    assert np.abs(model.sample(8000)).max() < 1e-6  # 40 s: the slowest channel has a time constant of 2 s
+    assert (
+        np.abs(model.sample(8000)).max() < 1e-6
+    )  # 40 s: the slowest channel has a time constant of 2 s
 
 
 @pytest.mark.parametrize("outputs", [["q", "V", "p"], ["pitch", "V", "p", "r"]])
 def test_levelling_needs_the_rates_and_the_speed(outputs: list[str]) -> None:
     n = len(outputs)
-    section = SECTION | {"outputs": outputs, "second_order": {"natural_frequency": [4.0] * n, "damping": [0.9] * n}}
+    section = SECTION | {
+        "outputs": outputs,
+        "second_order": {"natural_frequency": [4.0] * n, "damping": [0.9] * n},
+    }
     with pytest.raises(ParameterError, match=r"live\.speed: found 25"):
-        ReferenceModelConfig.validate_mapping(section | {"live": {"speed": 25.0}}, "reference_model")
+        ReferenceModelConfig.validate_mapping(
+            section | {"live": {"speed": 25.0}}, "reference_model"
+        )
 
 
 def test_in_lockstep_u_m_comes_at_instants_of_reference() -> None:
@@ -99,16 +114,27 @@ def test_in_lockstep_u_m_comes_at_instants_of_reference() -> None:
 
 
 AIRCRAFT: dict[str, tuple[Any, float]] = {
-    "osprey": (lambda: find_scenario("osprey_servo").vary(aircraft={"kinematics": "euler", "gusts": {}}), 35.0),
+    "osprey": (
+        lambda: find_scenario("osprey_servo").vary(aircraft={"kinematics": "euler", "gusts": {}}),
+        35.0,
+    ),
     "c172p": (lambda: find_scenario("jsbsim_c172p").vary(aircraft={"gusts": {}}), 30.0),
 }
 
 
 def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) -> FloatArray:
-    """Samples [t, phi] of a flight whose guidance rolls to a bank from t = 1 s and falls silent at `lost`, shape (N, 2)."""
+    """Samples [t, phi] of a flight whose guidance rolls to a bank from t = 1 s and falls silent at
+    `lost`, shape (N, 2).
+    """
     speed = scenario.aircraft.channels().speed
-    varied = scenario.vary(reference_model={"live": {"speed": speed}, "pulses": {}, "coordinated_turn": None})
-    aircraft, model, controller = Simulator(varied.aircraft), Reference(varied.reference_model), Controller(varied.controller)
+    varied = scenario.vary(
+        reference_model={"live": {"speed": speed}, "pulses": {}, "coordinated_turn": None}
+    )
+    aircraft, model, controller = (
+        Simulator(varied.aircraft),
+        Reference(varied.reference_model),
+        Controller(varied.controller),
+    )
     names, u, attitude = varied.reference_model.outputs, np.zeros(4), np.zeros(len(POSE))
     level, history = 0.0, []
     for t_ns in range(0, int(duration * 1e9) + 1, min(aircraft.period_ns, model.period_ns)):
@@ -137,7 +163,9 @@ def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) ->
 
 @pytest.mark.parametrize("lost", [1.5, 3.0])
 @pytest.mark.parametrize("name", AIRCRAFT)
-def test_wings_are_level_ten_seconds_after_guidance_fell_silent_in_roll_in(name: str, lost: float) -> None:
+def test_wings_are_level_ten_seconds_after_guidance_fell_silent_in_roll_in(
+    name: str, lost: float
+) -> None:
     make, bank_deg = AIRCRAFT[name]
     t, phi = flight(make(), bank_deg, lost, lost + 11.0).T
     after = t > lost

@@ -45,7 +45,8 @@ def test_pulse_rises_holds_and_falls_over_edges() -> None:
 @pytest.mark.equation(2)
 @given(t=st.floats(0, 10), dt=st.floats(1e-6, 1e-3))
 def test_commands_have_a_bounded_derivative(t: float, dt: float) -> None:
-    # Equation (2) requires a bounded u_m_dot: the slope of an edge is value / rise, and edges do not overlap here.
+    # Equation (2) requires a bounded u_m_dot: the slope of an edge is value / rise, and edges do
+    # not overlap here.
     profile = parameters(pulses=PULSES).profile()
     change = np.abs(command(t + dt, profile) - command(t, profile))
     assert (change <= np.array([0.2, 0.4, 0.0]) / 0.1 * dt + 1e-12).all()
@@ -59,7 +60,9 @@ def test_coordinated_turn_follows_integral_of_bank_rate() -> None:
         edges = [1.0, 1.1, 2.5, 2.6] if t > 2.6 else None
         bank, _ = quad(lambda s: float(command(s, profile)[1]), 0.0, t, points=edges, limit=200)
         # r = g / V0 sin(phi) is the turn rate without sideslip
-        assert float(command(t, profile)[2]) == pytest.approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
+        assert float(command(t, profile)[2]) == pytest.approx(
+            9.81 / 25.0 * math.sin(bank), abs=1e-8
+        )
 
 
 def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatArray:
@@ -87,14 +90,18 @@ def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     # PULSES change u_m within this step; the two differ by rounding only.
     u_m = np.concatenate([command(1.0 + part * dt, profile) for part in (0.0, 0.5, 1.0)])
     one_step = rk4(x_dot, 1.0, x_m, None, matrices, dt)
-    assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(one_step, rel=1e-14, abs=1e-15)
+    assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(
+        one_step, rel=1e-14, abs=1e-15
+    )
 
 
 def test_general_form_and_second_order_form_are_same_model() -> None:
     same = parameters().model()
     A_m, B_m = same.A_m.ravel().tolist(), same.B_m.ravel().tolist()
     linear = {"states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"], "A_m": A_m, "B_m": B_m}
-    for general_matrix, matrix in zip(parameters(second_order=None, linear=linear).model(), same, strict=True):
+    for general_matrix, matrix in zip(
+        parameters(second_order=None, linear=linear).model(), same, strict=True
+    ):
         assert (general_matrix == matrix).all()
 
 
@@ -105,5 +112,7 @@ def test_rate_at_which_runge_kutta_steps_diverge_refused() -> None:
         return parameters(rate=100.0, outputs=["q"], second_order=None, linear=linear)
 
     assert first_order(278.0).model().A_m.tolist() == [[-278.0]]
-    with pytest.raises(ParameterError, match=r"reference_model.rate: found 100 Hz, expected a higher one: the"):
+    with pytest.raises(
+        ParameterError, match=r"reference_model.rate: found 100 Hz, expected a higher one: the"
+    ):
         first_order(279.0)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the sentences about wrong input."""
+"""The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the
+sentences about wrong input.
+"""
 
 import ast
 import re
@@ -50,23 +52,36 @@ def type_checker_imports() -> set[tuple[str | None, str, str]]:
     tree = ast.parse(Path(str(rise_di.__file__)).read_text(encoding="utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
-    return {(node.module, alias.name, alias.asname or alias.name) for node in imports for alias in node.names}
+    return {
+        (node.module, alias.name, alias.asname or alias.name)
+        for node in imports
+        for alias in node.names
+    }
 
 
 def test_type_checkers_see_the_table() -> None:
     homes = vars(rise_di)["HOMES"]
-    table = {(module, name.split(" as ")[0], name.split(" as ")[-1]) for module, names in homes.items() for name in names}
+    table = {
+        (module, name.split(" as ")[0], name.split(" as ")[-1])
+        for module, names in homes.items()
+        for name in names
+    }
     assert type_checker_imports() == table
 
 
 def test_the_import_loads_no_library() -> None:
-    assert modules_loaded_by("import rise_di") - modules_loaded_by("import typing, importlib") == {"rise_di"}
+    assert modules_loaded_by("import rise_di") - modules_loaded_by("import typing, importlib") == {
+        "rise_di"
+    }
 
 
 def test_the_interface_needs_no_ros() -> None:
     """Every name is loaded, and none of the modules is of ROS."""
     ros = {"rclpy", "flight_ros", "ament_index_python", "launch", "sensor_msgs"}
-    assert not modules_loaded_by("import rise_di\nfor name in dir(rise_di): getattr(rise_di, name)") & ros
+    assert (
+        not modules_loaded_by("import rise_di\nfor name in dir(rise_di): getattr(rise_di, name)")
+        & ros
+    )
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -105,11 +120,15 @@ def test_a_data_frame_has_the_samples_of_the_tape(tape: rise_di.Tape) -> None:
 def test_a_log_has_the_samples_of_the_flight(run: rise_di.RecordedRun, tape: rise_di.Tape) -> None:
     assert run.tape.outcome == tape.outcome
     for topic in ("y", "y_m", "u", "internals"):
-        assert np.ascontiguousarray(run.tape[topic].values).tobytes() == tape[topic].values.tobytes()
+        assert (
+            np.ascontiguousarray(run.tape[topic].values).tobytes() == tape[topic].values.tobytes()
+        )
 
 
 def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.RecordedRun) -> None:
-    slower = SOFT.vary(controller={"Lambda": SOFT.rise_di().Lambda[0] * np.ones(4, dtype=np.float32)})
+    slower = SOFT.vary(
+        controller={"Lambda": SOFT.rise_di().Lambda[0] * np.ones(4, dtype=np.float32)}
+    )
     again = rise_di.replay(run, others=slower.controller)
     assert not again.equal()
     assert again.notes[0].startswith("open loop")
@@ -121,12 +140,21 @@ def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.Record
 def test_numpy_is_accepted_wherever_numbers_are() -> None:
     """Arrays of any real type, scalars and shapes, against lists of Python numbers."""
     gains = {"beta": [2.0, 2.0, 1.0, 1.0], "D": [1, -1, 1, 1], "k_g": 3.0}
-    arrays = {"beta": np.array(gains["beta"], dtype=np.float32), "D": np.array(gains["D"]), "k_g": np.float64(3.0)}
-    varied = SCENARIO.vary(controller=arrays, flight={"duration": np.int64(3), "lockstep": np.True_})
+    arrays = {
+        "beta": np.array(gains["beta"], dtype=np.float32),
+        "D": np.array(gains["D"]),
+        "k_g": np.float64(3.0),
+    }
+    varied = SCENARIO.vary(
+        controller=arrays, flight={"duration": np.int64(3), "lockstep": np.True_}
+    )
     assert varied == SCENARIO.vary(controller=gains, flight={"duration": 3.0, "lockstep": True})
     assert {type(value) for value in varied.rise_di().beta} == {float}
     assert rise_di.find_scenario("osprey_gust", duration=np.float64(2.0)) == SCENARIO
-    assert rise_di.decompose(np.eye(2)).D.tolist() == rise_di.decompose([[1.0, 0.0], [0.0, 1.0]]).D.tolist()
+    assert (
+        rise_di.decompose(np.eye(2)).D.tolist()
+        == rise_di.decompose([[1.0, 0.0], [0.0, 1.0]]).D.tolist()
+    )
 
 
 # Wrong input
@@ -136,13 +164,25 @@ A_RUN = "expected the folder of a run or an MCAP file"
 api: Any = rise_di
 scenario: Any = SCENARIO
 SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
-    "unknown scenario": (lambda: api.find_scenario("osprey_gast"), "scenario: found 'osprey_gast', expected one of "),
+    "unknown scenario": (
+        lambda: api.find_scenario("osprey_gast"),
+        "scenario: found 'osprey_gast', expected one of ",
+    ),
     "no scenario": (lambda: api.find_scenario(None), "scenario: found None, expected one of "),
-    "missing file": (lambda: api.find_scenario(Path("a.yaml")), "scenario: found 'a.yaml', expected one of "),
-    "text as duration": (lambda: api.find_scenario("osprey_gust", "5"), "flight.duration: found '5', expected a number"),
+    "missing file": (
+        lambda: api.find_scenario(Path("a.yaml")),
+        "scenario: found 'a.yaml', expected one of ",
+    ),
+    "text as duration": (
+        lambda: api.find_scenario("osprey_gust", "5"),
+        "flight.duration: found '5', expected a number",
+    ),
     "unknown section": (
         lambda: scenario.vary(controler={"rate": 1.0}),
-        "controler: found no such section, expected controller perhaps, or another of flight, aircraft, ",
+        (
+            "controler: found no such section, expected controller perhaps, or another of flight, "
+            "aircraft, "
+        ),
     ),
     "parameter as section": (
         lambda: scenario.vary(beta=[1.0]),
@@ -152,7 +192,10 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         lambda: scenario.vary(controller=3),
         "controller: found 3, expected a mapping of its parameters",
     ),
-    "wrong set": (lambda: scenario.vary(controller=scenario.flight), "controller: found FlightConfig("),
+    "wrong set": (
+        lambda: scenario.vary(controller=scenario.flight),
+        "controller: found FlightConfig(",
+    ),
     "unknown parameter": (
         lambda: scenario.vary(controller={"betta": 1}),
         "controller.betta: unknown key, expected beta perhaps, or another of ",
@@ -169,51 +212,120 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         lambda: scenario.vary(controller={"beta": np.full(4, np.nan)}),
         "controller.beta[0]: found nan, expected a finite number (and 3 more)",
     ),
-    "law without gains": (lambda: scenario.vary(controller={"law": "pi"}), "controller.K: missing, expected "),
-    "name as scenario": (lambda: api.simulate("osprey_gust"), "scenario: found 'osprey_gust', expected a Scenario, "),
+    "law without gains": (
+        lambda: scenario.vary(controller={"law": "pi"}),
+        "controller.K: missing, expected ",
+    ),
+    "name as scenario": (
+        lambda: api.simulate("osprey_gust"),
+        "scenario: found 'osprey_gust', expected a Scenario, ",
+    ),
     "duration as progress": (
         lambda: api.simulate(scenario, 20),
         "progress: found 20, expected a function of the flight time",
     ),
-    "folder as number": (lambda: api.fly(scenario, runs=3), "runs: found 3, expected the path of a folder"),
-    "missing run": (lambda: api.read_run("runs/latst"), f"runs/latst: found no such file or folder, {A_RUN}"),
+    "folder as number": (
+        lambda: api.fly(scenario, runs=3),
+        "runs: found 3, expected the path of a folder",
+    ),
+    "missing run": (
+        lambda: api.read_run("runs/latst"),
+        f"runs/latst: found no such file or folder, {A_RUN}",
+    ),
     "no run": (lambda: api.read_run(None), f"run: found None, {A_RUN}"),
     "empty path": (lambda: api.read_run(""), f"run: found '', {A_RUN}"),
-    "NUL in a path": (lambda: api.read_run("a\0b"), f"a\\x00b: found no such file or folder, {A_RUN}"),
+    "NUL in a path": (
+        lambda: api.read_run("a\0b"),
+        f"a\\x00b: found no such file or folder, {A_RUN}",
+    ),
     "run of a tape": (lambda run: api.recorded_scenario(run.tape), "run: found Tape("),
-    "tape without parameters": (lambda run: api.replay(run.tape), "parameters: found None, expected the parameters of "),
-    "scenario as parameters": (lambda run: api.replay(run, scenario), "parameters: found Scenario("),
-    "mapping as parameters": (lambda run: api.replay(run, others={"beta": 1}), "others: found {'beta': 1}, expected the "),
-    "number as changes": (lambda run: api.replay(run, changes=3), "changes: found 3, expected a list of changes, "),
+    "tape without parameters": (
+        lambda run: api.replay(run.tape),
+        "parameters: found None, expected the parameters of ",
+    ),
+    "scenario as parameters": (
+        lambda run: api.replay(run, scenario),
+        "parameters: found Scenario(",
+    ),
+    "mapping as parameters": (
+        lambda run: api.replay(run, others={"beta": 1}),
+        "others: found {'beta': 1}, expected the ",
+    ),
+    "number as changes": (
+        lambda run: api.replay(run, changes=3),
+        "changes: found 3, expected a list of changes, ",
+    ),
     "run as tape": (lambda run: api.data_frame(tape=run), "tape: found RecordedRun("),
-    "path as tape": (lambda: api.best_error("runs/latest"), "tape: found 'runs/latest', expected a Tape, "),
+    "path as tape": (
+        lambda: api.best_error("runs/latest"),
+        "tape: found 'runs/latest', expected a Tape, ",
+    ),
     "no samples": (lambda: api.data_frame(api.Tape({})), "tape: found no topic, expected a flight"),
     "tape of a log": (
         lambda run: api.summarise(run.tape),
-        "scenario: found none on the tape of a log, expected summarise(run.tape, recorded_scenario(run))",
+        (
+            "scenario: found none on the tape of a log, expected summarise(run.tape, "
+            "recorded_scenario(run))"
+        ),
     ),
     "signal as samples": (lambda tape: api.error_metrics(tape["y"]), "errors: found Signal("),
     "channel as topic": (lambda tape: tape["q"], "the log: found no topic q among y, y_m, "),
     "list as topic": (lambda tape: tape[["y"]], "the log: found no topic ['y'] among y, y_m, "),
-    "unknown channel": (lambda tape: tape["y"]["Q"], "the log: found no channel Q among q, V, p, r, expected one"),
+    "unknown channel": (
+        lambda tape: tape["y"]["Q"],
+        "the log: found no channel Q among q, V, p, r, expected one",
+    ),
     "report of nothing": (api.report, f"runs: found none, {A_RUN}"),
     "list of runs": (lambda: api.report(["a"]), f"run: found ['a'], {A_RUN}"),
     "number as file": (lambda: api.report("a", csv=3), "csv: found 3, expected the path of a file"),
-    "unknown law": (lambda: api.law_schema("nope"), "law: found 'nope', expected a registered law: "),
-    "unknown airframe": (lambda: api.load_airframe("ospry"), "airframe: found 'ospry', expected one of "),
-    "text as rate": (lambda: api.select_gains("osprey", rate="fast"), "rate: found 'fast', expected 1 to 1000 Hz"),
-    "text as lags": (lambda: api.select_gains("osprey", lag="0.1"), "lag: found '0.1', expected seconds, 0 or more"),
+    "unknown law": (
+        lambda: api.law_schema("nope"),
+        "law: found 'nope', expected a registered law: ",
+    ),
+    "unknown airframe": (
+        lambda: api.load_airframe("ospry"),
+        "airframe: found 'ospry', expected one of ",
+    ),
+    "text as rate": (
+        lambda: api.select_gains("osprey", rate="fast"),
+        "rate: found 'fast', expected 1 to 1000 Hz",
+    ),
+    "text as lags": (
+        lambda: api.select_gains("osprey", lag="0.1"),
+        "lag: found '0.1', expected seconds, 0 or more",
+    ),
     "too few lags": (
         lambda: api.select_gains("osprey", lag=[0.1, 0.2]),
-        "lag: found 2 values, expected one for all or one for each of elevator, thrust, aileron, rudder",
+        (
+            "lag: found 2 values, expected one for all or one for each of elevator, thrust, "
+            "aileron, rudder"
+        ),
     ),
-    "number as inputs": (lambda: api.select_gains("osprey", inputs=3), "inputs: found 3, expected the inputs elevator, "),
-    "percent as part": (lambda: api.select_gains("osprey", uncertainty=30), "uncertainty: found 30, expected 0 to 1"),
-    "half a sample": (lambda: api.select_gains("osprey", samples=2.5), "samples: found 2.5, expected an integer from 0 "),
+    "number as inputs": (
+        lambda: api.select_gains("osprey", inputs=3),
+        "inputs: found 3, expected the inputs elevator, ",
+    ),
+    "percent as part": (
+        lambda: api.select_gains("osprey", uncertainty=30),
+        "uncertainty: found 30, expected 0 to 1",
+    ),
+    "half a sample": (
+        lambda: api.select_gains("osprey", samples=2.5),
+        "samples: found 2.5, expected an integer from 0 ",
+    ),
     "scenario as airframe": (lambda: api.select_gains(scenario), "airframe: found Scenario("),
-    "name as loop": (lambda: api.margins("osprey_servo"), "scenario: found 'osprey_servo', expected a Scenario, "),
-    "part of an aircraft": (lambda: api.margins(scenario, 0.5), "aircraft: found 0.5, expected an integer of 0 or more"),
-    "number as selection": (lambda: api.gains_yaml(3), "selection: found 3, expected a Selection, "),
+    "name as loop": (
+        lambda: api.margins("osprey_servo"),
+        "scenario: found 'osprey_servo', expected a Scenario, ",
+    ),
+    "part of an aircraft": (
+        lambda: api.margins(scenario, 0.5),
+        "aircraft: found 0.5, expected an integer of 0 or more",
+    ),
+    "number as selection": (
+        lambda: api.gains_yaml(3),
+        "selection: found 3, expected a Selection, ",
+    ),
     "no aircraft": (
         lambda: api.fly_campaign(scenario, 0),
         "campaign.aircraft: found 0, expected greater than ",
@@ -242,14 +354,23 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         lambda: api.fly_campaign(scenario, 2, entries=["A[q,q]"]),
         "entries: found ['A[q,q]'], expected numbers by name",
     ),
-    "no threads": (lambda: api.fly_campaign(scenario, 2, workers=0), "workers: found 0, expected an integer of "),
+    "no threads": (
+        lambda: api.fly_campaign(scenario, 2, workers=0),
+        "workers: found 0, expected an integer of ",
+    ),
     "missing campaign": (lambda: api.resume_campaign("nope"), "nope: found no campaign "),
-    "text as matrix": (lambda: api.decompose("x"), "Omega: found 'x', expected a matrix of numbers, (m, m)"),
+    "text as matrix": (
+        lambda: api.decompose("x"),
+        "Omega: found 'x', expected a matrix of numbers, (m, m)",
+    ),
     "ragged matrix": (
         lambda: api.decompose([[1, 2], [3]]),
         "Omega: found [[1, 2], [3]], expected a matrix ",
     ),
-    "list as array": (lambda: api.engage([1.0], [1.0]), "found [1.0], expected an array of NumPy or of JAX"),
+    "list as array": (
+        lambda: api.engage([1.0], [1.0]),
+        "found [1.0], expected an array of NumPy or of JAX",
+    ),
     "scenario as controller": (lambda: api.Controller(scenario), "parameters: found Scenario("),
     "name as a file": (
         lambda: api.scenario_yaml("osprey_gust"),
@@ -261,7 +382,11 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
 @pytest.mark.parametrize("call", SENTENCES)
 def test_wrong_input_is_one_sentence(call: str, request: pytest.FixtureRequest) -> None:
     wrong, sentence = SENTENCES[call]
-    names = wrong.__code__.co_varnames[: wrong.__code__.co_argcount] if wrong.__name__ == "<lambda>" else ()
+    names = (
+        wrong.__code__.co_varnames[: wrong.__code__.co_argcount]
+        if wrong.__name__ == "<lambda>"
+        else ()
+    )
     arguments = [request.getfixturevalue(name) for name in names]
     with pytest.raises(rise_di.ParameterError) as refused:
         wrong(*arguments)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Allocation of the inputs of a law to more effectors: stops, rates, priority, and a flight that replays to the bit."""
+"""Allocation of the inputs of a law to more effectors: stops, rates, priority, and a flight that
+replays to the bit.
+"""
 
 from typing import Any
 
@@ -31,13 +33,22 @@ def drawn(generator: np.random.Generator, m: int, p: int, rate: float = np.inf) 
     return allocation(T, Omega, range(m), Limits(-stops, stops, np.full(p, rate)))
 
 
-def demands(seed: int, count: int, size: float, rate: float = np.inf) -> list[tuple[Allocation, FloatArray]]:
+def demands(
+    seed: int, count: int, size: float, rate: float = np.inf
+) -> list[tuple[Allocation, FloatArray]]:
     """Demands of `size` times the v of an effector position inside the stops."""
     generator, pairs = np.random.default_rng(seed), []
     for _ in range(count):
         m = int(generator.integers(2, 5))
         params = drawn(generator, m, int(generator.integers(m, 9)), rate)
-        pairs.append((params, size * params.effect @ (params.limits.upper * generator.uniform(-1.0, 1.0, len(params.T)))))
+        pairs.append(
+            (
+                params,
+                size
+                * params.effect
+                @ (params.limits.upper * generator.uniform(-1.0, 1.0, len(params.T))),
+            )
+        )
     return pairs
 
 
@@ -45,7 +56,9 @@ def test_a_demand_inside_the_limits_is_t_v_to_the_last_bit() -> None:
     for params, v in demands(1, 20, 0.05):
         u, given = allocate(v, np.zeros(len(params.T)), DT, params)
         assert given.tobytes() == v.tobytes()
-        np.testing.assert_allclose(u, params.T @ v, rtol=1e-12, atol=1e-14)  # a sum in another order
+        np.testing.assert_allclose(
+            u, params.T @ v, rtol=1e-12, atol=1e-14
+        )  # a sum in another order
 
 
 @pytest.mark.parametrize("size", [0.9, 3.0])
@@ -69,7 +82,9 @@ def most(params: Allocation, v: FloatArray) -> float:
 
 
 def test_what_some_effectors_inside_the_stops_give_is_given() -> None:
-    """Ten sweeps met 98.8 % of 500 demands to 1 %, here about 50 at 0.9 of what a linear program finds: three may miss."""
+    """Ten sweeps met 98.8 % of 500 demands to 1 %, here about 50 at 0.9 of what a linear program
+    finds: three may miss.
+    """
     misses = hard = 0
     for params, v in demands(3, 100, 1.0):
         demand = 0.9 * most(params, v) * v
@@ -95,8 +110,12 @@ def test_beyond_the_stops_the_first_input_keeps_what_a_linear_program_finds_for_
 
 
 def full_mixing(**changes: Any) -> dict[str, Any]:
-    """A section controller of osprey_servo with inputs v = C B u, the inverse found here by NumPy alone."""
-    Omega = np.array([[0.98, 0, 0, 0], [0.003, 0.06, 0, 0], [0, 0, 1.5, -0.02], [0, 0, -0.09, 0.17]])  # per deg and %
+    """A section controller of osprey_servo with inputs v = C B u, the inverse found here by NumPy
+    alone.
+    """
+    Omega = np.array(
+        [[0.98, 0, 0, 0], [0.003, 0.06, 0, 0], [0, 0, 1.5, -0.02], [0, 0, -0.09, 0.17]]
+    )  # per deg and %
     unit = np.array([np.pi / 180.0, 0.01, np.pi / 180.0, np.pi / 180.0])
     Omega[[0, 2, 3]] /= unit  # q, p, r: rad/s^2 per unit, SI
     Omega[1] /= unit
@@ -133,10 +152,13 @@ def mixed(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit() -> None:
-    """The elevator has a third of what the commands take: the allocation binds, and the integrals of q do not wind up."""
+    """The elevator has a third of what the commands take: the allocation binds, and the integrals
+    of q do not wind up.
+    """
     stop = [0.01, 0.5, 0.3, 0.3]
     scenario = find_scenario("osprey_servo").vary(
-        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0]), flight={"duration": 10.0}
+        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0]),
+        flight={"duration": 10.0},
     )
     tape = simulate(scenario)
     assert tape.outcome == "completed"
@@ -145,21 +167,32 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     limited = tape["internals"].group("limited")["v_q"] > 0.0
     assert 0.1 < limited.mean() < 0.9
     assert replay(tape).equal()
-    # The command ends at 8 s, and q needs no elevator soon after: with integrals that wind up e would stay large.
+    # The command ends at 8 s, and q needs no elevator soon after: with integrals that wind up e
+    # would stay large.
     assert np.abs(tape["internals"]["e.q"][tape.time("internals") > 9.5]).max() < 0.01
 
 
 @pytest.mark.parametrize(
     ("name", "effector", "channel"),
-    [("osprey_twin", "left_elevator", "q"), ("osprey_vtail", "left_aileron", "p"), ("x8_elevons", "right_outer", "q")],
+    [
+        ("osprey_twin", "left_elevator", "q"),
+        ("osprey_vtail", "left_aileron", "p"),
+        ("x8_elevons", "right_outer", "q"),
+    ],
 )
 def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, channel: str) -> None:
-    """Half of the effect is left, which D = I survives: e within twice that of the whole aircraft, 15 mrad/s; u inside."""
+    """Half of the effect is left, which D = I survives: e within twice that of the whole aircraft,
+    15 mrad/s; u inside.
+    """
     scenario = find_scenario(name)
     inputs = list(scenario.aircraft.channels().inputs)
-    lost = scenario.aircraft.actuators.model_dump() | {"lost_at": [1.0 if key == effector else np.inf for key in inputs]}
+    lost = scenario.aircraft.actuators.model_dump() | {
+        "lost_at": [1.0 if key == effector else np.inf for key in inputs]
+    }
     scenario = scenario.vary(
-        aircraft={"actuators": lost, "rate": 200.0, "step": 0.005}, reference_model={"rate": 200.0}, flight={"duration": 5.0}
+        aircraft={"actuators": lost, "rate": 200.0, "step": 0.005},
+        reference_model={"rate": 200.0},
+        flight={"duration": 5.0},
     )
     tape = simulate(scenario)
     assert tape.outcome == "completed"
@@ -169,7 +202,9 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
 
 
 def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six rotors, no V, no guidance; 64 mrad/s off at most in the two commands of 0.5 rad/s, so a sixth of these."""
+    """Six rotors, no V, no guidance; 64 mrad/s off at most in the two commands of 0.5 rad/s, so a
+    sixth of these.
+    """
     monkeypatch.chdir(REPOSITORY)  # the scenario names its airframe from there
     path = "examples/hexarotor/hexarotor_flight.yaml"
     scenario = find_scenario(path).vary(flight={"duration": 3.0})
@@ -184,10 +219,18 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
     [
         ({"T": [1.0] * 15}, "allocation.T: found 15 values, expected 16: 4 rows of 4"),
         ({"effect": [1.0] * 16}, "allocation.T: found effect T that is off I"),
-        ({"lower": [0.1] * 4}, "allocation.lower: found 0.1 and upper 0.3 of elevator, expected a range with trim, 0, inside"),
+        (
+            {"lower": [0.1] * 4},
+            (
+                "allocation.lower: found 0.1 and upper 0.3 of elevator, expected a range with "
+                "trim, 0, inside"
+            ),
+        ),
     ],
 )
-def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(changes: dict[str, Any], sentence: str) -> None:
+def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(
+    changes: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(ParameterError, match=sentence):
         find_scenario("osprey_servo").vary(controller=mixed(**changes))
 
@@ -195,10 +238,15 @@ def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(changes: dic
 def test_a_map_with_a_wrong_sign_contradicts_the_effect_of_an_effector() -> None:
     """The D of the law is I for any sign of an effector, so `effect` tells the sign."""
     channel_map, frame = named_map("ardupilot"), load_airframe("osprey")
-    assert not check_scenario(channel_map, find_scenario("osprey_servo").vary(controller=mixed()), frame, None).contradictions
+    assert not check_scenario(
+        channel_map, find_scenario("osprey_servo").vary(controller=mixed()), frame, None
+    ).contradictions
     flip = np.diag([1.0, 1.0, -1.0, 1.0])
     effect = (np.reshape(full_mixing()["effect"], (4, 4)) @ flip).ravel().tolist()
     T = (flip @ np.reshape(full_mixing()["T"], (4, 4))).ravel().tolist()
     scenario = find_scenario("osprey_servo").vary(controller=mixed(effect=effect, T=T))
     (sentence,) = check_scenario(channel_map, scenario, frame, None).contradictions
-    assert "aileron has +85.9 on p_dot, allocation.effect has -85.9: a positive aileron means roll right" in sentence
+    assert (
+        "aileron has +85.9 on p_dot, allocation.effect has -85.9: a positive aileron means roll "
+        "right" in sentence
+    )

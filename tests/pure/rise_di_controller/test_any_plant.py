@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 on random aircraft: with the right D and gains by the rules, e converges to the ultimate bound of sampling.
+"""Theorem 1 on random aircraft: with the right D and gains by the rules, e converges to the
+ultimate bound of sampling.
 
-An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y = y_m, and then rotated.
-The law has D and gains only. `gains` computes them from the true aircraft, because these tests check the theorem and not
-an identification.
+An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y
+= y_m, and then rotated. The law has D and gains only. `gains` computes them from the true aircraft,
+because these tests check the theorem and not an identification.
 """
 
 from typing import NamedTuple
@@ -26,7 +27,10 @@ from rise_di_controller.law import LawParams, Sign, gain
 pytestmark = pytest.mark.slow
 
 MIN_DAMPING = 0.5  # 1/s, of the aircraft and of its zero dynamics
-DURATION, SETTLED = 8.0, 5.0  # s, length of a flight and the time at which e has settled: ten time constants of Lambda
+DURATION, SETTLED = (
+    8.0,
+    5.0,
+)  # s, length of a flight and the time at which e has settled: ten time constants of Lambda
 DT = 0.008  # s; the tests also use half of it
 
 
@@ -62,7 +66,9 @@ def abscissa(matrix: FloatArray) -> float:
 
 
 def random_task(n: int, m: int, seed: int) -> Task:
-    """Random task of relative degree one, C B = S D U. The aircraft and its zero dynamics have at least MIN_DAMPING."""
+    """Random task of relative degree one, C B = S D U. The aircraft and its zero dynamics have at
+    least MIN_DAMPING.
+    """
     m, rng = min(m, n - 1), np.random.default_rng(seed)  # n > m
     directions = np.linalg.qr(rng.standard_normal((m, m)))[0]
     S = directions * rng.uniform(0.5, 2.0, m) @ directions.T
@@ -77,12 +83,18 @@ def random_task(n: int, m: int, seed: int) -> Task:
         C=rotation[:, :m].T,
         gravity=0.1 / n * rng.uniform(-1.0, 1.0, (n, n)),  # f: at most 0.1 in each x_dot
     )
-    reference = Sines(rng.uniform(0.2, 1.0, m), rng.uniform(0.5, 2.0, m), rng.uniform(0.0, 2.0 * np.pi, m))
-    return Task(aircraft, D, rotation, reference, rng.choice([-1.0, 1.0], m) * rng.uniform(0.1, 0.3, m))
+    reference = Sines(
+        rng.uniform(0.2, 1.0, m), rng.uniform(0.5, 2.0, m), rng.uniform(0.0, 2.0 * np.pi, m)
+    )
+    return Task(
+        aircraft, D, rotation, reference, rng.choice([-1.0, 1.0], m) * rng.uniform(0.1, 0.3, m)
+    )
 
 
 def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
-    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0, by finite differences."""
+    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0, by
+    finite differences.
+    """
     aircraft, rotation, dt = task.aircraft, task.rotation, 0.01
     m = len(task.D)
 
@@ -97,7 +109,9 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
     z, v = np.zeros(len(rotation) - m), []
     Omega = aircraft.C @ aircraft.B * scale
     for k in range(round(DURATION / dt)):
-        v.append(np.linalg.solve(Omega, task.reference.rate(k * dt) - aircraft.C @ x_free(k * dt, z)[1]))
+        v.append(
+            np.linalg.solve(Omega, task.reference.rate(k * dt) - aircraft.C @ x_free(k * dt, z)[1])
+        )
         z = rk4(z_dot, k * dt, z, None, None, dt)
     slew: FloatArray = np.gradient(np.array(v), dt, axis=0)
     return slew
@@ -106,11 +120,12 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
 def gains(task: Task, sign: Sign) -> LawParams:
     """Gains by rule, last channel first, with V = D U D of the scaled Omega.
 
-    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero; Omega_kk may be zero.
-    K is that of (22): K_m = 10 1/s, k_d,i = 1 + (m - 1) sum_{j>i} V_ij^2 K_j, which makes the symmetric part of V K positive
-    definite: 2 abs(V_ij) K_j abs(r_i r_j) <= (m - 1) V_ij^2 K_j r_i^2 + K_j r_j^2 / (m - 1).
-    beta: (30), with zeta_Nd,i = max abs((D U v*_dot)_i), which is N_d at e = 0, and a margin of a half.
-    Lambda is 2 1/s. omega is over-estimated by 2, because it must not be too small.
+    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero;
+    Omega_kk may be zero. K is that of (22): K_m = 10 1/s, k_d,i = 1 + (m - 1) sum_{j>i} V_ij^2 K_j,
+    which makes the symmetric part of V K positive definite: 2 abs(V_ij) K_j abs(r_i r_j) <= (m - 1)
+    V_ij^2 K_j r_i^2 + K_j r_j^2 / (m - 1). beta: (30), with zeta_Nd,i = max abs((D U v*_dot)_i),
+    which is N_d at e = 0, and a margin of a half. Lambda is 2 1/s. omega is over-estimated by 2,
+    because it must not be too small.
     """
     m = len(task.D)
     Omega = task.aircraft.C @ task.aircraft.B
@@ -125,11 +140,15 @@ def gains(task: Task, sign: Sign) -> LawParams:
         beta[i] = 1.5 * zeta[i] + V[i, i + 1 :] @ beta[i + 1 :]
         k_d[i] = 1.0 + (m - 1) * V[i, i + 1 :] ** 2 @ K[i + 1 :] if i < m - 1 else 0.0
         K[i] = K_min + k_d[i]
-    return law_params(gain(np.array(K_min - 1.0), k_d[:-1]), 2.0, beta, task.D, sign, input_scale=scale, omega=2.0)
+    return law_params(
+        gain(np.array(K_min - 1.0), k_d[:-1]), 2.0, beta, task.D, sign, input_scale=scale, omega=2.0
+    )
 
 
 def fly(task: Task, law: LawParams, dt: float) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above 100, which ends the flight."""
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above 100, which ends the
+    flight.
+    """
     y_m = [task.reference.at(k * dt) for k in range(round(DURATION / dt) + 1)]
     x_0 = task.rotation[:, : len(task.D)] @ (y_m[0] + task.e_0)
     return closed_loop.fly(task.aircraft, law, y_m, dt, bound=100.0, x_0=x_0)
@@ -155,17 +174,21 @@ def test_signs_of_omega_are_as_built(task: Task) -> None:
 @pytest.mark.parametrize(
     ("sign", "largest", "low", "high"),
     [
-        # Measured with 74 aircraft: ratios 3.98 to 4.00, so 3 % is ten times their scatter and excludes any other order.
-        # The ultimate bound at 8 ms is 2e-5 to 1.3e-3, for signals of size 0.2 to 1.
+        # Measured with 74 aircraft: ratios 3.98 to 4.00, so 3 % is ten times their scatter and
+        # excludes any other order. The ultimate bound at 8 ms is 2e-5 to 1.3e-3, for signals of
+        # size 0.2 to 1.
         pytest.param(Sign.IMPLICIT, 0.005, 3.88, 4.12, id="implicit sign, with the square of dt"),
-        # A chaotic limit cycle: measured with 74 aircraft, ratios are 1.4 to 2.5 with a mean of 1.9. No improvement would be 1,
-        # second order 4. The ultimate bound at 8 ms is 6e-4 to 0.032.
+        # A chaotic limit cycle: measured with 74 aircraft, ratios are 1.4 to 2.5 with a mean of
+        # 1.9. No improvement would be 1, second order 4. The ultimate bound at 8 ms is 6e-4 to
+        # 0.032.
         pytest.param(Sign.LITERAL, 0.1, 1.2, 3.2, id="literal sign, with dt"),
     ],
 )
 @settle
 @given(task=TASKS)
-def test_the_ultimate_bound_falls_with_dt(sign: Sign, largest: float, low: float, high: float, task: Task) -> None:
+def test_the_ultimate_bound_falls_with_dt(
+    sign: Sign, largest: float, low: float, high: float, task: Task
+) -> None:
     law = gains(task, sign)
     coarse, fine = ultimate_bound(task, law, DT), ultimate_bound(task, law, DT / 2)
     assert coarse < largest
@@ -175,11 +198,16 @@ def test_the_ultimate_bound_falls_with_dt(sign: Sign, largest: float, low: float
 @settle
 @given(task=TASKS)
 def test_error_decreases_from_engagement_to_ultimate_bound(task: Task) -> None:
-    # Largest errors in the first second, in the third, and after 5 s. exp(-Lambda t) is 0.018 at 2 s, and the sign term is
-    # faster: measured with 150 aircraft at most 0.005 in the third second, often the ultimate bound, and 0.006 after 5 s.
+    # Largest errors in the first second, in the third, and after 5 s. exp(-Lambda t) is 0.018 at 2
+    # s, and the sign term is faster: measured with 150 aircraft at most 0.005 in the third second,
+    # often the ultimate bound, and 0.006 after 5 s.
     errors = np.abs(fly(task, gains(task, Sign.IMPLICIT), DT)).max(axis=1)
     second = round(1.0 / DT)
-    first, third, settled = errors[:second].max(), errors[2 * second : 3 * second].max(), errors[5 * second :].max()
+    first, third, settled = (
+        errors[:second].max(),
+        errors[2 * second : 3 * second].max(),
+        errors[5 * second :].max(),
+    )
     assert third < 0.02 * first
     assert settled < 0.02 * first
 
@@ -187,8 +215,9 @@ def test_error_decreases_from_engagement_to_ultimate_bound(task: Task) -> None:
 @settle
 @given(task=TASKS, flipped=st.integers(0, 3))
 def test_one_wrong_sign_in_d_diverges(task: Task, flipped: int) -> None:
-    # An odd number of wrong signs makes det(Omega D K Lambda) < 0, so the loop has a real unstable pole. Diverged: an error
-    # above 100, a hundred times the largest reference, within the 8 s after which the right D has settled.
+    # An odd number of wrong signs makes det(Omega D K Lambda) < 0, so the loop has a real unstable
+    # pole. Diverged: an error above 100, a hundred times the largest reference, within the 8 s
+    # after which the right D has settled.
     assume(flipped < len(task.D))
     law = gains(task, Sign.IMPLICIT)
     wrong = law._replace(D=np.where(np.arange(len(task.D)) == flipped, -task.D, task.D))

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No event in any mode makes u jump: u of the controller, u that the aircraft applies, and u that a bridge sends.
+"""No event in any mode makes u jump: u of the controller, u that the aircraft applies, and u that a
+bridge sends.
 
 u of the controller moves by a step of the law, by the ramp to trim or by the rate limit.
 """
@@ -49,7 +50,10 @@ class Loop:
         self._now_ns, self._last_ns = nanoseconds(1.0), 0
         self._active, self._has_y, self._has_y_m, self._offset = True, True, True, 0.0
         self._u, self._u_ns, self._e, self._beyond = np.zeros(4), 0, np.zeros(4), np.zeros(4)
-        self._ramp = np.zeros(4), 0.0  # of the present failsafe: the largest abs(u), and the time to trim, s
+        self._ramp = (
+            np.zeros(4),
+            0.0,
+        )  # of the present failsafe: the largest abs(u), and the time to trim, s
         self._was_active = True  # at the last tick
         self._silent_ns = 0  # time without u
         self._dt = 0.0
@@ -98,10 +102,14 @@ class Loop:
     def ticks(self, count: int) -> None:
         """Run ticks."""
         for _ in range(count):
-            for instant_ns in self._controller.overrun(self._last_ns, self._now_ns) if self._last_ns else ():
+            for instant_ns in (
+                self._controller.overrun(self._last_ns, self._now_ns) if self._last_ns else ()
+            ):
                 self._tick(instant_ns)
             if self._has_y:
-                self._controller.take_y(StampedVector(self._now_ns, np.full(4, Y + self._offset)), self._now_ns)
+                self._controller.take_y(
+                    StampedVector(self._now_ns, np.full(4, Y + self._offset)), self._now_ns
+                )
             if self._has_y_m:
                 self._controller.take_y_m(StampedVector(self._now_ns, np.zeros(4)), self._now_ns)
             self._tick(self._now_ns)
@@ -115,7 +123,8 @@ class Loop:
             self._silent_ns += self._controller.period_ns
             silent = self._u.any() and seconds(self._silent_ns) > self._scenario.controller.max_age
             assert not silent, (
-                f"{self.mode.name}: u is {self._u} and not published, so that the aircraft starts its own failsafe"
+                f"{self.mode.name}: u is {self._u} and not published, so that the aircraft "
+                "starts its own failsafe"
             )
             return
         self._silent_ns = 0
@@ -123,23 +132,38 @@ class Loop:
             self._ramp = np.abs(self._u), self._scenario.controller.ramp
         self._was_active = self._active
         if self.mode is Mode.ENGAGED:
-            allowed = self._step_of_the_law(dict(zip(self._controller.names, output.internals, strict=True)))
+            allowed = self._step_of_the_law(
+                dict(zip(self._controller.names, output.internals, strict=True))
+            )
         else:
             u, ramp = self._ramp
             allowed = u * min(seconds(now_ns - self._u_ns) / ramp, 1.0)
         du = np.abs(output.u - self._u)
-        assert (du <= allowed + EXACT).all(), f"{before.name} -> {self.mode.name}: u moves by {du}, above {allowed}"
+        assert (du <= allowed + EXACT).all(), (
+            f"{before.name} -> {self.mode.name}: u moves by {du}, above {allowed}"
+        )
         self._u, self._u_ns = output.u, now_ns
 
     def _step_of_the_law(self, logged: Mapping[str, float]) -> FloatArray:
-        """The largest change of u in a tick of dt, e_p the error one tick ago; 0 at an engagement, where dt is 0.
+        """The largest change of u in a tick of dt, e_p the error one tick ago; 0 at an engagement,
+        where dt is 0.
 
-        input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta), equation (23), and what the limits kept back one tick
-        ago; but at most SLEW dt. SLEW dt where u is outside of new limits.
+        input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta), equation (23), and what
+        the limits kept back one tick ago; but at most SLEW dt. SLEW dt where u is outside of new
+        limits.
         """
-        law, limits = self._scenario.rise_di().law_params(), self._scenario.controller.guard().limits
-        e_p, self._e = self._e, np.array([logged[f"e.{name}"] for name in SCENARIO.controller.outputs])
-        u, u_free = (np.array([logged[f"{key}.{name}"] for name in SCENARIO.controller.inputs]) for key in ("u", "u_free"))
+        law, limits = (
+            self._scenario.rise_di().law_params(),
+            self._scenario.controller.guard().limits,
+        )
+        e_p, self._e = (
+            self._e,
+            np.array([logged[f"e.{name}"] for name in SCENARIO.controller.outputs]),
+        )
+        u, u_free = (
+            np.array([logged[f"{key}.{name}"] for name in SCENARIO.controller.inputs])
+            for key in ("u", "u_free")
+        )
         beyond, self._beyond = self._beyond, np.abs(u_free - u)
         self._dt = dt = logged["dt"]
         change = self._e - e_p + law.Lambda * dt * (self._e + e_p) / 2.0
@@ -220,7 +244,9 @@ def test_no_event_makes_u_jump(state: str, event: str) -> None:
     policy=st.sampled_from(["trim", "hold"]),
     events=st.lists(st.tuples(st.sampled_from([*EVENTS]), st.integers(0, 12)), max_size=20),
 )
-@example(policy="trim", events=[("y lost", 1), ("configured and activated", 10)])  # stale before the law engages again
+@example(
+    policy="trim", events=[("y lost", 1), ("configured and activated", 10)]
+)  # stale before the law engages again
 def test_no_sequence_of_events_makes_u_jump(policy: str, events: list[tuple[str, int]]) -> None:
     loop = engaged(on_deactivate=policy)
     for name, count in events:
@@ -243,7 +269,9 @@ HELD, RAMP = 0.25, 0.4  # s, of the failsafe of the aircraft; HELD includes the 
 STEP = 0.005  # s, of the aircraft
 PUBLISHED = {"first": 0.1, "restarted": -0.1, "standby": 0.05}  # u, constant, by publisher
 LARGEST = 0.1
-FADING = (LARGEST + 2.0 * LARGEST) * STEP / RAMP  # largest step of u: the ramp to trim, and the fading offset of a transfer
+FADING = (
+    (LARGEST + 2.0 * LARGEST) * STEP / RAMP
+)  # largest step of u: the ramp to trim, and the fading offset of a transfer
 
 
 class Applied:
@@ -255,7 +283,9 @@ class Applied:
         self.u: list[float] = []
 
     def fly(self, duration: float, publisher: str | None = None, u: float | None = None) -> None:
-        """Fly with the messages of a publisher, None: without messages. `u`: in place of the u of PUBLISHED."""
+        """Fly with the messages of a publisher, None: without messages. `u`: in place of the u of
+        PUBLISHED.
+        """
         for _ in range(round(duration / STEP)):
             now_ns = nanoseconds(self._number * STEP)
             if publisher is not None and self._number % 2 == 0:
@@ -266,10 +296,14 @@ class Applied:
             self._number += 1
 
 
-@pytest.mark.parametrize("silence", [0.0, 0.1, 0.3, 0.5, 1.0])  # s: in time, held, in the ramp twice, at trim
+@pytest.mark.parametrize(
+    "silence", [0.0, 0.1, 0.3, 0.5, 1.0]
+)  # s: in time, held, in the ramp twice, at trim
 @pytest.mark.parametrize("publisher", ["first", "restarted"])
 def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
-    """A publisher goes on with another u after the ramp has begun, a restarted publisher at any time."""
+    """A publisher goes on with another u after the ramp has begun, a restarted publisher at any
+    time.
+    """
     u = PUBLISHED["first" if publisher == "first" and silence < HELD else "restarted"]
     aircraft = Applied()
     aircraft.fly(1.0, "first")
@@ -281,7 +315,9 @@ def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([None, *PUBLISHED]), st.integers(1, 150)), max_size=20))
-def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(parts: list[tuple[str | None, int]]) -> None:
+def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(
+    parts: list[tuple[str | None, int]],
+) -> None:
     aircraft = Applied()
     for publisher, steps in parts:
         aircraft.fly(steps * STEP, publisher)
@@ -292,7 +328,9 @@ def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(parts: list
 
 @pytest.mark.parametrize("duration", [0.05, 0.12, 0.2, 1.0])
 def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
-    """With equal age limit, hold and ramp, u of controller and aircraft are equal within two periods of the ramp."""
+    """With equal age limit, hold and ramp, u of controller and aircraft are equal within two
+    periods of the ramp.
+    """
     loop = engaged()
     before, guard = loop.u, SCENARIO.controller.guard()
     aircraft = AppliedInput(4, guard.max_age_ns + guard.hold_ns, guard.ramp_ns)
@@ -301,7 +339,9 @@ def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
     loop.receive(y=False, y_m=False)
     loop.ticks(1)
     late = np.abs(before) * 2 * guard.period_ns / guard.ramp_ns
-    assert (np.abs(loop.u - aircraft.u_at(nanoseconds(duration) + guard.period_ns)) <= late + EXACT).all()
+    assert (
+        np.abs(loop.u - aircraft.u_at(nanoseconds(duration) + guard.period_ns)) <= late + EXACT
+    ).all()
 
 
 # The bridge
@@ -312,7 +352,8 @@ COMMANDED = 1.5  # u of the active controller, beyond the limits of each input o
 
 
 class Engagement:
-    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u, far from trim while ENGAGED.
+    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u, far from
+    trim while ENGAGED.
 
     The node of the bridge activates the controller at an engagement. Each sent u is checked.
     """
@@ -324,8 +365,13 @@ class Engagement:
         self.bridge = Bridge(self._map, dry_run=False)
         self.receives = {"y": True, "u": True, "conflicting u": False}
         self._t = 0.0
-        self._u, self._received_t = 0.0, 0.0  # of the controller, and the instant of the last u that the bridge took
-        self._sent: tuple[FloatArray, float] | None = None  # the last u sent while ENGAGED, and the instant of receipt
+        self._u, self._received_t = (
+            0.0,
+            0.0,
+        )  # of the controller, and the instant of the last u that the bridge took
+        self._sent: tuple[FloatArray, float] | None = (
+            None  # the last u sent while ENGAGED, and the instant of receipt
+        )
 
     def ticks(self, count: int) -> None:
         """Run ticks."""
@@ -367,15 +413,25 @@ class Engagement:
             resting = [row.neutral if phase is Phase.NEUTRAL else row.release for row in rows]
             np.testing.assert_array_equal(raw, np.array(resting))
             return
-        u = np.array([to_channel(raw_i, row.line) - row.trim for raw_i, row in zip(raw.tolist(), rows, strict=True)])
+        u = np.array(
+            [
+                to_channel(raw_i, row.line) - row.trim
+                for raw_i, row in zip(raw.tolist(), rows, strict=True)
+            ]
+        )
         lower, upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
         assert ((u >= lower - EXACT) & (u <= upper + EXACT)).all()
         # From trim at the engagement, and by the controller in the tick after.
         allowed = self._map.engage_within * np.where(u > 0.0, upper, -lower) + RATE * TICK
         du = u
         if self._sent is not None:
-            du, allowed = u - self._sent[0], np.full(len(rows), RATE * (self._received_t - self._sent[1]))
-        assert (np.abs(du) <= allowed + EXACT).all(), f"u sent to the autopilot moves by {du}, above {allowed}"
+            du, allowed = (
+                u - self._sent[0],
+                np.full(len(rows), RATE * (self._received_t - self._sent[1])),
+            )
+        assert (np.abs(du) <= allowed + EXACT).all(), (
+            f"u sent to the autopilot moves by {du}, above {allowed}"
+        )
         self._sent = u, self._received_t
 
 
@@ -396,7 +452,9 @@ REQUESTS: Mapping[str, Callable[[Engagement], object]] = {
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([*REQUESTS]), st.integers(0, 25)), max_size=30))
 @example([("engage", 2), ("u", 3), ("u", 4)])  # u returns within the age limit
-@example([("engage", 3), ("u", 3), ("conflicting u", 9), ("engage", 9)])  # a second publisher at the timeout of u
+@example(
+    [("engage", 3), ("u", 3), ("conflicting u", 9), ("engage", 9)]
+)  # a second publisher at the timeout of u
 def test_no_sequence_of_events_makes_sent_u_jump(events: list[tuple[str, int]]) -> None:
     loop = Engagement()
     loop.ticks(1)

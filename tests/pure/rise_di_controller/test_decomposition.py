@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Omega = S D U: the factors, the dependence of D, refusals, and the pairing of channels with D = I."""
+"""Omega = S D U: the factors, the dependence of D, refusals, and the pairing of channels with D =
+I.
+"""
 
 import math
 
@@ -73,7 +75,8 @@ EXCHANGE = np.array([[0.0, 1.0], [1.0, 0.0]])
 def test_factors_have_structure_that_paper_requires(Omega: FloatArray) -> None:
     S, D, U = decomposed(Omega)
     assert np.array_equal(S, S.T)
-    # A Cholesky factor exists only for positive definite matrices; the shift is the rounding of the entries of S.
+    # A Cholesky factor exists only for positive definite matrices; the shift is the rounding of the
+    # entries of S.
     np.linalg.cholesky(S + EPSILON * len(S) * np.diag(np.diag(S)))
     assert set(D) <= {-1.0, 1.0}
     assert np.array_equal(U, np.triu(U))
@@ -85,7 +88,8 @@ def test_factors_have_structure_that_paper_requires(Omega: FloatArray) -> None:
 def test_product_of_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
     sdu = decomposed(Omega)
     residual = np.linalg.norm(product(sdu) - Omega)
-    # The largest of 20 000 random matrices with up to 6 channels and entries over 6 decades was 1.0; the bound is 10.
+    # The largest of 20 000 random matrices with up to 6 channels and entries over 6 decades was
+    # 1.0; the bound is 10.
     assert residual <= 10.0 * len(Omega) * EPSILON * np.linalg.norm(sdu.S) * np.linalg.norm(sdu.U)
 
 
@@ -93,8 +97,11 @@ def test_product_of_factors_is_omega_to_machine_precision(Omega: FloatArray) -> 
 @given(factors())
 def test_unique_factors_are_recovered_from_their_product(known: SDU) -> None:
     recovered = decompose(product(known))
-    # S has eigenvalues in [1, 101]: rounding is amplified by far less than 1e6, which a tolerance of 1e-10 allows.
-    np.testing.assert_allclose(recovered.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S)))
+    # S has eigenvalues in [1, 101]: rounding is amplified by far less than 1e6, which a tolerance
+    # of 1e-10 allows.
+    np.testing.assert_allclose(
+        recovered.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S))
+    )
     np.testing.assert_array_equal(recovered.D, known.D)
     np.testing.assert_allclose(recovered.U, known.U, atol=1e-10 * float(np.max(known.S)))
 
@@ -118,10 +125,13 @@ def test_sign_change_of_input_changes_own_d_only(Omega: FloatArray, data: st.Dat
 @given(matrices(), st.data())
 def test_units_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
     """D is independent of the units of inputs and outputs."""
-    # Far from the limit of 1e-9, which holds for equilibrated units and changes by a factor with other units.
+    # Far from the limit of 1e-9, which holds for equilibrated units and changes by a factor with
+    # other units.
     D = decomposed(Omega).D
     assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
-    units = arrays(np.float64, len(Omega), elements=st.sampled_from([1e-3, 0.01, 0.3048, 1.0, 57.3, 1e4]))
+    units = arrays(
+        np.float64, len(Omega), elements=st.sampled_from([1e-3, 0.01, 0.3048, 1.0, 57.3, 1e4])
+    )
     np.testing.assert_array_equal(signs(data.draw(units)[:, None] * Omega * data.draw(units)), D)
 
 
@@ -134,12 +144,15 @@ def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None
     outputs, inputs, input_signs, U = pairing
     rearranged = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
     np.testing.assert_array_equal(signs(rearranged), np.ones(len(Omega)))
-    np.testing.assert_allclose(decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U))))
+    np.testing.assert_allclose(
+        decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U)))
+    )
 
 
 @pytest.mark.equation(10, 11)
 def test_positive_diagonal_does_not_make_d_one() -> None:
-    # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D W.
+    # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D
+    # W.
     S, D, U = decompose(np.array([[1.0, 2.0], [2.0, 1.0]]))
     np.testing.assert_array_equal(S, [[1.0, 2.0], [2.0, 7.0]])
     np.testing.assert_array_equal(D, [1.0, -1.0])
@@ -148,7 +161,9 @@ def test_positive_diagonal_does_not_make_d_one() -> None:
 
 def test_omega_without_s_d_u_refused() -> None:
     """A nonsingular Omega with a zero leading minor is refused with the number of the minor."""
-    with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
+    with pytest.raises(
+        DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*"
+    ) as caught:
         decompose(EXCHANGE)
     assert caught.value.minor == 1
     assert isinstance(caught.value, ParameterError)
@@ -161,7 +176,10 @@ def test_omega_without_s_d_u_refused() -> None:
         ([[1e-17, 1.0], [1.0, 0.0]], 1),  # zero up to rounding
         ([[1.0, 1.0], [1.0, 1.0]], 2),
         ([[1.0, 1.0], [1.0, 1.0 + 1e-12]], 2),
-        ([[1.0, 0.1, 0.0], [0.1, 0.01, 1.0], [0.0, 1.0, 1.0]], 2),  # 0.1 * 0.1 is not 0.01 in floating point
+        (
+            [[1.0, 0.1, 0.0], [0.1, 0.01, 1.0], [0.0, 1.0, 1.0]],
+            2,
+        ),  # 0.1 * 0.1 is not 0.01 in floating point
         ([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]], 3),
     ],
 )
@@ -188,7 +206,8 @@ def test_matrix_not_square_or_finite_refused(Omega: FloatArray, sentence: str) -
 
 
 def test_osprey_has_identity_d_and_little_coupling() -> None:
-    # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe file.
+    # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe
+    # file.
     np.testing.assert_array_equal(signs(OSPREY), [1.0, 1.0, 1.0, 1.0])
     assert coupling(OSPREY) == pytest.approx(0.058, abs=5e-4)
 

@@ -24,11 +24,15 @@ LEARNED = np.array([True])
         ((0.2, 0.05), True),
     ],
 )
-def test_divergence_is_three_times_the_error_before(errors: tuple[float, float], expected: bool) -> None:
+def test_divergence_is_three_times_the_error_before(
+    errors: tuple[float, float], expected: bool
+) -> None:
     now, largest = (np.array([value**2, 0.0]) for value in errors)
     state, least = divergence.Errors(now, largest), divergence.least(("q", "V"))
     assert divergence.diverging(state, least, np.array([True, True])).tolist() == [expected, False]
-    assert not divergence.diverging(state, least, np.array([False, True])).any()  # q flies the law of the start
+    assert not divergence.diverging(
+        state, least, np.array([False, True])
+    ).any()  # q flies the law of the start
 
 
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
@@ -46,8 +50,12 @@ def noise(frequency: float, damping: float) -> FloatArray:
     return np.asarray(x / np.std(x))
 
 
-def flown(e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = BEFORE) -> divergence.Oscillations:
-    """The error of 20 s of the law of the start, then e under a learned model, until an oscillation is found."""
+def flown(
+    e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = BEFORE
+) -> divergence.Oscillations:
+    """The error of 20 s of the law of the start, then e under a learned model, until an oscillation
+    is found.
+    """
     found = divergence.Oscillations(divergence.least(("q",)))
     for value in before * noise(1.0, 0.5)[:2000]:
         found.take(np.array([value]), DT, None)
@@ -61,7 +69,9 @@ def flown(e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = B
 @pytest.mark.parametrize("frequency", [0.5, 1.7, 4.6])
 def test_limit_cycle_is_found_with_its_period(frequency: float) -> None:
     e = 0.06 * np.sqrt(2.0) * np.sin(2.0 * np.pi * frequency * T) + 0.015 * noise(1.0, 0.5)
-    assert flown(e).periods == pytest.approx(1.0 / frequency, rel=0.1)  # samples of 20 ms, and noise
+    assert flown(e).periods == pytest.approx(
+        1.0 / frequency, rel=0.1
+    )  # samples of 20 ms, and noise
 
 
 def test_limit_cycle_is_found_within_the_record_and_forgotten_by_the_law_of_the_start() -> None:
@@ -76,7 +86,8 @@ def test_limit_cycle_is_found_within_the_record_and_forgotten_by_the_law_of_the_
 @pytest.mark.parametrize(
     "e",
     [
-        0.06 * noise(1.0, 0.3),  # turbulence; a loop with a phase margin of 35 deg has a damping of 0.3
+        0.06
+        * noise(1.0, 0.3),  # turbulence; a loop with a phase margin of 35 deg has a damping of 0.3
         0.06 * noise(3.0, 0.3),
         0.1 * (np.sin(2.0 * np.pi * T / 4.7) > 0.95),  # gusts, one every 4.7 s
         0.06 * np.sign(np.sin(2.0 * np.pi * T / 12.0)),  # the sign of a bias
@@ -90,5 +101,7 @@ def test_wind_and_small_oscillations_are_none(e: FloatArray) -> None:
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.05, True), (0.02, False)])
 def test_record_oscillates_by_more_than_is_harmless(amplitude: float, expected: bool) -> None:
     """Harmless is an rms of 0.02 rad/s, an amplitude of 0.028."""
-    y = np.stack([amplitude * np.sin(2.0 * np.pi * 2.2 * T), RANDOM.normal(0.0, 1.0, len(T))], axis=1)
+    y = np.stack(
+        [amplitude * np.sin(2.0 * np.pi * 2.2 * T), RANDOM.normal(0.0, 1.0, len(T))], axis=1
+    )
     assert divergence.oscillating(y, divergence.least(("q", "p"))).tolist() == [expected, False]

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bumpless transfer in flight: engagement, re-engagement and new gains do not make u jump, and tracking recovers.
+"""Bumpless transfer in flight: engagement, re-engagement and new gains do not make u jump, and
+tracking recovers.
 
-The servos are those of scenario osprey_servo, without noise, with sines as commands, at 100 Hz and in steps of 5 ms. The
-loop calls the controller as the node does. Events happen at ten random instants, one in each 4 s of 40 s.
+The servos are those of scenario osprey_servo, without noise, with sines as commands, at 100 Hz and
+in steps of 5 ms. The loop calls the controller as the node does. Events happen at ten random
+instants, one in each 4 s of 40 s.
 """
 
 from collections.abc import Callable
@@ -27,19 +29,27 @@ from rise_di_controller.params import ControllerConfig
 pytestmark = pytest.mark.slow
 
 PERIOD_NS = 10_000_000
-SINES = {  # u always moves; p is small, because the bank that builds up without control loads the rudder
+# u always moves; p is small, because the bank that builds up without control loads the rudder
+SINES = {
     "q": {"amplitude": 0.1, "frequency": 1.0},
     "V": {"amplitude": 1.0, "frequency": 0.3},
     "p": {"amplitude": 0.1, "frequency": 0.8, "phase": 0.4},
     "r": {"amplitude": 0.02, "frequency": 1.3},
 }
-SERVO = CALM_SERVO.vary(flight={"duration": 40.0}, reference_model={"pulses": {}, "coordinated_turn": None, "sines": SINES})
+SERVO = CALM_SERVO.vary(
+    flight={"duration": 40.0},
+    reference_model={"pulses": {}, "coordinated_turn": None, "sines": SINES},
+)
 AIRFRAME, _ = SERVO.aircraft.load()
-OUTPUTS = [AIRFRAME.outputs.index(name) for name in SERVO.controller.outputs]  # from the airframe's order to the law's
+OUTPUTS = [
+    AIRFRAME.outputs.index(name) for name in SERVO.controller.outputs
+]  # from the airframe's order to the law's
 INPUTS = [SERVO.controller.inputs.index(name) for name in AIRFRAME.inputs]  # and back
 LIMITS = SERVO.controller.guard().limits
 RANGE = LIMITS.upper - LIMITS.lower  # 60 deg and 100 %
-ROUNDING = 1e-12 * RANGE  # u is a sum of about ten terms within its range, each with a rounding error of 1e-16 of it
+ROUNDING = (
+    1e-12 * RANGE
+)  # u is a sum of about ten terms within its range, each with a rounding error of 1e-16 of it
 
 
 class Conditions(NamedTuple):
@@ -81,7 +91,11 @@ def fly(
     New parameters are taken between two ticks by `guard.retune`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
-    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), conditions(0).parameters.tuned_law()
+    aircraft, state, old = (
+        plant.initial_state(hardware),
+        guard.initial_state(4),
+        conditions(0).parameters.tuned_law(),
+    )
     aircraft = aircraft if x_0 is None else aircraft._replace(x=x_0)
     y: StampedVector | None = None
     samples: list[StampedVector] = []
@@ -89,14 +103,18 @@ def fly(
     for k, reference in enumerate(references() if y_m is None else y_m):
         now_ns, now = k * PERIOD_NS, conditions(k)
         if k > 0:
-            aircraft = plant.advance(now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware)
+            aircraft = plant.advance(
+                now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware
+            )
         measured = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
         y = StampedVector(now_ns, measured) if now.y else y
         samples = [*samples[-15:], StampedVector(now_ns, reference)] if now.y_m else samples
         before, law = state, now.parameters.tuned_law()
         if now.parameters != conditions(max(k - 1, 0)).parameters:
             state = guard.retune(state, old, law)
-        state, inputs = guard.tick(state, now_ns, y, samples, now.parameters.guard(), law, now.active)
+        state, inputs = guard.tick(
+            state, now_ns, y, samples, now.parameters.guard(), law, now.active
+        )
         if k == 0 and not latched and state.law is not None:
             state = state._replace(law=state.law._replace(e_0=np.zeros(4)))
         dt = inputs.dt if inputs is not None else 0.0
@@ -107,22 +125,32 @@ def fly(
 
 def instants(seed: int) -> list[int]:
     """Ten random ticks, one in the first 1.5 s of each 4 s, so that 2.5 s remain for the event."""
-    return [400 * i + int(offset) for i, offset in enumerate(np.random.default_rng(seed).integers(10, 150, 10))]
+    return [
+        400 * i + int(offset)
+        for i, offset in enumerate(np.random.default_rng(seed).integers(10, 150, 10))
+    ]
 
 
 def step_of_the_law(tick: Tick) -> FloatArray:
-    """Largest change of u by (23) in a tick: input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta)."""
+    """Largest change of u by (23) in a tick: input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2)
+    + dt beta).
+    """
     assert tick.before.law is not None
     assert tick.after.law is not None
     law, e, e_p = tick.new, tick.after.law.e, tick.before.law.e
-    # The literal sign uses Pi before its update, so the last increment before a change of the gains is still pending.
+    # The literal sign uses Pi before its update, so the last increment before a change of the gains
+    # is still pending.
     beta = np.maximum(tick.old.beta, law.beta)
-    change: FloatArray = law.input_scale * (law.K * np.abs(e - e_p + law.Lambda * tick.dt * (e + e_p) / 2.0) + tick.dt * beta)
+    change: FloatArray = law.input_scale * (
+        law.K * np.abs(e - e_p + law.Lambda * tick.dt * (e + e_p) / 2.0) + tick.dt * beta
+    )
     return change
 
 
 def assert_no_jumps(records: list[Tick]) -> None:
-    """Check that u changes only by a step of the law or by the ramp to trim, and not at all at an engagement."""
+    """Check that u changes only by a step of the law or by the ramp to trim, and not at all at an
+    engagement.
+    """
     for tick in records:
         if tick.after.mode is Mode.ENGAGED:
             allowed = step_of_the_law(tick) if tick.before.mode is Mode.ENGAGED else np.zeros(4)
@@ -138,17 +166,23 @@ def engagements(records: list[Tick]) -> list[int]:
 
 
 def assert_bumpless_re_engagement(records: list[Tick], modes: set[Mode]) -> None:
-    """Ten re-engagements from these modes without a jump of u, after each of which tracking recovers.
+    """Ten re-engagements from these modes without a jump of u, after each of which tracking
+    recovers.
 
-    One second after each engagement q, p and r are close to the undisturbed flight; V, which is slower, is nearer to it.
-    Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120 mrad/s and 0.9 m/s at engagement.
+    One second after each engagement q, p and r are close to the undisturbed flight; V, which is
+    slower, is nearer to it. Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120
+    mrad/s and 0.9 m/s at engagement.
     """
     engaged = engagements(records)
     assert len(engaged) == 10
     assert {records[k].before.mode for k in engaged} == modes
     assert_no_jumps(records)
-    deviation = np.array([np.abs(tick.error - calm.error) for tick, calm in zip(records, undisturbed(), strict=True)])
-    assert (deviation[engaged].max(axis=0) > [0.05, 0.04, 0.03, 0.3]).all()  # there is an error to recover from
+    deviation = np.array(
+        [np.abs(tick.error - calm.error) for tick, calm in zip(records, undisturbed(), strict=True)]
+    )
+    assert (
+        deviation[engaged].max(axis=0) > [0.05, 0.04, 0.03, 0.3]
+    ).all()  # there is an error to recover from
     assert (deviation[np.array(engaged) + 100].max(axis=0) < [0.005, 0.005, 0.005, 0.5]).all()
 
 
@@ -160,7 +194,10 @@ def undisturbed() -> list[Tick]:
 def test_loop_equals_simulation_to_last_bit() -> None:
     """The loop of this file gives the bits of the simulation."""
     u = simulate(SERVO.vary(flight={"duration": 3.0}))["u"]
-    assert np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes() == u.values.tobytes()
+    assert (
+        np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes()
+        == u.values.tobytes()
+    )
 
 
 def test_re_engagement_after_stale_inputs_is_bumpless() -> None:
@@ -168,10 +205,14 @@ def test_re_engagement_after_stale_inputs_is_bumpless() -> None:
     rng = np.random.default_rng(11)
     lost = {
         k: bool(y_lost)
-        for begin, length, y_lost in zip(instants(1), rng.integers(20, 150, 10), rng.integers(0, 2, 10), strict=True)
+        for begin, length, y_lost in zip(
+            instants(1), rng.integers(20, 150, 10), rng.integers(0, 2, 10), strict=True
+        )
         for k in range(begin, begin + int(length))
     }
-    records = fly(lambda k: Conditions(y=k not in lost or not lost[k], y_m=k not in lost or lost[k]))
+    records = fly(
+        lambda k: Conditions(y=k not in lost or not lost[k], y_m=k not in lost or lost[k])
+    )
     assert_bumpless_re_engagement(records, {Mode.HOLD, Mode.RAMP})
 
 
@@ -180,7 +221,11 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
     # The controller is inactive for 0.01 to 1.5 s.
     parameters = SERVO.vary(controller={"on_deactivate": policy}).controller
     lengths = np.random.default_rng(12).integers(1, 150, 10)
-    off = {k for begin, length in zip(instants(2), lengths, strict=True) for k in range(begin, begin + int(length))}
+    off = {
+        k
+        for begin, length in zip(instants(2), lengths, strict=True)
+        for k in range(begin, begin + int(length))
+    }
     records = fly(lambda k: Conditions(active=k not in off, parameters=parameters))
     assert_bumpless_re_engagement(records, {Mode.INACTIVE})
 
@@ -191,14 +236,18 @@ def gains(rng: np.random.Generator, sign: str) -> ControllerConfig:
     for key in ("k_d", "Lambda", "beta"):
         values = np.array(getattr(section, key))
         changes[key] = (values * rng.uniform(0.6, 1.4, len(values))).tolist()
-    return SERVO.vary(controller=changes | {"k_g": section.k_g * float(rng.uniform(0.6, 1.4)), "sign": sign}).controller
+    return SERVO.vary(
+        controller=changes | {"k_g": section.k_g * float(rng.uniform(0.6, 1.4)), "sign": sign}
+    ).controller
 
 
 @pytest.mark.parametrize("sign", ["soft", "implicit", "literal"])
 def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
     changes, rng = instants(3), np.random.default_rng(13)
     sets = [SERVO.vary(controller={"sign": sign}).controller, *(gains(rng, sign) for _ in changes)]
-    records = fly(lambda k: Conditions(parameters=sets[int(np.searchsorted(changes, k, side="right"))]))
+    records = fly(
+        lambda k: Conditions(parameters=sets[int(np.searchsorted(changes, k, side="right"))])
+    )
     assert engagements(records) == []
     without = []
     for k in changes:
@@ -210,9 +259,9 @@ def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
         without.append((np.abs(control(before, before, tick.new) - u) / RANGE).max())
     assert max(without) > 0.005  # without `retune`, u would jump by more than 0.5 % of its range
     assert_no_jumps(records)
-    # Measured rms of q, p, r, V: soft 3.6, 2.6, 4.2 mrad/s, 0.10 m/s (3.7, 2.7, 4.2, 0.10 with the same gains throughout),
-    # implicit 4.9, 6.9, 8.8, 0.15 (5.2, 6.8, 8.2, 0.14), literal 13, 19, 22, 0.19 (14, 19, 21, 0.18): with servos these two
-    # chatter for any gains.
+    # Measured rms of q, p, r, V: soft 3.6, 2.6, 4.2 mrad/s, 0.10 m/s (3.7, 2.7, 4.2, 0.10 with the
+    # same gains throughout), implicit 4.9, 6.9, 8.8, 0.15 (5.2, 6.8, 8.2, 0.14), literal 13, 19,
+    # 22, 0.19 (14, 19, 21, 0.18): with servos these two chatter for any gains.
     rms = np.sqrt(np.mean([tick.error**2 for tick in records], axis=0))
     bounds = {
         "soft": [0.005, 0.005, 0.007, 0.16],
@@ -222,13 +271,16 @@ def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
     assert (rms < bounds[sign]).all()
 
 
-# Engaging with e(0) = (0.1 rad/s, 2 m/s, 0.2 rad/s, 0.1 rad/s) in q, V, p, r: the aircraft starts off trim, y_m = 0.
+# Engaging with e(0) = (0.1 rad/s, 2 m/s, 0.2 rad/s, 0.1 rad/s) in q, V, p, r: the aircraft starts
+# off trim, y_m = 0.
 OFF_TRIM = {"q": 0.1, "V": 2.0, "p": 0.2, "r": 0.1}
 
 
 @cache
 def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
-    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order. Without latching e_0 is 0."""
+    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order. Without latching e_0 is
+    0.
+    """
     x = np.zeros(len(AIRFRAME.states))
     for name, value in OFF_TRIM.items():
         x[AIRFRAME.index(name)] = value
@@ -237,8 +289,9 @@ def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
 
 
 def test_engagement_with_error_commands_zero_at_first_tick() -> None:
-    # Measured at the second tick, 10 ms later, of elevator, aileron, rudder, thrust: 0.06, 0.02, 0.49 deg, 0.8 %; without
-    # latching 1.9, 2.4, 5.8 deg and the limit of 50 %. The prototype: 2.55, 2.7, 7.1 deg, 100 %.
+    # Measured at the second tick, 10 ms later, of elevator, aileron, rudder, thrust: 0.06, 0.02,
+    # 0.49 deg, 0.8 %; without latching 1.9, 2.4, 5.8 deg and the limit of 50 %. The prototype:
+    # 2.55, 2.7, 7.1 deg, 100 %.
     _, u = upset(latched=True)
     _, without = upset(latched=False)
     assert u[0].tolist() == [0.0] * 4
@@ -248,9 +301,10 @@ def test_engagement_with_error_commands_zero_at_first_tick() -> None:
 
 
 def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
-    # Measured overshoot of q, p, r, V in % of e(0): 1.2, 0.7, 25, 20, without latching 25, 22, 49, 26; peak of elevator,
-    # aileron, rudder, thrust: 0.25, 0.15, 3.1 deg, 32 %, without 1.9, 2.4, 6.5 deg, 50 % (its limit). The prototype,
-    # possibly with another initial state: 4 to 12 %, without 16 to 51 %; 0.39, 0.70, 2.2 deg, 34 %.
+    # Measured overshoot of q, p, r, V in % of e(0): 1.2, 0.7, 25, 20, without latching 25, 22, 49,
+    # 26; peak of elevator, aileron, rudder, thrust: 0.25, 0.15, 3.1 deg, 32 %, without 1.9, 2.4,
+    # 6.5 deg, 50 % (its limit). The prototype, possibly with another initial state: 4 to 12 %,
+    # without 16 to 51 %; 0.39, 0.70, 2.2 deg, 34 %.
     overshoot, peak = {}, {}
     for latched in (True, False):
         e, u = upset(latched=latched)
@@ -262,7 +316,8 @@ def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
 
 
 def test_error_goes_to_zero_with_and_without_latching() -> None:
-    # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a hundredth is left.
+    # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a
+    # hundredth is left.
     e, without = upset(latched=True)[0], upset(latched=False)[0]
     assert int(np.argmax(np.abs(e[:, 0]) < 0.05 * e[0, 0])) in range(15, 30)
     assert (np.abs(e[-1]) < 0.01 * np.abs(e[0])).all()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward: its numbers, its effect on the error, that it is off by default, and bumpless transfer."""
+"""Feedforward: its numbers, its effect on the error, that it is off by default, and bumpless
+transfer.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -37,12 +39,18 @@ BY_HAND = nominal_model(
     lead=np.zeros(1),
 )
 
-# A small aircraft: two channels and two further states, one of them an angle that acts on y through gravity.
-# CB = [[2, 0.4], [0.3, -1]], so D = (1, -1). At y = 0 the eigenvalues of the other two states are -2 1/s and 0.
+# A small aircraft: two channels and two further states, one of them an angle that acts on y through
+# gravity. CB = [[2, 0.4], [0.3, -1]], so D = (1, -1). At y = 0 the eigenvalues of the other two
+# states are -2 1/s and 0.
 A = ((-1.0, 0.2, 1.5, 0.0), (0.3, -2.0, 0.5, 0.0), (1.0, 0.4, -2.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 B = ((2.0, 0.4), (0.3, -1.0), (0.0, 0.0), (0.0, 0.0))
 GRAVITY = ((0.0, 0.0, 0.0, -3.0), (0.0,) * 4, (0.0,) * 4, (0.0,) * 4)
-MODEL: dict[str, Any] = {"states": ("a", "b", "c", "d"), "A": sum(A, ()), "B": sum(B, ()), "gravity": sum(GRAVITY, ())}
+MODEL: dict[str, Any] = {
+    "states": ("a", "b", "c", "d"),
+    "A": sum(A, ()),
+    "B": sum(B, ()),
+    "gravity": sum(GRAVITY, ()),
+}
 CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
     "outputs": ("a", "b"),
     "inputs": ("u", "v"),
@@ -67,7 +75,9 @@ def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerConfig:
 
 
 def reference(t: float) -> FloatArray:
-    """A reference that is at rest until 0 and moves afterwards, with a continuous second derivative."""
+    """A reference that is at rest until 0 and moves afterwards, with a continuous second
+    derivative.
+    """
     t = max(t, 0.0)
     return np.array([np.sin(t) ** 3, (1.0 - np.cos(2.0 * t)) ** 2 / 2.0])
 
@@ -79,7 +89,9 @@ def nominal_of(params: ControllerConfig) -> Nominal:
 
 
 def largest_error(params: ControllerConfig) -> float:
-    """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of a tenth of a period."""
+    """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of
+    a tenth of a period.
+    """
     limits, law, state, x = params.guard(), params.tuned_law(), guard.initial_state(2), np.zeros(4)
     samples: list[StampedVector] = []
     errors = []
@@ -98,19 +110,25 @@ def largest_error(params: ControllerConfig) -> float:
 
 
 def test_one_tick_gives_the_hand_worked_numbers() -> None:
-    # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1. The other state, eta_dot = 4 y_m - 3 eta with y_m = t, is
-    # 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414 then, and Runge-Kutta is within (3 t)^5 / 5! of it.
-    # In the middle x = (0.05, 0.0090707), so u = (1 - (-0.05 + 2 0.0090707)) / 2 = 0.5159293.
-    state, added = feedforward.step(feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND)
+    # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1. The other state, eta_dot = 4 y_m - 3 eta
+    # with y_m = t, is 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414 then, and Runge-Kutta is within (3
+    # t)^5 / 5! of it. In the middle x = (0.05, 0.0090707), so u = (1 - (-0.05 + 2 0.0090707)) / 2 =
+    # 0.5159293.
+    state, added = feedforward.step(
+        feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND
+    )
     assert state.x == pytest.approx([0.1, 0.0181414], abs=1e-5)
     assert state.u == pytest.approx([0.5159293], abs=1e-5)
     assert added.tolist() == [0.0]
 
 
 def test_input_extrapolated_linearly_from_last_two() -> None:
-    # The middles of ticks of 0.1 and 0.2 s are 0.15 s apart; from the last middle it is 0.1 s to the tick plus 0.05 s of lead.
+    # The middles of ticks of 0.1 and 0.2 s are 0.15 s apart; from the last middle it is 0.1 s to
+    # the tick plus 0.05 s of lead.
     nominal = BY_HAND._replace(lead=np.array([0.05]))
-    first, _ = feedforward.step(feedforward.initial_state(np.zeros(1), nominal), np.array([0.1]), np.array(0.1), nominal)
+    first, _ = feedforward.step(
+        feedforward.initial_state(np.zeros(1), nominal), np.array([0.1]), np.array(0.1), nominal
+    )
     second, _ = feedforward.step(first, np.array([0.5]), np.array(0.2), nominal)
     assert second.u_0 == pytest.approx(second.u + 0.15 * (second.u - first.u) / 0.15)
 
@@ -118,19 +136,27 @@ def test_input_extrapolated_linearly_from_last_two() -> None:
 def test_zero_dynamics_are_zeros_of_model() -> None:
     # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
     assert feedforward.zero_dynamics(BY_HAND) == pytest.approx([-3.0])
-    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == pytest.approx([-2.0, 0.0])
+    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == pytest.approx(
+        [-2.0, 0.0]
+    )
 
 
 def test_the_feedforward_does_not_depend_on_y() -> None:
     # For two different y, u_ff is the same to the last bit.
-    tracking, oscillating = (ticks(small_aircraft(), y) for y in (reference, lambda t: np.full(2, 10.0 * np.sin(30.0 * t))))
-    assert [state.u_ff.tobytes() for state in tracking] == [state.u_ff.tobytes() for state in oscillating]
+    tracking, oscillating = (
+        ticks(small_aircraft(), y)
+        for y in (reference, lambda t: np.full(2, 10.0 * np.sin(30.0 * t)))
+    )
+    assert [state.u_ff.tobytes() for state in tracking] == [
+        state.u_ff.tobytes() for state in oscillating
+    ]
     assert (tracking[-1].u != oscillating[-1].u).all()
 
 
 def test_on_nominal_plant_feedforward_alone_leaves_sampling_error() -> None:
-    # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3, the error of the linear
-    # extrapolation, which is of second order in the period: 3.5 to 4.5 differs from first order (2) and third order (8).
+    # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3, the
+    # error of the linear extrapolation, which is of second order in the period: 3.5 to 4.5 differs
+    # from first order (2) and third order (8).
     coarse, fine = largest_error(small_aircraft(100.0)), largest_error(small_aircraft(200.0))
     assert coarse < 2e-3
     assert 3.5 < coarse / fine < 4.5
@@ -147,28 +173,40 @@ def short(**changes: Any) -> Scenario:
     }
     starts = zip(SERVO.aircraft.gusts.items(), (7.0, 9.5), strict=True)
     gusts = {name: gust.model_dump() | {"start": start} for (name, gust), start in starts}
-    # y and y_m at the controller's rate, in steps of 5 ms: a fifth of the computation, scores within 1 %
+    # y and y_m at the controller's rate, in steps of 5 ms: a fifth of the computation, scores
+    # within 1 %
     slow = {"rate": 100.0, "step": 0.005, "gusts": gusts}
     reference_model = {"rate": 100.0, "pulses": pulses}
-    return SERVO.vary(flight={"duration": 12.0}, aircraft=slow, reference_model=reference_model).vary(**changes)
+    return SERVO.vary(
+        flight={"duration": 12.0}, aircraft=slow, reference_model=reference_model
+    ).vary(**changes)
 
 
 def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
     """The scenario without feedforward, and with that of its airframe as published."""
     chosen = with_feedforward(scenario.controller, scenario.aircraft.load()[0])
-    return scenario.vary(controller={"feedforward": None}), scenario.vary(controller=chosen.model_dump())
+    return scenario.vary(controller={"feedforward": None}), scenario.vary(
+        controller=chosen.model_dump()
+    )
 
 
 def ticks(
-    params: ControllerConfig, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
+    params: ControllerConfig,
+    y: Callable[[float], FloatArray],
+    missing: tuple[float, float] = (9.0, 9.0),
 ) -> list[ControllerState]:
-    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received in `missing`."""
+    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received
+    in `missing`.
+    """
     state, states = guard.initial_state(2), []
     y_now, y_m_samples = StampedVector(0, np.zeros(2)), [StampedVector(0, np.zeros(2))]
     for k in range(50, 150):
         t, now_ns = k / 100, k * 10 * MS
         if not missing[0] < t < missing[1]:
-            y_now, y_m_samples = StampedVector(now_ns, y(t)), [*y_m_samples[-2:], StampedVector(now_ns, reference(t))]
+            y_now, y_m_samples = (
+                StampedVector(now_ns, y(t)),
+                [*y_m_samples[-2:], StampedVector(now_ns, reference(t))],
+            )
         state, _ = guard.tick(state, now_ns, y_now, y_m_samples, params.guard(), params.tuned_law())
         states.append(state)
     return states
@@ -179,8 +217,8 @@ def test_engagement_and_re_engagement_during_manoeuvre_bumpless() -> None:
     modes = [state.mode for state in states]
     engaged = [0, modes.index(Mode.ENGAGED, modes.index(Mode.HOLD))]
     assert engaged[1] == 70
-    # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per tick. The whole u_ff would be
-    # a jump of 0.8 at the first engagement and of 4.6 at the second.
+    # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per
+    # tick. The whole u_ff would be a jump of 0.8 at the first engagement and of 4.6 at the second.
     nominal = nominal_of(small_aircraft())
     for first in engaged:
         u = np.array([state.u for state in states[first : first + 20]])
@@ -200,7 +238,9 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
     assert state.law is not None
     law = rise.retune(state.law, old.law_params(), new.law_params())
     retuned = state._replace(law=law)
-    assert rise.control(law, law, new.law_params()) == pytest.approx(rise.control(state.law, state.law, old.law_params()))
+    assert rise.control(law, law, new.law_params()) == pytest.approx(
+        rise.control(state.law, state.law, old.law_params())
+    )
     now = StampedVector(1500 * MS, reference(1.5))
     before, _ = guard.tick(state, now.stamp_ns, now, [now], old.guard(), old.tuned_law())
     after, _ = guard.tick(retuned, now.stamp_ns, now, [now], new.guard(), new.tuned_law())
@@ -210,18 +250,30 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"A": (1.0,) * 15}, r"^controller\.feedforward\.A: found 15 values, expected 16: 4 rows of 4$"),
+        (
+            {"A": (1.0,) * 15},
+            r"^controller\.feedforward\.A: found 15 values, expected 16: 4 rows of 4$",
+        ),
         (
             {"B": (2.0, 0.4, 0.3, 1.0) + (0.0,) * 4},
-            r"^controller\.feedforward\.B: found a C B with D = \[1, 1\], expected D = \[1, -1\], that of the controller$",
+            (
+                r"^controller\.feedforward\.B: found a C B with D = \[1, 1\], expected D = \[1, "
+                r"-1\], that of the controller$"
+            ),
         ),
         (
             {"A": sum((*A[:2], (1.0, 0.4, 0.5, 0.0), A[3]), ())},
-            r"^controller\.feedforward\.A: found zero dynamics with an eigenvalue at 0\.5 1/s, expected none in the right half",
+            (
+                r"^controller\.feedforward\.A: found zero dynamics with an eigenvalue at 0\.5 1/s, "
+                r"expected none in the right half"
+            ),
         ),
         (
             {"A": sum((*A[:2], (1.0, 0.4, -30.0, 0.0), A[3]), ())},
-            r"^controller\.feedforward\.A: found zero dynamics as fast as 30 1/s, expected at most 25 1/s, which",
+            (
+                r"^controller\.feedforward\.A: found zero dynamics as fast as 30 1/s, expected at "
+                r"most 25 1/s, which"
+            ),
         ),
     ],
 )
@@ -232,8 +284,9 @@ def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentenc
 
 def test_feedforward_lowers_needed_beta() -> None:
     """The gain beta has to exceed only the slew of the ideal input left over by the feedforward."""
-    # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30 % in calm air the mean
-    # remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust, aileron and rudder; the test allows half.
+    # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30
+    # % in calm air the mean remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust,
+    # aileron and rudder; the test allows half.
     airframe = load_airframe("osprey")
     study = study_airframe(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
     whole = np.abs(study.u_dot[:, 1:]).max(axis=0)
@@ -242,7 +295,10 @@ def test_feedforward_lowers_needed_beta() -> None:
 
 
 def test_feedforward_reduces_error_of_nominal_osprey_with_servos() -> None:
-    # Measured in units of a score: 1.98 -> 0.22 in calm air, where noise remains. The margin is half of the improvement.
+    # Measured in units of a score: 1.98 -> 0.22 in calm air, where noise remains. The margin is
+    # half of the improvement.
     errors = [error(simulate(scenario)).values for scenario in both(short(aircraft={"gusts": {}}))]
-    without, with_it = (float(np.sqrt(np.mean(e**2, axis=0)) @ [100.0, 10.0, 50.0, 100.0]) for e in errors)
+    without, with_it = (
+        float(np.sqrt(np.mean(e**2, axis=0)) @ [100.0, 10.0, 50.0, 100.0]) for e in errors
+    )
     assert with_it < 0.55 * without

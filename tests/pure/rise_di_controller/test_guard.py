@@ -18,7 +18,15 @@ from rise_di_controller import guard, internals
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import ControllerState, align
 from rise_di_controller.internals import Saturation
-from rise_di_controller.law import LawState, Sign, control, engage, retune, step, step_with_anti_windup
+from rise_di_controller.law import (
+    LawState,
+    Sign,
+    control,
+    engage,
+    retune,
+    step,
+    step_with_anti_windup,
+)
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, saturate
 
@@ -49,11 +57,14 @@ def test_single_sample_held_for_one_period() -> None:
 
 
 def test_close_reference_samples_amplify_no_noise() -> None:
-    # Two samples 1 us apart differ by 1: the line through them is wrong by 8000 after 8 ms. The slope is taken from samples
-    # that are at least a twentieth of the extrapolation limit apart, here the first and the last; otherwise the value is held.
+    # Two samples 1 us apart differ by 1: the line through them is wrong by 8000 after 8 ms. The
+    # slope is taken from samples that are at least a twentieth of the extrapolation limit apart,
+    # here the first and the last; otherwise the value is held.
     close = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
     first = StampedVector(0, np.array([0.0]))
-    assert align([first, *close], 10 * MS, 10 * MS) == pytest.approx([2.0 * 10.0 / 2.001], rel=1e-12)
+    assert align([first, *close], 10 * MS, 10 * MS) == pytest.approx(
+        [2.0 * 10.0 / 2.001], rel=1e-12
+    )
     assert align(close, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
 
 
@@ -75,7 +86,8 @@ def tick(
 
 
 def run(
-    *ticks: tuple[float, StampedVector | None, list[StampedVector]], params: ControllerConfig = PARAMS
+    *ticks: tuple[float, StampedVector | None, list[StampedVector]],
+    params: ControllerConfig = PARAMS,
 ) -> list[ControllerState]:
     states = [guard.initial_state(4)]
     for ms, y, y_m in ticks:
@@ -87,7 +99,12 @@ def test_engages_with_zero_input() -> None:
     """The controller waits for y and y_m, then engages with u = 0."""
     both = (30, sample(30, 1.0), [sample(20), sample(30)])
     modes = run((0, None, []), (10, sample(10, 1.0), []), (20, None, [sample(20)]), both)
-    assert [state.mode for state in modes] == [Mode.WAITING, Mode.WAITING, Mode.WAITING, Mode.ENGAGED]
+    assert [state.mode for state in modes] == [
+        Mode.WAITING,
+        Mode.WAITING,
+        Mode.WAITING,
+        Mode.ENGAGED,
+    ]
     assert modes[-1].u.tolist() == [0.0] * 4
 
 
@@ -102,7 +119,9 @@ def test_y_bounded_behind_and_ahead_of_clock(offset: int) -> None:
     assert (state.mode is Mode.ENGAGED) == (abs(offset) <= AGE)
 
 
-@pytest.mark.parametrize("offset", [AGE, AGE + 1, 10_000])  # ms; an old y_m has no value at the stamp of a fresh y
+@pytest.mark.parametrize(
+    "offset", [AGE, AGE + 1, 10_000]
+)  # ms; an old y_m has no value at the stamp of a fresh y
 def test_y_m_bounded_ahead_of_clock(offset: int) -> None:
     (state,) = run((0, sample(0), [sample(0), sample(offset)]))
     assert (state.mode is Mode.ENGAGED) == (offset <= AGE)
@@ -154,7 +173,9 @@ def test_a_repeated_sample_changes_nothing() -> None:
 
 
 def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
-    """The input holds, then ramps to trim, and fresh samples re-engage the law without a jump of u."""
+    """The input holds, then ramps to trim, and fresh samples re-engage the law without a jump of
+    u.
+    """
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y, y_m = sample(10, 1.1), [sample(10)]
     states = run(
@@ -186,13 +207,24 @@ def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
 
 
 @pytest.mark.parametrize("policy", ["trim", "hold"])
-def test_deactivation_holds_or_ramps_input_as_configured(policy: str, osprey_gust: Scenario) -> None:
+def test_deactivation_holds_or_ramps_input_as_configured(
+    policy: str, osprey_gust: Scenario
+) -> None:
     params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
     states = [guard.initial_state(4)]
     for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
-        states.append(tick(states[-1], ms, sample(ms, 1.0 + ms / 100), [sample(ms)], params, active)[0])
+        states.append(
+            tick(states[-1], ms, sample(ms, 1.0 + ms / 100), [sample(ms)], params, active)[0]
+        )
     states = states[1:]
-    assert [state.mode.name for state in states] == ["ENGAGED", "ENGAGED", "INACTIVE", "INACTIVE", "INACTIVE", "ENGAGED"]
+    assert [state.mode.name for state in states] == [
+        "ENGAGED",
+        "ENGAGED",
+        "INACTIVE",
+        "INACTIVE",
+        "INACTIVE",
+        "ENGAGED",
+    ]
     scales = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
     for state, expected in zip(states[2:5], scales, strict=True):
         assert state.u == pytest.approx(expected * states[1].u)
@@ -214,7 +246,9 @@ def limits_of(bound: float, rate: float = np.inf) -> Limits:
     return Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
 
 
-TWO = law_params([5.0, 2.0], [2.0, 1.0], [3.0, 1.0], [1.0, -1.0], input_scale=[0.5, 2.0], eps=[0.1, 0.2])
+TWO = law_params(
+    [5.0, 2.0], [2.0, 1.0], [3.0, 1.0], [1.0, -1.0], input_scale=[0.5, 2.0], eps=[0.1, 0.2]
+)
 VALUES = st.floats(-10, 10)
 PAIRS = st.tuples(VALUES, VALUES).map(np.array)
 STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
@@ -227,13 +261,17 @@ def test_anti_windup_leaves_unsaturated_law(sign: Sign, state: LawState, y: Floa
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
-    limited_state, u_free, limited = step_with_anti_windup(state, y, zero, dt, zero, u, law, limits_of(np.inf))
+    limited_state, u_free, limited = step_with_anti_windup(
+        state, y, zero, dt, zero, u, law, limits_of(np.inf)
+    )
     assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
     assert [part.tobytes() for part in limited_state] == [part.tobytes() for part in after]
 
 
 @given(u=PAIRS, before=PAIRS, bound=st.floats(0.1, 5), rate=st.floats(0.1, 100))
-def test_saturation_leaves_input_inside_limits(u: FloatArray, before: FloatArray, bound: float, rate: float) -> None:
+def test_saturation_leaves_input_inside_limits(
+    u: FloatArray, before: FloatArray, bound: float, rate: float
+) -> None:
     limits = limits_of(bound, rate)
     before = np.clip(before, -bound, bound)
     limited = saturate(u, before, np.array(0.01), limits)
@@ -269,22 +307,37 @@ def test_integrals_stop_only_in_direction_that_worsens_saturation(
 
 
 @pytest.mark.equation(23)
-@given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10), D=st.sampled_from([-1.0, 1.0]))
-def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: float, scale: float, D: float) -> None:
+@given(
+    state=STATES,
+    k=st.floats(0.5, 50),
+    Lambda=st.floats(0.1, 10),
+    scale=st.floats(0.1, 10),
+    D=st.sampled_from([-1.0, 1.0]),
+)
+def test_new_gains_transfer_without_a_bump(
+    state: LawState, k: float, Lambda: float, scale: float, D: float
+) -> None:
     new = TWO._replace(
-        D=TWO.D * D, K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2
+        D=TWO.D * D,
+        K=TWO.K * k,
+        Lambda=TWO.Lambda * Lambda,
+        input_scale=TWO.input_scale * scale,
+        beta=TWO.beta * 2,
     )
     retuned = retune(state, TWO, new)
     before, after = control(state, state, TWO), control(retuned, retuned, new)
     # u is a sum of terms of this size, each rounded once or twice
     size = np.abs(new.input_scale) * (
-        new.K * (np.abs(state.e - state.e_0) + new.Lambda * np.abs(state.integral_e)) + np.abs(state.Pi)
+        new.K * (np.abs(state.e - state.e_0) + new.Lambda * np.abs(state.integral_e))
+        + np.abs(state.Pi)
     )
     assert (np.abs(after - before) <= 1e-12 * np.maximum(size, 1.0)).all()
     assert (retuned.e, retuned.e_0, retuned.integral_e) == (state.e, state.e_0, state.integral_e)
 
 
-def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any) -> dict[str, float]:
+def logged(
+    state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any
+) -> dict[str, float]:
     values = internals.values(state, inputs, PARAMS.guard()._replace(limits=limits), *others)
     return dict(zip(internals.names(PARAMS.logged_groups()), values, strict=True))
 
@@ -293,10 +346,31 @@ def test_internals_hold_integrals_and_what_limited_each_input() -> None:
     limits = Limits(np.full(4, -1.0), np.full(4, 1.0), np.full(4, np.inf))
     law_state = LawState(np.zeros(4), np.ones(4), np.full(4, 2.0), np.full(4, 3.0))
     state = guard.initial_state(4)._replace(
-        law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
+        law=law_state,
+        u_free=np.array([0.5, 5.0, -5.0, 0.9]),
+        u=np.array([0.5, 1.0, -1.0, 0.7]),
+        u_trim=np.full(4, 0.1),
     )
-    values = logged(state, guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8, np.zeros(0))
-    assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
-    assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (5.0, 1.0, 0.1)
+    values = logged(
+        state,
+        guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01),
+        limits,
+        0.0,
+        0.0,
+        7,
+        8,
+        np.zeros(0),
+    )
+    assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (
+        1.0,
+        0.0,
+        2.0,
+        3.0,
+    )
+    assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (
+        5.0,
+        1.0,
+        0.1,
+    )
     limited = [values[f"limited.{name}"] for name in PARAMS.inputs]
     assert limited == [Saturation.NO, Saturation.MAGNITUDE, Saturation.MAGNITUDE, Saturation.RATE]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Any sequence of samples, losses, overruns and activations: when the guard engages, how far u moves, when u is at trim."""
+"""Any sequence of samples, losses, overruns and activations: when the guard engages, how far u
+moves, when u is at trim.
+"""
 
 import numpy as np
 import pytest
@@ -17,14 +19,26 @@ from rise_di_controller import guard
 MS = 1_000_000
 SLEW = 0.5  # limit of abs(u_dot), rad/s and 1/s
 CONFIG = find_scenario("osprey_gust").controller.model_copy(
-    update={"max_age": 0.03, "hold": 0.05, "ramp": 0.2, "slew": (SLEW,) * 4, "lower": (-0.1,) * 4, "upper": (0.2,) * 4}
+    update={
+        "max_age": 0.03,
+        "hold": 0.05,
+        "ramp": 0.2,
+        "slew": (SLEW,) * 4,
+        "lower": (-0.1,) * 4,
+        "upper": (0.2,) * 4,
+    }
 )
-PARAMS = {policy: CONFIG.model_copy(update={"on_deactivate": policy}).guard() for policy in ("trim", "hold")}
+PARAMS = {
+    policy: CONFIG.model_copy(update={"on_deactivate": policy}).guard()
+    for policy in ("trim", "hold")
+}
 LAW = CONFIG.tuned_law()
 AGE = CONFIG.guard().max_age_ns
 EXACT = 1e-12  # u is below 1: rounding is some 1e-16
 
-STAMPS = st.sampled_from([0, 0, 0, -AGE, AGE, -AGE - 1, AGE + 1, -MS, MS, -1000 * MS, 1000 * MS])  # ns from the clock
+STAMPS = st.sampled_from(
+    [0, 0, 0, -AGE, AGE, -AGE - 1, AGE + 1, -MS, MS, -1000 * MS, 1000 * MS]
+)  # ns from the clock
 VALUES = st.sampled_from([-0.3, 0.0, 0.05, 1.0, 1e9])  # rad/s and m/s
 
 
@@ -43,7 +57,9 @@ class Sequence(RuleBasedStateMachine):
 
     @rule(active=st.booleans(), policy=st.sampled_from([*PARAMS]))
     def activate(self, active: bool, policy: str) -> None:
-        """Activate or deactivate, with what u does after a deactivation; a held u may not change to a ramp."""
+        """Activate or deactivate, with what u does after a deactivation; a held u may not change to
+        a ramp.
+        """
         if self.state.mode is not Mode.INACTIVE:
             self.guard = PARAMS[policy]
         self.active = active
@@ -87,7 +103,9 @@ class Sequence(RuleBasedStateMachine):
     def tick(self) -> None:
         """Run a tick, check the new state, and advance the clock by a period."""
         before = self.state
-        self.state, inputs = guard.tick(before, self.now_ns, self.y, self.y_m, self.guard, LAW, self.active)
+        self.state, inputs = guard.tick(
+            before, self.now_ns, self.y, self.y_m, self.guard, LAW, self.active
+        )
         if self.state.mode is Mode.ENGAGED:
             self._check_law(before, 0.0 if inputs is None else inputs.dt)
         elif self.state.law is None:
@@ -107,7 +125,11 @@ class Sequence(RuleBasedStateMachine):
 
     def _check_failsafe(self, before: guard.ControllerState) -> None:
         if before.mode is Mode.ENGAGED or (before.mode is Mode.INACTIVE) == self.active:
-            self.begin_ns, self.begin_u, self.hold = self.now_ns, before.u, CONFIG.hold if self.active else 0.0
+            self.begin_ns, self.begin_u, self.hold = (
+                self.now_ns,
+                before.u,
+                CONFIG.hold if self.active else 0.0,
+            )
         if not self.active and self.guard.deactivation_holds:
             expected, mode = self.begin_u, Mode.INACTIVE
         else:

@@ -19,7 +19,9 @@ DT = 0.1
 
 def one_channel(sign: Sign, D: float = -1.0) -> LawParams:
     """K = 2, Lambda = 3, beta = 4, input scale 1/2."""
-    return law_params(gain(np.array(1.0), np.array([])), 3.0, 4.0, D, sign, input_scale=0.5, eps=0.1)
+    return law_params(
+        gain(np.array(1.0), np.array([])), 3.0, 4.0, D, sign, input_scale=0.5, eps=0.1
+    )
 
 
 def respond(params: LawParams, errors: list[float], dt: float = DT) -> list[float]:
@@ -41,14 +43,16 @@ def test_gain_has_the_structure_of_equation_22() -> None:
 @pytest.mark.equation(3, 20, 21)
 def test_literal_sign_gives_the_hand_worked_inputs() -> None:
     # e_0 = 1; e = 1.2: integral 0.1 (1.2 + 1)/2 = 0.11, Pi applied 0: v = 2 (0.2 + 3 0.11) = 1.06
-    # e = 0.9: integral 0.11 + 0.1 (0.9 + 1.2)/2 = 0.215, Pi applied 0.1 4 = 0.4: v = 2 (-0.1 + 3 0.215) + 0.4 = 1.49
-    # D = -1, so -D = +1; u = v / 2
-    assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx([0.53, 0.745], abs=1e-15)
+    # e = 0.9: integral 0.11 + 0.1 (0.9 + 1.2)/2 = 0.215, Pi applied 0.1 4 = 0.4: v = 2 (-0.1 + 3
+    # 0.215) + 0.4 = 1.49 D = -1, so -D = +1; u = v / 2
+    assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx(
+        [0.53, 0.745], abs=1e-15
+    )
 
 
 def test_implicit_sign_applies_saturated_sign_in_same_tick() -> None:
-    # e_hat = 1.2 + 0.2 - 0.1 2 (0.2 + 3 0.11) = 1.294, over dt^2 omega beta = 0.04 is above 1: s = 1, Pi = 0.4
-    # v = 1.06 + 0.4
+    # e_hat = 1.2 + 0.2 - 0.1 2 (0.2 + 3 0.11) = 1.294, over dt^2 omega beta = 0.04 is above 1: s =
+    # 1, Pi = 0.4 v = 1.06 + 0.4
     assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
@@ -56,13 +60,16 @@ def test_implicit_sign_applies_saturated_sign_in_same_tick() -> None:
 def test_implicit_sign_zeroes_predicted_error() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
-    assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
+    assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx(
+        [-0.1], abs=1e-15
+    )
 
 
 @pytest.mark.equation(21)
 def test_softened_sign_is_saturated_line() -> None:
     """The softened sign is proportional inside the width and +-1 outside."""
-    # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) + 0.2 = 0.315
+    # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) +
+    # 0.2 = 0.315
     assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
     # e = 1.2 from 1: s = 1, as with the implicit sign
     assert respond(one_channel(Sign.SOFT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
@@ -70,7 +77,8 @@ def test_softened_sign_is_saturated_line() -> None:
 
 @pytest.mark.equation(3)
 def test_input_is_zero_at_engagement_whatever_error() -> None:
-    # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step adds the integrals of one tick only.
+    # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step adds the integrals of
+    # one tick only.
     state = engage(np.array([5.0, -3.0]), np.array([1.0, 1.0]))
     assert state.e_0.tolist() == [4.0, -4.0]
     assert state.integral_e.tolist() == [0.0, 0.0]
@@ -80,7 +88,8 @@ def test_input_is_zero_at_engagement_whatever_error() -> None:
 @pytest.mark.equation(20)
 @pytest.mark.parametrize("sign", list(Sign))
 def test_constant_error_gives_a_ramp(sign: Sign) -> None:
-    # (20), (21) with e = e_0 = 2: u = -D (K Lambda e + beta) t, so v grows by 2 3 2 0.1 + 4 0.1 = 1.6 a tick, u by 0.8.
+    # (20), (21) with e = e_0 = 2: u = -D (K Lambda e + beta) t, so v grows by 2 3 2 0.1 + 4 0.1 =
+    # 1.6 a tick, u by 0.8.
     inputs = np.array(respond(one_channel(sign), [2.0] * 50))
     assert np.diff(inputs) == pytest.approx(0.8, rel=1e-12)
     # The literal sign uses Pi as it stands, one tick later than the implicit sign.
@@ -96,14 +105,18 @@ def test_zero_error_leaves_the_input_at_zero(sign: Sign) -> None:
 @given(errors=st.lists(st.floats(-10, 10), min_size=3, max_size=20))
 def test_the_law_is_odd_in_the_error(sign: Sign, errors: list[float]) -> None:
     # Every term of (20), (21) is odd in e, and so is each sampling of them.
-    assert respond(one_channel(sign), [-e for e in errors]) == [-u for u in respond(one_channel(sign), errors)]
+    assert respond(one_channel(sign), [-e for e in errors]) == [
+        -u for u in respond(one_channel(sign), errors)
+    ]
 
 
 @given(e=st.lists(st.floats(-1, 1), min_size=2, max_size=2))
 def test_channels_do_not_mix(e: list[float]) -> None:
     # K, Lambda, beta and D are diagonal: the first of two channels equals a single channel.
     single = one_channel(Sign.IMPLICIT)
-    doubled: dict[str, Any] = {name: np.repeat(getattr(single, name), 2) for name in single._fields if name != "sign"}
+    doubled: dict[str, Any] = {
+        name: np.repeat(getattr(single, name), 2) for name in single._fields if name != "sign"
+    }
     both = single._replace(**doubled)
     zero = np.zeros(2)
     _, u = step(engage(zero, zero), np.array(e), zero, np.array(DT), both)
@@ -119,8 +132,13 @@ def test_a_step_changes_none_of_its_arguments() -> None:
 
 
 def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() -> None:
-    old, new = one_channel(Sign.LITERAL, D=-1.0), one_channel(Sign.LITERAL, D=1.0)._replace(K=np.array([5.0]))
-    state, _ = step(engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old)
+    old, new = (
+        one_channel(Sign.LITERAL, D=-1.0),
+        one_channel(Sign.LITERAL, D=1.0)._replace(K=np.array([5.0])),
+    )
+    state, _ = step(
+        engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old
+    )
     retuned = retune(state, old, new)
     assert control(retuned, retuned, new) == pytest.approx(control(state, state, old), abs=1e-15)
 
@@ -141,7 +159,9 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
 def test_outward_increment_is_reduced_by_what_is_beyond(
     before: float, after: float, change: float, beyond: float, expected: float
 ) -> None:
-    """The formula of the docstring: a part of the increment where change and beyond have one sign, else `after` to the bit."""
+    """The formula of the docstring: a part of the increment where change and beyond have one sign,
+    else `after` to the bit.
+    """
     values = (np.array([value]) for value in (before, after, change, beyond))
     limited = limited_integral(*values)
     assert limited[0] == (pytest.approx(expected, rel=1e-12) if change * beyond > 0 else expected)

@@ -10,7 +10,13 @@ import pytest
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.guard import initial_state, retune
-from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, estimates_after, with_observer
+from rise_di_controller.observer import (
+    ObserverParams,
+    ObserverState,
+    PastTick,
+    estimates_after,
+    with_observer,
+)
 from rise_di_controller.saturation import Limits
 
 DT, TRIM = np.float64(0.1), 10.0
@@ -31,7 +37,9 @@ def vector(value: float) -> FloatArray:
 def params(bound: float = np.inf, rate: float = np.inf) -> ObserverParams:
     """Phi = 0.5, Gamma = 2, H = 1, L = 0.25, F = 3, full after 0.5 s."""
     Phi, Gamma, H, L, F = (np.array([[value]]) for value in (0.5, 2.0, 1.0, 0.25, 3.0))
-    return ObserverParams((), Phi, Gamma, H, L, F, Limits(vector(-bound), vector(bound), vector(rate)), np.array(2.0))
+    return ObserverParams(
+        (), Phi, Gamma, H, L, F, Limits(vector(-bound), vector(bound), vector(rate)), np.array(2.0)
+    )
 
 
 def measured(e: float, u_before: float = TRIM) -> Measurements:
@@ -40,7 +48,9 @@ def measured(e: float, u_before: float = TRIM) -> Measurements:
 
 
 def respond(errors: list[float], observer: ObserverParams) -> list[float]:
-    """The inputs u less the trim for a series of errors, of which the first is that of engagement."""
+    """The inputs u less the trim for a series of errors, of which the first is that of
+    engagement.
+    """
     law = with_observer(TRIM_LAW)
     state = law.engage(measured(errors[0]), observer)
     inputs = []
@@ -51,13 +61,15 @@ def respond(errors: list[float], observer: ObserverParams) -> list[float]:
 
 
 def test_contribution_fades_in_and_follows_the_estimate() -> None:
-    # z = 1 at engagement. e = 1.4: z = 1 + 0.25 0.4 = 1.1, sigma = 0.2, u_o = -0.2 3 1.1 = -0.66, z+ = 0.55 - 1.32 = -0.77
-    # e = -0.5: z = -0.77 + 0.25 0.27 = -0.7025, sigma = 0.4, u_o = 0.4 3 0.7025 = 0.843
+    # z = 1 at engagement. e = 1.4: z = 1 + 0.25 0.4 = 1.1, sigma = 0.2, u_o = -0.2 3 1.1 = -0.66,
+    # z+ = 0.55 - 1.32 = -0.77 e = -0.5: z = -0.77 + 0.25 0.27 = -0.7025, sigma = 0.4, u_o = 0.4 3
+    # 0.7025 = 0.843
     assert respond([1.0, 1.4, -0.5], params()) == pytest.approx([-0.66, 0.843], abs=1e-14)
 
 
 def test_contribution_is_full_after_its_fade_in() -> None:
-    # without an effect of u (Gamma = 0) and for a constant e the corrected z = 0.75 (0.5 z) + 0.25 e tends to 0.25 e / 0.625
+    # without an effect of u (Gamma = 0) and for a constant e the corrected z = 0.75 (0.5 z) + 0.25
+    # e tends to 0.25 e / 0.625
     steady = respond([1.0] * 60, params()._replace(Gamma=np.zeros((1, 1))))[-1]
     assert steady == pytest.approx(-3.0 * 0.4, abs=1e-12)
 
@@ -72,7 +84,9 @@ def test_missed_tick_predicts_with_the_u_that_was_held() -> None:
     law, observer = with_observer(TRIM_LAW), params()
     state = law.engage(measured(1.0), observer)
     # z+ = 0.5 1 + 2 (10.5 - 10) = 1.5
-    assert law.missed(state, measured(0.0, u_before=10.5), observer).z == pytest.approx([1.5], abs=1e-15)
+    assert law.missed(state, measured(0.0, u_before=10.5), observer).z == pytest.approx(
+        [1.5], abs=1e-15
+    )
 
 
 def test_filter_over_the_record_is_that_of_each_tick() -> None:
@@ -88,13 +102,21 @@ def test_filter_over_the_record_is_that_of_each_tick() -> None:
 
 def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> None:
     # change 0.1, means e = 2 and u = 0.15: z = (0.5 0.25 2 + 2 0.15) / (1 - 0.375) = 0.88
-    # without y: z+ = 0.5 0.88 + 2 0.1 = 0.64. e = 2: z = 0.64 + 0.25 1.36 = 0.98, z+ = 0.49 + 2 (0.3 - 0.1) = 0.89
-    record = (PastTick(None, vector(0.2), vector(7.0), DT), PastTick(vector(2.0), vector(0.3), vector(7.0), DT))
-    assert estimates_after(record, vector(0.1), [params()] * len(record)) == pytest.approx([0.89], abs=1e-14)
+    # without y: z+ = 0.5 0.88 + 2 0.1 = 0.64. e = 2: z = 0.64 + 0.25 1.36 = 0.98, z+ = 0.49 + 2
+    # (0.3 - 0.1) = 0.89
+    record = (
+        PastTick(None, vector(0.2), vector(7.0), DT),
+        PastTick(vector(2.0), vector(0.3), vector(7.0), DT),
+    )
+    assert estimates_after(record, vector(0.1), [params()] * len(record)) == pytest.approx(
+        [0.89], abs=1e-14
+    )
 
 
 def test_new_observer_without_record_starts_from_error_and_trim_keeps_contribution() -> None:
-    """As after the first tick: u stays 10.7, the estimate begins as at engagement, z = H'e = 0.5."""
+    """As after the first tick: u stays 10.7, the estimate begins as at engagement, z = H'e =
+    0.5.
+    """
     law, old = with_observer(TRIM_LAW), params()
     state = initial_state(1)._replace(
         law=ObserverState((), vector(0.4), vector(0.7), vector(1.0)),
@@ -104,4 +126,6 @@ def test_new_observer_without_record_starts_from_error_and_trim_keeps_contributi
         u_trim=vector(TRIM),
     )
     after = retune(state, TunedLaw(law, old), TunedLaw(law, old._replace(L=np.array([[0.5]]))))
-    assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == pytest.approx((TRIM + 0.7, 0.0, 0.5))
+    assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == pytest.approx(
+        (TRIM + 0.7, 0.0, 0.5)
+    )

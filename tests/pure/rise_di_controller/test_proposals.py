@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proposals of a learner as the controller takes or refuses them, in real time and in simulated time."""
+"""Proposals of a learner as the controller takes or refuses them, in real time and in simulated
+time.
+"""
 
 import math
 import re
@@ -69,7 +71,9 @@ class Flight:
     def receive(self, change: dict[str, Any] | None = None, **replaced: Any) -> None:
         """A proposal of now."""
         digest = self.controller.digest
-        proposal = Proposal(self.now_ns, START.digest(), digest, CHANGE if change is None else change, "model")
+        proposal = Proposal(
+            self.now_ns, START.digest(), digest, CHANGE if change is None else change, "model"
+        )
         self.learning.receive(proposal._replace(**replaced), self.controller, self.now_ns)
 
     def step(self, count: int = 20) -> int:
@@ -88,7 +92,9 @@ class Flight:
 def test_proposal_flies_after_certificate_in_parts() -> None:
     flight = Flight()
     flight.receive()
-    assert flight.step() == 11  # fields, relations, zeros, filter and feedback, three delays, law, limits, names, the switch
+    assert (
+        flight.step() == 11
+    )  # fields, relations, zeros, filter and feedback, three delays, law, limits, names, the switch
     assert flight.sentences == ["flies model"]
     expected = RiseDiConfig.validate_mapping(START.changed(CHANGE), "expected")
     assert flight.controller.digest == expected.digest()
@@ -97,7 +103,9 @@ def test_proposal_flies_after_certificate_in_parts() -> None:
 
 def test_part_that_is_learned_later_gets_its_feedforward() -> None:
     whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
-    lateral = RiseDiConfig.validate_mapping(whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral")
+    lateral = RiseDiConfig.validate_mapping(
+        whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral"
+    )
     flight, acting = Flight(), []
     for model in (lateral, whole):
         flight.receive(designed(START, model))
@@ -111,19 +119,28 @@ def test_part_that_is_learned_later_gets_its_feedforward() -> None:
 
 def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
     def of(flown: RiseDiConfig) -> dict[str, float]:
-        return dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
+        return dict(
+            zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True)
+        )
 
     assert set(of(START).values()) == {UNKNOWN}  # no model flies yet
     flight = Flight()
-    flight.receive(CHANGE | {"feedforward.deviation": [0.05 * abs(value) for value in CHANGE["feedforward.B"]]})
+    flight.receive(
+        CHANGE | {"feedforward.deviation": [0.05 * abs(value) for value in CHANGE["feedforward.B"]]}
+    )
     flight.step()
     flown = flight.controller.parameters
     assert isinstance(flown, RiseDiConfig)
-    # of the file: 0.98 / s^2 per deg and 30 deg, 0.06 m/s^2 per % and 50 %. Twice 5 % less are 10 % to first order
+    # of the file: 0.98 / s^2 per deg and 30 deg, 0.06 m/s^2 per % and 50 %. Twice 5 % less are 10 %
+    # to first order
     assert of(flown)["up.q"] == pytest.approx(0.9 * 0.98 * 30.0, rel=0.01)
     assert of(flown)["down.V"] == pytest.approx(0.9 * 0.06 * 50.0, rel=0.01)
-    np.testing.assert_array_equal(flight.learning.authority(flight.controller), authority(flown, START))
-    without = with_channels_of(START, flown, [False, True, True, False], [False, True, False, False])  # of aileron, rudder
+    np.testing.assert_array_equal(
+        flight.learning.authority(flight.controller), authority(flown, START)
+    )
+    without = with_channels_of(
+        START, flown, [False, True, True, False], [False, True, False, False]
+    )  # of aileron, rudder
     assert [of(without)[name] for name in ("down.p", "up.p", "up.r")] == [0.0, 0.0, UNKNOWN]
     assert of(without)["up.q"] == of(flown)["up.q"]
 
@@ -135,7 +152,10 @@ def scaled(name: str, factor: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (scaled("feedforward.B", -1.0), r"^refused: controller\.feedforward\.B: found a C B with D = \[-1, -1, -1, -1\]"),
+        (
+            scaled("feedforward.B", -1.0),
+            r"^refused: controller\.feedforward\.B: found a C B with D = \[-1, -1, -1, -1\]",
+        ),
         (scaled("observer.F", -1.0), r"^refused: controller\.observer\.F: found a spectral radius"),
         (scaled("observer.L", -1.0), r"^refused: controller\.observer\.L: found a spectral"),
         (scaled("observer.F", 8.0), r"late, expected a delay margin of at"),
@@ -147,9 +167,18 @@ def scaled(name: str, factor: float) -> dict[str, Any]:
             scaled("observer.Phi", 1e7),
             r"^refused: controller\.observer\.L: found a spectral",
         ),
-        (CHANGE | {"observer.margin": 0.0}, r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.03 s"),
-        (CHANGE | {"D": [-1, 1, 1, 1]}, r"^refused: proposal: found a change of D, expected changes of"),
-        (CHANGE | {"observer.states": ["x.q"]}, r"^refused: controller\.observer\.states: found x\.q"),
+        (
+            CHANGE | {"observer.margin": 0.0},
+            r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.03 s",
+        ),
+        (
+            CHANGE | {"D": [-1, 1, 1, 1]},
+            r"^refused: proposal: found a change of D, expected changes of",
+        ),
+        (
+            CHANGE | {"observer.states": ["x.q"]},
+            r"^refused: controller\.observer\.states: found x\.q",
+        ),
         (CHANGE | {"feedforward": 1.0}, r"^refused: feedforward.*: found both a value and a group"),
         ({"observer": None}, r"^refused: proposal: found no observer, expected one"),
     ],
@@ -189,7 +218,9 @@ def test_proposal_that_loses_the_race_during_its_certificate_is_refused() -> Non
     assert flight.sentences[0].endswith("they changed meanwhile")
 
 
-def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     flight = Flight()
     flight.receive()
     flight.step()
@@ -201,15 +232,22 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(monkeyp
     monkeypatch.undo()
     assert flight.controller.digest == START.digest()
     of_q = [name in {"elevator", "thrust"} for name in START.inputs]
-    held = designed(START, with_channels_of(START, beside, of_q, [name == "elevator" for name in START.inputs]))
+    held = designed(
+        START, with_channels_of(START, beside, of_q, [name == "elevator" for name in START.inputs])
+    )
     flight.receive(flown=beside.digest())  # a model alone: the law fell back because of one
     flight.receive(held, flown=beside.digest() + 1)
-    assert [sentence.endswith("they changed meanwhile") for sentence in flight.sentences[-2:]] == [True, True]
+    assert [sentence.endswith("they changed meanwhile") for sentence in flight.sentences[-2:]] == [
+        True,
+        True,
+    ]
     flight.receive(held, flown=beside.digest())
     flight.step()
     assert flight.sentences[-1] == "flies model"
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
-    assert flight.controller.parameters.input_scale[START.inputs.index("elevator")] < 1e-6  # the law moves it no more
+    assert (
+        flight.controller.parameters.input_scale[START.inputs.index("elevator")] < 1e-6
+    )  # the law moves it no more
 
 
 def test_second_and_late_proposals_are_refused() -> None:
@@ -267,7 +305,9 @@ def test_simulated_time_waits_for_no_proposal_of_a_deactivated_law() -> None:
 
 def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None:
     updates = Updates(LearnConfig(window=30.0, updates=(10.0, 15.0), check=12.0))
-    ticks = [7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)]  # 55 s of late ticks from 7 s on
+    ticks = [
+        7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)
+    ]  # 55 s of late ticks from 7 s on
     begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
     assert begins == pytest.approx([10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
 
@@ -284,7 +324,9 @@ def test_stale_law_takes_no_model() -> None:
     flight.now_ns += nanoseconds(START.max_age) + 1
     flight.controller.tick(flight.now_ns)
     flight.step()
-    assert flight.sentences == ["refused: found the mode HOLD, expected a model only while the law is engaged"]
+    assert flight.sentences == [
+        "refused: found the mode HOLD, expected a model only while the law is engaged"
+    ]
     assert flight.controller.digest == START.digest()
 
 
@@ -311,7 +353,9 @@ def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagem
     assert flight.sentences[-1] == "flies model"
 
 
-def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behind_a_bridge(tmp_path: Path) -> None:
+def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behind_a_bridge(
+    tmp_path: Path,
+) -> None:
     scenario = find_scenario("osprey_learn")
     assert LEARNER in second_stage(scenario)
     assert LEARNER not in second_stage(scenario.vary(controller={"learn": None}))
@@ -319,11 +363,15 @@ def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behin
         "lockstep": True,
         "scenario_file": str(scenario.path),
     }
-    with pytest.raises(ValueError, match=r"controller\.learn: found a bridge, expected a simulated aircraft"):
+    with pytest.raises(
+        ValueError, match=r"controller\.learn: found a bridge, expected a simulated aircraft"
+    ):
         second_stage(scenario, bridge=True)
 
 
-def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engagement(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engagement(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     flight = Flight()
     flight.receive()
     flight.step()
@@ -344,7 +392,9 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert changes(fallen, fallen_back(START, whole, longitudinal)) == {"learn.without": None}
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive(CHANGE | {"observer.fade": 0.5})  # all parts, as of a learner that was started again
+    flight.receive(
+        CHANGE | {"observer.fade": 0.5}
+    )  # all parts, as of a learner that was started again
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     flight.now_ns += 10 * NANOSECONDS
@@ -352,7 +402,10 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
-        "falls back to the law of the start in q, V, to the end of the engagement: q oscillates at 4 Hz",
+        (
+            "falls back to the law of the start in q, V, to the end of the engagement: q "
+            "oscillates at 4 Hz"
+        ),
         "flies model, without q, V",
         "flies model, without q, V",
     ]
@@ -374,7 +427,10 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     flight.controller.retune(without_models(START, whole, START.outputs))
     flight.receive()
     flight.step()
-    refused = "refused: proposal: found no model, expected one of other outputs than q, p, r, V, by learn.without"
+    refused = (
+        "refused: proposal: found no model, expected one of other outputs than q, p, r, "
+        "V, by learn.without"
+    )
     assert flight.sentences == [refused]
     flight.now_ns += 10 * NANOSECONDS
     flight.receive({}, sentence="")  # nothing to say
@@ -398,7 +454,9 @@ def faded(time: float) -> dict[str, Any]:
     return CHANGE | {"observer.fade": time}
 
 
-def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     flight = Flight()
     flight.receive()
     flight.step()
@@ -409,7 +467,11 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(monkeypa
         "falls back to the law of the start: q diverges",
         "refused: found parameters that diverged in this engagement, expected others",
     ]
-    assert [event.kind for event in flight.events] == [EventKind.FLIES, EventKind.FALLBACK, EventKind.REFUSED]
+    assert [event.kind for event in flight.events] == [
+        EventKind.FLIES,
+        EventKind.FALLBACK,
+        EventKind.REFUSED,
+    ]
     assert flight.controller.digest == START.digest()
     flight.controller.tick(flight.now_ns, active=False)
     flight.step(1)
@@ -420,7 +482,9 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(monkeypa
     assert flight.sentences[-1] == "flies model"
 
 
-def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_has_no_further_model_after_its_second_fallback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of a learner that proposes on and on, as one whose models all have the same fault."""
     flight = Flight()
     for time in (0.5, 0.6):
@@ -437,7 +501,10 @@ def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest
         "flies model",
         "falls back to the law of the start: q diverges",
         "flies model",
-        "falls back to the law of the start, in q, V to the end of the engagement: q diverges again",
+        (
+            "falls back to the law of the start, in q, V to the end of the engagement: q diverges "
+            "again"
+        ),
         "flies model, without q, V",
         "flies model, without q, V",
     ]
@@ -446,8 +513,12 @@ def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest
         flight.receive(faded(time))
         flight.step()
     assert outputs_without(flight.controller.parameters) == START.outputs
-    assert flight.sentences[-2].endswith("in p, r to the end of the engagement: p diverges again and r diverges again")
-    assert flight.sentences[-1].startswith("refused: proposal: found no model, expected one of other outputs than q, p, r, V")
+    assert flight.sentences[-2].endswith(
+        "in p, r to the end of the engagement: p diverges again and r diverges again"
+    )
+    assert flight.sentences[-1].startswith(
+        "refused: proposal: found no model, expected one of other outputs than q, p, r, V"
+    )
     flight.controller.tick(flight.now_ns, active=False)
     flight.step(1)
     flight.now_ns += NANOSECONDS
@@ -464,17 +535,24 @@ def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest
 
 
 def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
-    """The model has 31 ms. A learner that found u 20 ms late asks for 30 ms, one that found it 40 ms late for 50 ms."""
+    """The model has 31 ms. A learner that found u 20 ms late asks for 30 ms, one that found it 40
+    ms late for 50 ms.
+    """
     flight = Flight()
     flight.receive(CHANGE | {"observer.margin": 0.05})
     flight.step()
-    assert re.search(r"unstable with u 50 ms late, expected a delay margin of at least 50 ms", flight.sentences[0])
+    assert re.search(
+        r"unstable with u 50 ms late, expected a delay margin of at least 50 ms",
+        flight.sentences[0],
+    )
     assert flight.controller.digest == START.digest()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
-    """An elevator of -0.1 and +0.4 rad: with an effect B of 56.15 / s^2 it has 5.615 rad/s^2 down and 22.46 up."""
+    """An elevator of -0.1 and +0.4 rad: with an effect B of 56.15 / s^2 it has 5.615 rad/s^2 down
+    and 22.46 up.
+    """
     whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
     assert whole.feedforward is not None
     B = tuple(sign * value for value in whole.feedforward.B)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that no aircraft can give are lost, a state that is not finite begins again, and u is a number whatever comes."""
+"""Samples that no aircraft can give are lost, a state that is not finite begins again, and u is a
+number whatever comes.
+"""
 
 from collections.abc import Iterable
 from functools import cache
@@ -31,11 +33,17 @@ NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # rad/s and m/s, of osprey_ser
 def noisy(ticks: int, seed: int = 1) -> FloatArray:
     """Samples of y, (ticks, 4): a slow motion and noise."""
     t = np.arange(ticks)[:, None] / 100.0
-    return 0.1 * np.sin(t + np.arange(4.0)) + NOISE * np.random.default_rng(seed).normal(size=(ticks, 4))
+    return 0.1 * np.sin(t + np.arange(4.0)) + NOISE * np.random.default_rng(seed).normal(
+        size=(ticks, 4)
+    )
 
 
-def flown(controller: Controller, y: Iterable[FloatArray | None], first: int = 0) -> tuple[FloatArray, list[Mode], list[str]]:
-    """The u after each tick, (T, m), the modes, and why samples are lost. None: no sample of y comes; y_m is always 0."""
+def flown(
+    controller: Controller, y: Iterable[FloatArray | None], first: int = 0
+) -> tuple[FloatArray, list[Mode], list[str]]:
+    """The u after each tick, (T, m), the modes, and why samples are lost. None: no sample of y
+    comes; y_m is always 0.
+    """
     u, modes, lost = [], [], []
     for k, value in enumerate(y, first):
         now_ns = k * PERIOD_NS
@@ -59,8 +67,12 @@ def without_sample(observed: bool) -> FloatArray:
 @pytest.mark.parametrize("observed", [False, True], ids=["law alone", "observer"])
 @pytest.mark.parametrize("channel", [0, 3])
 @pytest.mark.parametrize("size", [3.0, 35.0, -1e3, 1e6, -1e307, np.nan])
-def test_wrong_sample_is_as_one_that_did_not_arrive(observed: bool, channel: int, size: float) -> None:
-    """To the bit. Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3 rad/s and 30 m/s are above."""
+def test_wrong_sample_is_as_one_that_did_not_arrive(
+    observed: bool, channel: int, size: float
+) -> None:
+    """To the bit. Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3
+    rad/s and 30 m/s are above.
+    """
     config, unit = OBSERVER if observed else SERVO, np.array([1.0, 1.0, 1.0, 10.0])
     y = noisy(SPIKE + 60)
     y[SPIKE, channel] += size * unit[channel]
@@ -73,7 +85,9 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(observed: bool, channel: int
 
 @pytest.mark.parametrize(("channel", "bound"), [(0, 34.9066), (3, 340.0)])
 def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> None:
-    """2000 deg/s, the range of a gyro, and the speed of sound: of y and of y_m, so that the law never engages with more."""
+    """2000 deg/s, the range of a gyro, and the speed of sound: of y and of y_m, so that the law
+    never engages with more.
+    """
     controller, unit = Controller(SERVO), np.eye(4)[channel]
     for take in (controller.take_y, controller.take_y_m):
         sentence = take(StampedVector(0, 1.001 * bound * unit), 0)
@@ -85,16 +99,22 @@ def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> Non
 
 
 def test_bound_is_a_parameter() -> None:
-    config = AnyLaw.validate_mapping(SERVO.model_dump() | {"y_max": [1.0, 2.0, 3.0, 4.0]}, "controller")
+    config = AnyLaw.validate_mapping(
+        SERVO.model_dump() | {"y_max": [1.0, 2.0, 3.0, 4.0]}, "controller"
+    )
     controller = Controller(config)
-    assert controller.take_y(StampedVector(0, np.array([0.9, 1.9, 2.9, -4.1])), 0).startswith("V = -4.1 is beyond 4")
+    assert controller.take_y(StampedVector(0, np.array([0.9, 1.9, 2.9, -4.1])), 0).startswith(
+        "V = -4.1 is beyond 4"
+    )
     assert controller.take_y(StampedVector(0, np.array([0.9, -1.9, 2.9, 3.9])), 0) == ""
     with pytest.raises(ParameterError, match="y_max"):
         AnyLaw.validate_mapping(SERVO.model_dump() | {"y_max": [1.0]}, "controller")
 
 
 def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
-    """Then the law engages again, from the u of then and with the estimates of the new y: nothing is locked out for ever."""
+    """Then the law engages again, from the u of then and with the estimates of the new y: nothing
+    is locked out for ever.
+    """
     controller = Controller(OBSERVER)
     before, _, _ = flown(controller, noisy(SPIKE))
     y = noisy(3, 2) + np.array([0.0, 3.0, 0.0, 0.0])
@@ -112,7 +132,9 @@ def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
 
 
 def test_samples_that_disagree_are_all_lost() -> None:
-    """The failsafe begins as without samples, and ends with the third sample in a row that agrees."""
+    """The failsafe begins as without samples, and ends with the third sample in a row that
+    agrees.
+    """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
     garbage = 30.0 * np.where(np.arange(9)[:, None] % 2, 1.0, -1.0) * np.ones(4)
@@ -127,7 +149,9 @@ def test_samples_that_disagree_are_all_lost() -> None:
 
 
 def test_samples_that_never_agree_are_taken_again() -> None:
-    """2 rad/s more and less in turn: the possible change of 0.6 rad/s grows with the periods since the last sample taken."""
+    """2 rad/s more and less in turn: the possible change of 0.6 rad/s grows with the periods since
+    the last sample taken.
+    """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
     loud = noisy(100, 3) + 2.0 * np.where(np.arange(100)[:, None] % 2, 1.0, -1.0) * np.eye(4)[0]
@@ -150,8 +174,12 @@ def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["osprey_turbulence", "osprey_vanes", "x8_elevons"])
 def test_flights_lose_no_sample(name: str) -> None:
-    """Every sample of y after the first tick becomes a tick: gusts, turbulence, commands and engagement are possible motion."""
-    scenario = find_scenario(name, 4.0).vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
+    """Every sample of y after the first tick becomes a tick: gusts, turbulence, commands and
+    engagement are possible motion.
+    """
+    scenario = find_scenario(name, 4.0).vary(
+        aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    )
     tape = rise_di.simulate(scenario)
     ticks = tape["internals"]
     assert tape.outcome == "completed"
@@ -161,7 +189,9 @@ def test_flights_lose_no_sample(name: str) -> None:
 
 @pytest.mark.parametrize("reading", [1e308, -4.0, np.nan])
 def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -> None:
-    """A vane alone does not take y from the law: it stands still, and a vane that stands still is left out."""
+    """A vane alone does not take y from the law: it stands still, and a vane that stands still is
+    left out.
+    """
     config = find_scenario("osprey_vanes").controller
     readings = 0.02 * np.random.default_rng(2).normal(size=(SPIKE + 1, 2))
     y = np.hstack([noisy(SPIKE + 1), readings])
@@ -196,32 +226,67 @@ def test_loop_warns_of_a_lost_sample_and_of_a_new_engagement() -> None:
     loop, zero = rise_di.Loop(SERVO), np.zeros(4)
     for k in range(SPIKE):
         loop.step(k / 100.0, y=zero, y_m=zero)
-    with pytest.warns(RuntimeWarning, match=r"^sample lost at t = 1.2 s: q = 1e\+308 is beyond 34\.9"):
+    with pytest.warns(
+        RuntimeWarning, match=r"^sample lost at t = 1.2 s: q = 1e\+308 is beyond 34\.9"
+    ):
         loop.step(1.2, y=1e308 * np.eye(4)[0], y_m=zero)
     assert loop.lost
     loop.step(1.21, y=zero, y_m=zero)
     assert not loop.lost
     jumped = np.array([3.0, 0.0, 0.0, 0.0])
-    with pytest.warns(RuntimeWarning, match="sample lost at t = 1.22 s: a jump of y in 0.01 s: q from 0 to 3"):
+    with pytest.warns(
+        RuntimeWarning, match="sample lost at t = 1.22 s: a jump of y in 0.01 s: q from 0 to 3"
+    ):
         loop.step(1.22, y=jumped, y_m=zero)
-    loop.step(1.23, y=jumped, y_m=zero)  # the second of a row: no further warning, which a test makes an error
+    loop.step(
+        1.23, y=jumped, y_m=zero
+    )  # the second of a row: no further warning, which a test makes an error
     with pytest.warns(RuntimeWarning, match="the law engages again at t = 1.24 s: a jump of y"):
         loop.step(1.24, y=jumped, y_m=zero)
 
 
 LIMITS = {"lower": (-0.3,) * 4, "upper": (0.2,) * 4}
 MODELS = {key: getattr(OBSERVER, key) for key in ("feedforward", "observer")}
-LAWS = {name: AnyLaw.validate_mapping(section, "controller") for name, section in SECTIONS.items() if name != "pid"} | {
+LAWS = {
+    name: AnyLaw.validate_mapping(section, "controller")
+    for name, section in SECTIONS.items()
+    if name != "pid"
+} | {
     "rise_di": SERVO,
-    **{f"rise_di, {sign}": SERVO.model_copy(update={"sign": sign}) for sign in ("literal", "implicit")},
+    **{
+        f"rise_di, {sign}": SERVO.model_copy(update={"sign": sign})
+        for sign in ("literal", "implicit")
+    },
 }
-"""The registered laws. The observer of osprey_observer beside each: not for a good flight, but for any state."""
+"""The registered laws. The observer of osprey_observer beside each: not for a good flight, but for
+any state."""
 
 ANY = st.one_of(
-    st.sampled_from([0.0, 1e-320, 0.1, -0.5, 3.0, 30.0, 1e3, 1e6, 1e154, -1e200, 1e308, -1.7e308, np.inf, -np.inf, np.nan]),
+    st.sampled_from(
+        [
+            0.0,
+            1e-320,
+            0.1,
+            -0.5,
+            3.0,
+            30.0,
+            1e3,
+            1e6,
+            1e154,
+            -1e200,
+            1e308,
+            -1.7e308,
+            np.inf,
+            -np.inf,
+            np.nan,
+        ]
+    ),
     st.floats(),
 )
-ROWS = st.lists(st.tuples(st.tuples(ANY, ANY, ANY, ANY), st.tuples(ANY, ANY, ANY, ANY), st.integers(1, 12)), min_size=1)
+ROWS = st.lists(
+    st.tuples(st.tuples(ANY, ANY, ANY, ANY), st.tuples(ANY, ANY, ANY, ANY), st.integers(1, 12)),
+    min_size=1,
+)
 
 
 @pytest.mark.parametrize("observed", [False, True], ids=["alone", "observed"])
@@ -229,13 +294,17 @@ ROWS = st.lists(st.tuples(st.tuples(ANY, ANY, ANY, ANY), st.tuples(ANY, ANY, ANY
 @settings(max_examples=12, deadline=None)
 @given(rows=ROWS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on what is not finite
-def test_u_is_a_number_within_its_limits_whatever_comes(name: str, observed: bool, rows: list[tuple[Any, ...]]) -> None:
+def test_u_is_a_number_within_its_limits_whatever_comes(
+    name: str, observed: bool, rows: list[tuple[Any, ...]]
+) -> None:
     """Each law behind the controller, and behind the guard alone, which has no bounds of y."""
     config = LAWS[name].model_copy(update=LIMITS | (MODELS if observed else {}))
     controller, law, limits = Controller(config), config.tuned_law(), config.guard()
     state, now_ns = guard.initial_state(4), 0
     for k, (y, y_m, periods) in enumerate(rows):
-        ready = np.zeros((2, 4)) if k % 3 == 0 else np.array([y, y_m])  # zeros engage between what comes
+        ready = (
+            np.zeros((2, 4)) if k % 3 == 0 else np.array([y, y_m])
+        )  # zeros engage between what comes
         now_ns += periods * PERIOD_NS
         samples = [StampedVector(now_ns, value) for value in ready]
         controller.take_y(samples[0], now_ns)

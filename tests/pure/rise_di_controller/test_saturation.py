@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights in saturation: the effect of anti-windup and of a rate limit, and no effect without saturation.
+"""Flights in saturation: the effect of anti-windup and of a rate limit, and no effect without
+saturation.
 
-The servos are those of scenario osprey_servo, without noise, with tighter stops of one actuator. "guarded": the controller has
-the stops as its limits. "unguarded": only the actuators have them, and the integrals wind up. Everything is sampled at 100 Hz
-and integrated in steps of 5 ms: the results are within 2 % of those at 500 Hz and 2 ms, in a fifth of the time.
+The servos are those of scenario osprey_servo, without noise, with tighter stops of one actuator.
+"guarded": the controller has the stops as its limits. "unguarded": only the actuators have them,
+and the integrals wind up. Everything is sampled at 100 Hz and integrated in steps of 5 ms: the
+results are within 2 % of those at 500 Hz and 2 ms, in a fifth of the time.
 """
 
 import math
@@ -31,14 +33,20 @@ UNGUARDED: dict[str, Any] = {"lower": None, "upper": None, "slew": None}
 
 
 def with_stops(name: str, stop: float, *, guarded: bool) -> Scenario:
-    """The scenario with the stops of one actuator at -stop and stop; `guarded` is whether the controller has these limits."""
+    """The scenario with the stops of one actuator at -stop and stop; `guarded` is whether the
+    controller has these limits.
+    """
     actuators = SERVO.aircraft.actuators.model_dump()
-    lower = dict(zip(INPUTS, actuators["lower"], strict=True)) | {name: -stop}  # all stops are symmetric
+    lower = dict(zip(INPUTS, actuators["lower"], strict=True)) | {
+        name: -stop
+    }  # all stops are symmetric
     limits = np.array([lower[key] for key in SERVO.controller.inputs])
     stops = {"lower": [*lower.values()], "upper": [-value for value in lower.values()]}
     return SERVO.vary(
         aircraft={"actuators": actuators | stops},
-        controller={"lower": limits.tolist(), "upper": (-limits).tolist()} if guarded else UNGUARDED,
+        controller={"lower": limits.tolist(), "upper": (-limits).tolist()}
+        if guarded
+        else UNGUARDED,
     )
 
 
@@ -56,11 +64,15 @@ def last_beyond(t: FloatArray, values: FloatArray, bound: float) -> float:
 
 
 @cache
-def pulse_flight(name: str, stop: float, duration: float, channel: str, *edges: float, guarded: bool) -> Tape:
+def pulse_flight(
+    name: str, stop: float, duration: float, channel: str, *edges: float, guarded: bool
+) -> Tape:
     """A flight with the stops of one actuator and one pulse on a channel."""
     pulses = {channel: pulse(*edges)}
     scenario = with_stops(name, stop, guarded=guarded)
-    return simulate(scenario.vary(flight={"duration": duration}, reference_model={"pulses": pulses}))
+    return simulate(
+        scenario.vary(flight={"duration": duration}, reference_model={"pulses": pulses})
+    )
 
 
 # Aileron +-3 deg: p 0.6 rad/s from 1 s to 3 s, a flight of 12 s. 0.6 rad/s needs about 5 deg.
@@ -74,18 +86,22 @@ def aileron_flight(*, guarded: bool) -> Tape:
 @pytest.mark.parametrize(
     ("guarded", "wrong_way", "recovered", "commanded"),
     [
-        # Measured 0.0422 rad/s, 0.58 s, 5.3 deg. The prototype, with unknown timing: conditional integration 0.041, 0.65 s,
-        # 5.7 deg; back-calculation 0.058, 0.65 s, 6.3 deg.
+        # Measured 0.0422 rad/s, 0.58 s, 5.3 deg. The prototype, with unknown timing: conditional
+        # integration 0.041, 0.65 s, 5.7 deg; back-calculation 0.058, 0.65 s, 6.3 deg.
         pytest.param(True, (0.0, 0.0423), (0.0, 0.65), (0.0, 5.7), id="guarded"),
         # Measured 0.381 rad/s, 1.96 s, 53 deg. The prototype: 0.377, 1.98 s, 58 deg.
         pytest.param(False, (0.3, 0.5), (1.8, 2.2), (30.0, 90.0), id="unguarded"),
     ],
 )
 def test_aileron_recovery_after_a_saturated_roll_command(
-    guarded: bool, wrong_way: tuple[float, float], recovered: tuple[float, float], commanded: tuple[float, float]
+    guarded: bool,
+    wrong_way: tuple[float, float],
+    recovered: tuple[float, float],
+    commanded: tuple[float, float],
 ) -> None:
-    # e is negative while p is commanded. A positive e afterwards is the effect of the integrals. "recovered" is the time until
-    # e stays within 5 % of the pulse. Without anti-windup the error is nine times as large and lasts three times as long.
+    # e is negative while p is commanded. A positive e afterwards is the effect of the integrals.
+    # "recovered" is the time until e stays within 5 % of the pulse. Without anti-windup the error
+    # is nine times as large and lasts three times as long.
     tape = aileron_flight(guarded=guarded)
     e, t = error(tape)["p"], tape.time("truth")
     assert wrong_way[0] <= e[t > P_END].max() <= wrong_way[1]
@@ -94,29 +110,39 @@ def test_aileron_recovery_after_a_saturated_roll_command(
 
 
 def test_anti_windup_loses_bank_that_saturated_ailerons_missed() -> None:
-    # The integral of e_p is the bank error, so anti-windup loses bank: measured -0.49 rad, and -0.02 rad without anti-windup,
-    # where the wound-up integral restores the bank afterwards. Attitude needs an outer loop.
+    # The integral of e_p is the bank error, so anti-windup loses bank: measured -0.49 rad, and
+    # -0.02 rad without anti-windup, where the wound-up integral restores the bank afterwards.
+    # Attitude needs an outer loop.
     deficits = {}
     for guarded in (True, False):
         tape = aileron_flight(guarded=guarded)
-        deficits[guarded] = state(tape, "phi")[-1] - np.trapezoid(tape["y_m"]["p"], tape.time("y_m"))
+        deficits[guarded] = state(tape, "phi")[-1] - np.trapezoid(
+            tape["y_m"]["p"], tape.time("y_m")
+        )
     assert -0.6 < deficits[True] < -0.3
     assert abs(deficits[False]) < 0.1
 
 
-# Elevator +-3 deg: the vertical gust of the scenario at 2 s, of 1.2 s, a flight of 8 s. Without stops it needs 4.5 deg.
+# Elevator +-3 deg: the vertical gust of the scenario at 2 s, of 1.2 s, a flight of 8 s. Without
+# stops it needs 4.5 deg.
 
 
 # A slow rudder: the lateral gust of the scenario at 2 s, a flight of 10 s. It needs 46 deg/s.
 @cache
 def rudder_flight(rate_deg: float, *, limited: bool = False, sign: str = "auto") -> Tape:
     actuators = SERVO.aircraft.actuators.model_dump()
-    rate = [rate_deg * DEG if key == "rudder" else old for key, old in zip(INPUTS, actuators["rate"], strict=True)]
+    rate = [
+        rate_deg * DEG if key == "rudder" else old
+        for key, old in zip(INPUTS, actuators["rate"], strict=True)
+    ]
     slew = [rate[INPUTS.index(key)] for key in SERVO.controller.inputs] if limited else None
     return simulate(
         SERVO.vary(
             flight={"duration": 10.0},
-            aircraft={"actuators": actuators | {"rate": rate}, "gusts": {"lateral": GUSTS["lateral"] | {"start": 2.0}}},
+            aircraft={
+                "actuators": actuators | {"rate": rate},
+                "gusts": {"lateral": GUSTS["lateral"] | {"start": 2.0}},
+            },
             controller={"slew": slew, "sign": sign},
         )
     )
@@ -129,8 +155,9 @@ def end_of_r(tape: Tape) -> float:
 
 @pytest.mark.parametrize("rate_deg", [40.0, 30.0])
 def test_controller_with_rate_limit_has_no_limit_cycle(rate_deg: float) -> None:
-    # The command keeps the rate limit, so the actuator follows it. At 40 deg/s, where the limit of the actuator alone causes no
-    # limit cycle, the error in the gust is 0.083 rad/s instead of 0.073; at 30 it is 0.22 instead of a limit cycle of 0.42.
+    # The command keeps the rate limit, so the actuator follows it. At 40 deg/s, where the limit of
+    # the actuator alone causes no limit cycle, the error in the gust is 0.083 rad/s instead of
+    # 0.073; at 30 it is 0.22 instead of a limit cycle of 0.42.
     tape = rudder_flight(rate_deg, limited=True)
     commanded = np.abs(np.diff(tape["u"]["rudder"])).max() / 0.01 / DEG
     assert commanded <= rate_deg * (1.0 + 1e-9)

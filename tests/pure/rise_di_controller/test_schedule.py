@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule of input_scale over dynamic pressure: its equation, bumpless, in flight with a delay, replayed."""
+"""Schedule of input_scale over dynamic pressure: its equation, bumpless, in flight with a delay,
+replayed.
+"""
 
 from functools import cache
 
@@ -82,10 +84,14 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
     state = control_law.engage(Measurements(zero, zero, zero, zero, zero), params)
     for _ in range(20):
         y = 0.01 * rng.normal(size=4)
-        state, u = control_law.step(state, Measurements(y, zero, zero, zero, zero), np.float64(0.01), params)
+        state, u = control_law.step(
+            state, Measurements(y, zero, zero, zero, zero), np.float64(0.01), params
+        )
     instant, at_once = np.float64(1e-9), params._replace(time=np.float64(1e-9))
     y[3] += FASTER
-    moved = Measurements(y, y_at(FASTER), zero, zero, zero)  # the reference moved too: the same error
+    moved = Measurements(
+        y, y_at(FASTER), zero, zero, zero
+    )  # the reference moved too: the same error
     state, after = control_law.step(state, moved, instant, at_once)
     assert state.scale[0] == pytest.approx((SPEED / (SPEED + y[3])) ** 2)
     assert after == pytest.approx(u, rel=1e-6)
@@ -98,8 +104,11 @@ def rms(tape: Tape) -> dict[str, float]:
 
 
 def test_schedule_keeps_delayed_loop_at_rest() -> None:
-    """At 1.8 times the dynamic pressure the loop with delay stays at rest with the schedule alone."""
-    # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The margin at trim is 18 ms.
+    """At 1.8 times the dynamic pressure the loop with delay stays at rest with the schedule
+    alone.
+    """
+    # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The
+    # margin at trim is 18 ms.
     assert rms(flown(False))["q"] > 10.0
     tape = flown(True)
     assert max(rms(tape).values()) < 0.1
@@ -116,16 +125,36 @@ def test_flight_with_schedule_replayed_to_last_bit() -> None:
 
 @pytest.mark.parametrize("name", ["osprey_observer"])
 def test_model_of_trim_beside_schedule_refused(name: str) -> None:
-    with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer that holds at the trim speed"):
+    with pytest.raises(
+        ParameterError,
+        match=r"schedule: found a feedforward or an observer that holds at the trim speed",
+    ):
         find_scenario(name).vary(controller={"schedule": {"speed": 25.0}})
 
 
 def test_schedule_of_airspeed_alone_refused() -> None:
     """The factor of channel V is 1: nothing would follow the schedule."""
-    values, alone = flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump(), C172P.controller.outputs.index("V")
-    for key in ("outputs", "inputs", "D", "input_scale", "lag", "Lambda", "beta", "omega", "lower", "upper"):
+    values, alone = (
+        flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump(),
+        C172P.controller.outputs.index("V"),
+    )
+    for key in (
+        "outputs",
+        "inputs",
+        "D",
+        "input_scale",
+        "lag",
+        "Lambda",
+        "beta",
+        "omega",
+        "lower",
+        "upper",
+    ):
         values[key] = values[key][alone : alone + 1]
     for key in ("k_d", "slew", "allocation"):
         values[key] = () if key == "k_d" else None
-    with pytest.raises(ParameterError, match=r"schedule: found the outputs V, expected V among them, and one that follows V"):
+    with pytest.raises(
+        ParameterError,
+        match=r"schedule: found the outputs V, expected V among them, and one that follows V",
+    ):
         C172P.rise_di().validate_mapping(values, "controller")

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flights with the right D, which track, and with a wrong D, which diverge.
 
-Three aircraft: the Osprey with the elevator sign of textbooks (trailing edge down positive), the Osprey with rudder and aileron
-exchanged, and a plant whose Omega = C B has a positive diagonal and a negative determinant.
+Three aircraft: the Osprey with the elevator sign of textbooks (trailing edge down positive), the
+Osprey with rudder and aileron exchanged, and a plant whose Omega = C B has a positive diagonal and
+a negative determinant.
 """
 
 import math
@@ -28,7 +29,9 @@ UNLIMITED = CALM_SERVO.vary(aircraft={"actuators": {}}, controller={"lower": Non
 
 
 def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
-    """The same flight with an airframe whose positive elevator pitches the nose down; D is unchanged."""
+    """The same flight with an airframe whose positive elevator pitches the nose down; D is
+    unchanged.
+    """
     airframe = yaml.safe_load((LIBRARY / "osprey.yaml").read_text(encoding="utf-8"))
     elevator = list(airframe["inputs"]).index("elevator")
     airframe["inputs"]["elevator"]["positive"] = "trailing edge down"
@@ -45,12 +48,19 @@ def first(t: FloatArray, values: FloatArray, bound: float) -> float:
     return float(t[beyond][0]) if beyond.any() else math.inf
 
 
-@pytest.mark.parametrize("scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
+@pytest.mark.parametrize(
+    "scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")]
+)
 def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path) -> None:
     """The trailing edge down is positive."""
-    # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the prototype: 2.0 and 2.2.
-    right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
-    sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
+    # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the
+    # prototype: 2.0 and 2.2.
+    right = trailing_edge_down(scenario, tmp_path).vary(
+        controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0}
+    )
+    sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(
+        30.0 / 60.0
+    )  # no events for q after 30 s
     assert sixty_seconds <= 0.0022
 
 
@@ -66,8 +76,9 @@ def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
 
 def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
     """With the trailing edge down positive the flight diverges at the first command."""
-    # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it; the prototype: 2.38 s.
-    # It grows further, by a factor of e each 0.08 s: 34.9 rad/s, where the aircraft is lost, 0.08 ln 34.9 = 0.28 s later.
+    # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it;
+    # the prototype: 2.38 s. It grows further, by a factor of e each 0.08 s: 34.9 rad/s, where the
+    # aircraft is lost, 0.08 ln 34.9 = 0.28 s later.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
     t, e = tape.time("truth"), error(tape)["q"]
     assert np.abs(e[t < 2.0]).max() < 1e-3
@@ -78,12 +89,14 @@ def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
 
 # Below: the law and the plant without a scenario, at periods and gains that scenarios do not allow.
 
-# Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], as in the paper, dt = 0.5 ms, 4 s.
-# q 0.1 rad/s from 0.5 s to 1.5 s, p 0.4 rad/s from 1 s to 2.5 s, r coordinated. Diverged: abs(e_i) above 1, rad/s or m/s.
+# Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], as in the
+# paper, dt = 0.5 ms, 4 s. q 0.1 rad/s from 0.5 s to 1.5 s, p 0.4 rad/s from 1 s to 2.5 s, r
+# coordinated. Diverged: abs(e_i) above 1, rad/s or m/s.
 
 
-# CB = [[1, 2], [2, 1]]: x1_dot = -x1 + 0.5 x3 + u1 + 2 u2, x2_dot = -x2 - 0.5 x3 + 2 u1 + u2, x3_dot = 0.5 (x1 + x2) - x3,
-# y = (x1, x2), y_m = 0.1 (sin t, sin 1.3t), dt = 10 ms, 12 s. Diverged: abs(e_i) above 10, a hundred times the reference.
+# CB = [[1, 2], [2, 1]]: x1_dot = -x1 + 0.5 x3 + u1 + 2 u2, x2_dot = -x2 - 0.5 x3 + 2 u1 + u2,
+# x3_dot = 0.5 (x1 + x2) - x3, y = (x1, x2), y_m = 0.1 (sin t, sin 1.3t), dt = 10 ms, 12 s.
+# Diverged: abs(e_i) above 10, a hundred times the reference.
 
 OMEGA = np.array([[1.0, 2.0], [2.0, 1.0]])
 SMALL = still_air(
@@ -110,7 +123,8 @@ def fly_small(D: list[float], K: list[float]) -> FloatArray:
 )
 def test_negative_determinant_diverges_with_identity_d(K: list[float]) -> None:
     """A negative determinant with D = I diverges for every K."""
-    # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the prototype: 0.66 to 1.6 s.
+    # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the
+    # prototype: 0.66 to 1.6 s.
     assert len(fly_small([1.0, 1.0], K)) * 0.01 < 4.0
 
 
@@ -124,6 +138,6 @@ def test_negative_determinant_converges_with_22() -> None:
 
 def test_negative_determinant_diverges_without_22() -> None:
     """A negative determinant with the right D diverges where K lacks the order of (22)."""
-    # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5 leaves the damping to A.
-    # Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
+    # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5
+    # leaves the damping to A. Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
     assert 6.0 < len(fly_small([1.0, -1.0], [5.0, 5.0])) * 0.01 < 9.0

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An observer over the airspeed: the airframe at another speed, models between the speeds, flights with u late, replay."""
+"""An observer over the airspeed: the airframe at another speed, models between the speeds, flights
+with u late, replay.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -33,7 +35,9 @@ pytestmark = pytest.mark.slow
 FASTER, LATE = 1.32, 0.02  # of the trim speed; s
 OSPREY = load_airframe("osprey")
 SHIPPED = find_scenario("osprey_observer").vary(
-    aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}, flight={"duration": 12.0}
+    aircraft={"rate": 100.0, "step": 0.005},
+    reference_model={"rate": 100.0},
+    flight={"duration": 12.0},
 )
 
 
@@ -47,19 +51,36 @@ def margin(controller: RiseDiConfig, ratio: float) -> float:
     """Delay margin of a controller around the osprey at another speed, s."""
     frame = at_speed(OSPREY, ratio, "thrust")
     rows, columns = law_order(frame, controller)
-    plant = LinearPlant(frame.matrix_a() + frame.matrix_gravity(), frame.matrix_b()[:, columns], frame.matrix_c()[rows])
-    return delay_margin(plant, linear_law(controller.tuned_law(), 4, 0.01), Loop(np.array(controller.lag), 0.0, 0.01))
+    plant = LinearPlant(
+        frame.matrix_a() + frame.matrix_gravity(),
+        frame.matrix_b()[:, columns],
+        frame.matrix_c()[rows],
+    )
+    return delay_margin(
+        plant,
+        linear_law(controller.tuned_law(), 4, 0.01),
+        Loop(np.array(controller.lag), 0.0, 0.01),
+    )
 
 
 def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
-    """An aircraft of one shape moves alike along its path: frequencies and rates by a surface grow with V."""
+    """An aircraft of one shape moves alike along its path: frequencies and rates by a surface grow
+    with V.
+    """
     places = [OSPREY.index(name) for name in ("alpha", "q")]
     moved = at_speed(OSPREY, 1.3, "thrust")
     before, after = (frame.matrix_a()[np.ix_(places, places)] for frame in (OSPREY, moved))
-    assert np.sort_complex(np.linalg.eigvals(after)) == pytest.approx(1.3 * np.sort_complex(np.linalg.eigvals(before)))
-    steady = [np.linalg.solve(A, frame.matrix_b()[places, 0]) for A, frame in ((before, OSPREY), (after, moved))]
+    assert np.sort_complex(np.linalg.eigvals(after)) == pytest.approx(
+        1.3 * np.sort_complex(np.linalg.eigvals(before))
+    )
+    steady = [
+        np.linalg.solve(A, frame.matrix_b()[places, 0])
+        for A, frame in ((before, OSPREY), (after, moved))
+    ]
     assert steady[1] == pytest.approx(steady[0] * np.array([1.0, 1.3]))  # alpha as before, q with V
-    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == pytest.approx(9.81 / (1.3 * 25.0), rel=0.01)
+    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == pytest.approx(
+        9.81 / (1.3 * 25.0), rel=0.01
+    )
     vertical = moved.gust_direction("vertical")  # m/s of wind change alpha by 1 / V
     assert vertical == pytest.approx(-moved.matrix_a()[:, 1] / moved.speed, abs=0.003)
     assert moved.gust_direction("longitudinal") == pytest.approx(-moved.matrix_a()[:, 0])
@@ -80,7 +101,9 @@ def test_margin_holds_from_slow_to_fast(scheduled: RiseDiConfig) -> None:
         assert margin(scheduled.at_speed(ratio), ratio) > 0.03
 
 
-def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(scheduled: RiseDiConfig, tmp_path: Path) -> None:
+def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(
+    scheduled: RiseDiConfig, tmp_path: Path
+) -> None:
     path = tmp_path / "fast.yaml"
     path.write_text(as_yaml(at_speed(OSPREY, FASTER, "thrust")), encoding="utf-8")
     sensors = SHIPPED.aircraft.sensors.model_dump() | {"delay": LATE}
@@ -101,12 +124,16 @@ def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) ->
         law, params = controller.tuned_law()
         state = law.engage(Measurements(V, V, zero, zero, zero), params)
         for e in errors:
-            state, u = law.step(state, Measurements(V + e, V, zero, zero, zero), np.float64(0.01), params)
+            state, u = law.step(
+                state, Measurements(V + e, V, zero, zero, zero), np.float64(0.01), params
+            )
         outputs.append(u)
     assert outputs[0] == pytest.approx(outputs[1], rel=1e-9)
 
 
-def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(scheduled: RiseDiConfig) -> None:
+def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
+    scheduled: RiseDiConfig,
+) -> None:
     pulse = {"V": {"start": [1.0], "stop": [9.0], "value": [6.0]}}
     flown = SHIPPED.vary(controller=scheduled, reference_model={"pulses": pulse})
     tape = simulate(flown)
@@ -114,7 +141,9 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(schedule
     assert scale.min() < 0.75
     assert replay(tape).equal()
     step = np.abs(np.diff(tape["u"].values, axis=0)).max(axis=0)
-    fixed = np.abs(np.diff(simulate(flown.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)).max(axis=0)
+    fixed = np.abs(
+        np.diff(simulate(flown.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)
+    ).max(axis=0)
     assert (step < 1.2 * fixed).all()  # noise of the sensors moves u of both
 
 
@@ -136,18 +165,31 @@ def test_other_models_at_another_speed_leave_u_as_it_is(scheduled: RiseDiConfig,
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"slow": None}, "schedule: found a feedforward or an observer that holds at the trim speed alone"),
-        ({"slow": {"ratio": 1.1}}, "schedule: found ratios of 1.1 and 1.4, expected one below 1 and one above"),
-        ({"fast": {"F": -1.0}}, r"schedule, at 1.4 of the trim speed: observer.F: found a spectral radius"),
+        (
+            {"slow": None},
+            "schedule: found a feedforward or an observer that holds at the trim speed alone",
+        ),
+        (
+            {"slow": {"ratio": 1.1}},
+            "schedule: found ratios of 1.1 and 1.4, expected one below 1 and one above",
+        ),
+        (
+            {"fast": {"F": -1.0}},
+            r"schedule, at 1.4 of the trim speed: observer.F: found a spectral radius",
+        ),
     ],
 )
-def test_wrong_models_at_other_speeds_refused(scheduled: RiseDiConfig, changes: dict[str, Any], sentence: str) -> None:
+def test_wrong_models_at_other_speeds_refused(
+    scheduled: RiseDiConfig, changes: dict[str, Any], sentence: str
+) -> None:
     values = scheduled.model_dump()
     for name, change in changes.items():
         if change is None:
             values["schedule"][name] = None
         elif "F" in change:  # a factor
-            values["schedule"][name]["F"] = [change["F"] * value for value in values["schedule"][name]["F"]]
+            values["schedule"][name]["F"] = [
+                change["F"] * value for value in values["schedule"][name]["F"]
+            ]
         else:
             values["schedule"][name] |= change
     with pytest.raises(ParameterError, match=sentence):
@@ -158,7 +200,9 @@ LEARNS = find_scenario("osprey_learn_speeds").rise_di()
 
 
 class Learns:
-    """A controller that learns beside a schedule, at 1.2 of the trim speed for 6 s, and the proposals of its flight."""
+    """A controller that learns beside a schedule, at 1.2 of the trim speed for 6 s, and the
+    proposals of its flight.
+    """
 
     def __init__(self, scheduled: RiseDiConfig) -> None:
         self.change = designed(LEARNS, scheduled)
@@ -191,14 +235,18 @@ class Learns:
         return self.events[-1].sentence
 
 
-def test_learned_models_of_all_speeds_fly_and_go_back_at_once(scheduled: RiseDiConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learned_models_of_all_speeds_fly_and_go_back_at_once(
+    scheduled: RiseDiConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     flight = Learns(scheduled)
     assert flight.propose(flight.change) == "flies model"
     assert flight.controller.digest == flight.model.digest()
     assert {"schedule.slow.Phi", "schedule.fast.F"} <= set(flight.change)
     state, (law, params) = flight.controller.state, flight.model.tuned_law()
     assert state.y is not None
-    at_once = Measurements(state.y.value, state.y_m, np.zeros(4), state.u_trim + state.u_ff, state.u)
+    at_once = Measurements(
+        state.y.value, state.y_m, np.zeros(4), state.u_trim + state.u_ff, state.u
+    )
     _, u = law.step(state.law, at_once, np.float64(1e-9), params)
     assert u == pytest.approx(state.u, abs=1e-6)
     monkeypatch.setattr(flight.controller, "diverging", lambda: ("q",))
@@ -212,12 +260,21 @@ def test_learned_models_of_all_speeds_fly_and_go_back_at_once(scheduled: RiseDiC
         (
             "schedule.fast.F",
             -1.0,
-            "refused: controller.schedule, at 1.4 of the trim speed: observer.F: found a spectral radius",
+            (
+                "refused: controller.schedule, at 1.4 of the trim speed: observer.F: found a "
+                "spectral radius"
+            ),
         ),
-        ("schedule.speed", 2.0, "refused: controller.schedule: found 50.0 m/s, 1.0 s, models at 0.7 and 1.4 times it"),
+        (
+            "schedule.speed",
+            2.0,
+            "refused: controller.schedule: found 50.0 m/s, 1.0 s, models at 0.7 and 1.4 times it",
+        ),
     ],
 )
-def test_lie_about_another_speed_is_refused(scheduled: RiseDiConfig, name: str, factor: float, sentence: str) -> None:
+def test_lie_about_another_speed_is_refused(
+    scheduled: RiseDiConfig, name: str, factor: float, sentence: str
+) -> None:
     flight = Learns(scheduled)
     change = dict(flight.change)
     value = change[name]
@@ -236,20 +293,32 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
             "rate": 100.0,
             "pulses": {
                 "V": faster,
-                "q": {"start": [9.0, 12.0, 15.0, 18.0], "stop": [10.0, 13.0, 16.0, 19.0], "value": [-0.1, 0.1, 0.1, -0.1]},
-                "p": {"start": [10.0, 13.0, 16.0, 19.0], "stop": [11.0, 14.0, 17.0, 20.0], "value": [0.4, -0.4, -0.5, 0.5]},
+                "q": {
+                    "start": [9.0, 12.0, 15.0, 18.0],
+                    "stop": [10.0, 13.0, 16.0, 19.0],
+                    "value": [-0.1, 0.1, 0.1, -0.1],
+                },
+                "p": {
+                    "start": [10.0, 13.0, 16.0, 19.0],
+                    "stop": [11.0, 14.0, 17.0, 20.0],
+                    "value": [0.4, -0.4, -0.5, 0.5],
+                },
                 "r": {"start": [11.0, 14.0], "stop": [12.0, 15.0], "value": [0.03, -0.03]},
             },
         },
     )
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
     made = Learner(scenario.rise_di(), OSPREY, lambda start, model: start)
-    for stamp_ns, y, u in zip(ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True):
+    for stamp_ns, y, u in zip(
+        ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True
+    ):
         made.take(stamp_ns, y, u, 0)
     made.propose(0)
     found, true, file = made.identification, scenario.aircraft.sampled_airframe(), OSPREY.matrix_b()
     assert found is not None
-    assert 12.0 < len(found.recorded.t) * 0.01 < 18.5  # the seconds of the climb in speed are left out
+    assert (
+        12.0 < len(found.recorded.t) * 0.01 < 18.5
+    )  # the seconds of the climb in speed are left out
     for entry in best_known(found.entries, true.outputs):
         place = true.index(entry.row), list(true.inputs).index(entry.column)
         assert entry.nominal == pytest.approx(file[place])

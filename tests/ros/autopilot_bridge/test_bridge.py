@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the map examples/maps/ardupilot_2024.yaml.
+"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the map
+examples/maps/ardupilot_2024.yaml.
 
-tests/nodes/autopilot_bridge/test_bridge.py has what a bridge does with its messages. These tests have the commands, the flight
-with a bridge, and the ends of its process.
+tests/nodes/autopilot_bridge/test_bridge.py has what a bridge does with its messages. These tests
+have the commands, the flight with a bridge, and the ends of its process.
 """
 
 import json
@@ -46,7 +47,9 @@ FULL = math.radians(30.0)  # full deflection of a surface in the map
 EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
 PATIENT = 5.0  # s, of y and u, where a release by their age would hide another one
 MAX_AGE, RELEASE = 1.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s: a host pauses for up to a second
-LATE = 0.2  # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20 ms
+# s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20
+# ms
+LATE = 0.2
 
 
 class BridgeSetup:
@@ -60,7 +63,10 @@ class BridgeSetup:
         for name in ("q", "V", "p", "r"):
             self.change_map(outputs={name: {"max_age": MAX_AGE}})
         self.peer = peer_node
-        self.sent, self.axes = 0, list[float]()  # messages to the autopilot, and the axes of the last one
+        self.sent, self.axes = (
+            0,
+            list[float](),
+        )  # messages to the autopilot, and the axes of the last one
         peer_node.node.create_subscription(Joy, "/ap/joy", self._take, BEST_EFFORT)
 
     def _take(self, joy: Joy) -> None:
@@ -69,7 +75,9 @@ class BridgeSetup:
     def change_map(self, **changes: Any) -> None:
         """Change keys of the map; of a mapping some of its keys."""
         content = yaml.safe_load(Path(self.map).read_text(encoding="utf-8"))
-        Path(self.map).write_text(yaml.safe_dump(merged(content, changes), sort_keys=False), encoding="utf-8")
+        Path(self.map).write_text(
+            yaml.safe_dump(merged(content, changes), sort_keys=False), encoding="utf-8"
+        )
 
     def autopilot(self) -> Process:
         """Start the simulated autopilot."""
@@ -83,7 +91,9 @@ class BridgeSetup:
     def command(self, each: Callable[[], None] | None, *options: str) -> Process:
         """`rise-di engage` until it has ended, while u is published."""
         client = self._start("flight_cli.cli", "engage", *options)
-        self.peer.until(lambda: client.popen.poll() is not None, "the end of the command", each=each)
+        self.peer.until(
+            lambda: client.popen.poll() is not None, "the end of the command", each=each
+        )
         return client
 
     def send(self) -> None:
@@ -93,7 +103,10 @@ class BridgeSetup:
 
 def merged(content: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """A map with changes of it. Merged keys of YAML share one object, which stays as it is."""
-    inner = {key: merged(content[key], value) if is_part(content, key, value) else value for key, value in changes.items()}
+    inner = {
+        key: merged(content[key], value) if is_part(content, key, value) else value
+        for key, value in changes.items()
+    }
     return content | inner
 
 
@@ -109,7 +122,9 @@ def setup(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         yield BridgeSetup(start, peer_node, tmp_path)
 
 
-def test_command_engages_withdraws_and_says_what_still_releases(setup: BridgeSetup, start: Start) -> None:
+def test_command_engages_withdraws_and_says_what_still_releases(
+    setup: BridgeSetup, start: Start
+) -> None:
     """A map without a bound needs `--blind`; Ctrl-C withdraws a request that waits for a condition.
 
     A bridge that ends releases, and one that is killed leaves it to the autopilot.
@@ -139,38 +154,64 @@ def test_command_engages_withdraws_and_says_what_still_releases(setup: BridgeSet
         setup.send()
         mode.publish(UInt8(data=15))
 
-    setup.peer.until(lambda: setup.peer.last("y") and setup.peer.last("bridge/would_send"), "y and u", each=manual)
+    setup.peer.until(
+        lambda: setup.peer.last("y") and setup.peer.last("bridge/would_send"),
+        "y and u",
+        each=manual,
+    )
     refused = setup.command(manual)
     assert refused.end() == 1
-    assert "not engaged: the loss of the transmitter cannot be seen over this link: set max_engaged" in refused.output
+    assert (
+        "not engaged: the loss of the transmitter cannot be seen over this link: set max_engaged"
+        in refused.output
+    )
     client = start("flight_cli.cli", "engage", "--blind")
     waiting = "waiting: the mode is not guided (data is 10)"
     setup.peer.until(lambda: client.has_logged(waiting), "a request that waits", each=manual)
     client.interrupt()
     setup.peer.until(lambda: client.popen.poll() is not None, "the end of the command", each=manual)
     assert client.end() == 130, client.output
-    setup.peer.until(lambda: bridge.has_logged("ENGAGING -> RELEASE: disengaged by request"), "a withdrawal", each=manual)
+    setup.peer.until(
+        lambda: bridge.has_logged("ENGAGING -> RELEASE: disengaged by request"),
+        "a withdrawal",
+        each=manual,
+    )
     blind = setup.command(guided, "--blind").succeed()
-    assert "the loss of the transmitter cannot be seen over this link; released by the override by gamepad" in blind.output
+    assert (
+        "the loss of the transmitter cannot be seen over this link; released by the override by "
+        "gamepad" in blind.output
+    )
     assert setup.command(guided, "--off").end() == 0
     assert bridge.has_logged("ENGAGED -> RELEASE: disengaged by request")
 
     setup.command(guided, "--blind").succeed()
-    setup.peer.until(lambda: setup.axes and not all(map(math.isnan, setup.axes)), "messages to the autopilot", each=guided)
+    setup.peer.until(
+        lambda: setup.axes and not all(map(math.isnan, setup.axes)),
+        "messages to the autopilot",
+        each=guided,
+    )
     bridge.popen.send_signal(signal.SIGHUP)  # a bridge that ends releases
     bridge.succeed()
     setup.peer.until(lambda: all(map(math.isnan, setup.axes)), "release values")
     killed = setup.bridge()
     setup.command(guided, "--blind").succeed()
-    setup.peer.until(lambda: not all(map(math.isnan, setup.axes)), "messages to the autopilot", each=guided)
+    setup.peer.until(
+        lambda: not all(map(math.isnan, setup.axes)), "messages to the autopilot", each=guided
+    )
     timeouts = autopilot.lines.count("timeout")
     killed.popen.kill()  # one that is killed leaves it to the autopilot
-    setup.peer.until(lambda: autopilot.lines.count("timeout") > timeouts, "the autopilot's own timeout")
+    setup.peer.until(
+        lambda: autopilot.lines.count("timeout") > timeouts, "the autopilot's own timeout"
+    )
 
 
-def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
+def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
+    setup: BridgeSetup, start: Start, tmp_path: Path
+) -> None:
     setup.autopilot()
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json")
+    flight = start(
+        "flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json"
+    )
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
     refused = start("flight_cli.cli", "engage")
     setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
@@ -182,7 +223,9 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup,
     log = read_run(run)
     assert {"y", "y_m", "u", "bridge/would_send"} <= log.tape.signals.keys()
     assert "truth" not in log.tape
-    assert "internals" not in log.tape  # the law is inactive from the start: its integrals would wind up
+    assert (
+        "internals" not in log.tape
+    )  # the law is inactive from the start: its integrals would wind up
     u = log.tape["u"].values
     assert not u.any()  # what is sent at an engagement: the trim
     assert len(u) > 100  # of 450
@@ -202,18 +245,33 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
 ) -> None:
     begin = time.time()
     setup.autopilot()
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "10000", "--json")
+    flight = start(
+        "flight_cli.cli",
+        "fly",
+        str(SCENARIO),
+        "--bridge",
+        setup.map,
+        "--send",
+        "--duration",
+        "10000",
+        "--json",
+    )
     # A busy host may start the bridge later than the 10 s for which the command waits for one.
     setup.peer.until(lambda: setup.peer.node.count_publishers("bridge/engagement"), "the bridge")
     engaged = start("flight_cli.cli", "engage")  # before all nodes run: it waits for the first u
     setup.peer.until(lambda: engaged.popen.poll() is not None, "the end of the command")
     engaged.succeed()
-    setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]), "a u away from trim")
+    setup.peer.until(
+        lambda: any(any(u.position) for u in setup.peer.received["u"]), "a u away from trim"
+    )
     off = start("flight_cli.cli", "engage", "--off")
     setup.peer.until(lambda: off.popen.poll() is not None, "the end of the command")
     off.succeed()
     end_ns = time.time_ns() + 3 * NANOSECONDS  # a second beyond what is checked
-    setup.peer.until(lambda: (y := setup.peer.last("y")) and stamp_ns(y) > end_ns, "three seconds without an engagement")
+    setup.peer.until(
+        lambda: (y := setup.peer.last("y")) and stamp_ns(y) > end_ns,
+        "three seconds without an engagement",
+    )
     flight.interrupt()
     setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
     assert flight.end() == 130, flight.output
@@ -224,26 +282,38 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     tape = read_run(run).tape
     mode, t = tape["internals"]["mode"], tape.time("internals")
     delay, flies = host_delays.since(begin), t[mode == Mode.ENGAGED]
-    assert abs(engagement["start"] - flies[0]) < 1.0 + delay  # the timeout of an activation, reported when it has answered
+    assert (
+        abs(engagement["start"] - flies[0]) < 1.0 + delay
+    )  # the timeout of an activation, reported when it has answered
     assert engagement["stop"] - 0.1 - delay < flies[-1] < engagement["stop"] + LATE + delay
     u, t_u = tape["u"].values, tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
     assert (t_u > engagement["stop"] + 2.0).any()
     assert not u[t_u > engagement["stop"] + 2.0].any()
     assert (
-        summary["notes"][0] == f"engaged from {engagement['start']:.1f} s to {engagement['stop']:.1f} s: disengaged by request"
+        summary["notes"][0]
+        == f"engaged from {engagement['start']:.1f} s to {engagement['stop']:.1f} s: disengaged "
+        "by request"
     )
 
 
-def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
-    # Roll alone, 11 s in place of 52 s for four inputs: the other axes of Joy are NaN, which leaves them at trim.
+def test_identify_excites_autopilot_and_writes_what_flies_it(
+    setup: BridgeSetup, start: Start, tmp_path: Path
+) -> None:
+    # Roll alone, 11 s in place of 52 s for four inputs: the other axes of Joy are NaN, which leaves
+    # them at trim.
     content = yaml.safe_load(Path(setup.map).read_text(encoding="utf-8"))
-    content |= {"instant": "p", "outputs": {"p": content["outputs"]["p"]}, "inputs": {"aileron": content["inputs"]["aileron"]}}
+    content |= {
+        "instant": "p",
+        "outputs": {"p": content["outputs"]["p"]},
+        "inputs": {"aileron": content["inputs"]["aileron"]},
+    }
     del content["pose"], content["topics"]["/ap/airspeed"], content["topics"]["/ap/pose/filtered"]
     Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     setup.autopilot()
     options = ("--speed", "25", "--set", "amplitude=0.3", "--write", "found", "--json")
-    # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and refused it.
+    # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and
+    # refused it.
     identify = start("flight_cli.cli", "identify", "--bridge", setup.map, *options)
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
     setup.command(None).succeed()
@@ -255,11 +325,15 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup,
     airframe = load_airframe("osprey")
     p, aileron = list(airframe.states).index("p"), list(airframe.inputs).index("aileron")
     s = 0.5j / (channels["lag"] + channels["delay"])  # where a loop by the rules crosses 1
-    true = airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)  # lag of slow_autopilot.yaml
+    true = (
+        airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)
+    )  # lag of slow_autopilot.yaml
     gain = channels["Omega"] / (s + channels["damping"]) / (channels["lag"] * s + 1.0)
-    # The gain of the loop, since Omega and damping alone take each other's place where messages of 20 ms are late. 40 %: a loop
-    # with a phase margin of 54 degrees bears a factor of 2.
+    # The gain of the loop, since Omega and damping alone take each other's place where messages of
+    # 20 ms are late. 40 %: a loop with a phase margin of 54 degrees bears a factor of 2.
     assert abs(gain) == pytest.approx(abs(true), rel=0.4)
     (folder,) = tmp_path.rglob("found")
-    check = CliRunner().invoke(app, ["check", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")])
+    check = CliRunner().invoke(
+        app, ["check", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")]
+    )
     assert check.exit_code == 0, check.output

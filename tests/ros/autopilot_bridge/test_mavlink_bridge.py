@@ -29,7 +29,9 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
     content = yaml.safe_load(MAP_FILES["ardupilot_mavlink"].read_text(encoding="utf-8"))
     content["link"]["url"] = f"udpin:127.0.0.1:{port}"
     for row in (content["silence"], *content["conditions"].values()):
-        row["max_age"] = 5.0  # s: a release by the age of u, or by a condition, would hide that by the link
+        row["max_age"] = (
+            5.0  # s: a release by the age of u, or by a condition, would hide that by the link
+        )
     for row in (*content["outputs"].values(), *content["pose"].values()):
         row["max_age"] = 2.0  # s: a host pauses for up to a second
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
@@ -37,22 +39,43 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
     autopilot = start("tests.ros.mavlink_autopilot", str(SCENARIO), str(port)).wait_for("ready")
     with peer(topics=("y", "u", "bridge/would_send", "mavlink/ATTITUDE")) as node:
         bridge = start(
-            "autopilot_bridge.main", "--ros-args", "-p", f"map:={tmp_path / 'map.yaml'}", "-p", "dry_run:=false"
+            "autopilot_bridge.main",
+            "--ros-args",
+            "-p",
+            f"map:={tmp_path / 'map.yaml'}",
+            "-p",
+            "dry_run:=false",
         ).wait_for("ready")
 
         def command() -> None:
             node.command(ELEVATOR, 0.0, 0.0, 0.0)
 
         def engage(on: bool) -> str:
-            return str(node.call(SetBool, "bridge/engage", SetBool.Request(data=on), command).message)
+            return str(
+                node.call(SetBool, "bridge/engage", SetBool.Request(data=on), command).message
+            )
 
         node.until(lambda: engage(on=True) == "", "an engagement", each=command)
-        node.until(lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"), "the overridden sticks", each=command)
+        node.until(
+            lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"),
+            "the overridden sticks",
+            each=command,
+        )
         engage(on=False)
-        node.until(lambda: autopilot.lines[-1] == TRIM, "the sticks of the transmitter", each=command)
+        node.until(
+            lambda: autopilot.lines[-1] == TRIM, "the sticks of the transmitter", each=command
+        )
         (y, attitude) = (node.last(topic) for topic in ("y", "mavlink/ATTITUDE"))
         assert list(y.name) == ["q", "V", "p", "r"]
-        assert list(attitude.name) == ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"]
+        assert list(attitude.name) == [
+            "time_boot_ms",
+            "roll",
+            "pitch",
+            "yaw",
+            "rollspeed",
+            "pitchspeed",
+            "yawspeed",
+        ]
 
         node.until(lambda: engage(on=True) == "", "an engagement", each=command)
         autopilot.popen.kill()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A control law of another package over real DDS: lockstep equal to the loop in one process, and replayed."""
+"""A control law of another package over real DDS: lockstep equal to the loop in one process, and
+replayed.
+"""
 
 import os
 import shutil
@@ -25,16 +27,35 @@ from flight_log.tape_reader import read_run
 from rise_di_controller import laws
 
 OPTIONS = {"lockstep": ["--lockstep"], "composed": ["--lockstep", "--set", "composed"]}
-PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}
+PULSES = {
+    "q": {"start": [0.2], "stop": [1.0], "value": [0.1]},
+    "p": {"start": [0.4], "stop": [1.4], "value": [0.4]},
+}
 
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder into which pip installs a copy of the example; pip leaves build artefacts beside the source."""
-    copy, target = tmp_path_factory.mktemp("source") / "pid_law", tmp_path_factory.mktemp("installed")
-    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
-    options = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--target", str(target))
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(copy)], check=True, timeout=120.0)
+    """The folder into which pip installs a copy of the example; pip leaves build artefacts beside
+    the source.
+    """
+    copy, target = (
+        tmp_path_factory.mktemp("source") / "pid_law",
+        tmp_path_factory.mktemp("installed"),
+    )
+    shutil.copytree(
+        EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
+    )
+    options = (
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        "--no-build-isolation",
+        "--target",
+        str(target),
+    )
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options, str(copy)], check=True, timeout=120.0
+    )
     return target
 
 
@@ -52,7 +73,9 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
     """Two seconds of a scenario with commands and lost samples, under another controller."""
     tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
-    sections = {name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()}
+    sections = {
+        name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()
+    }
     sections["flight"]["duration"] = 2.0
     sections["reference_model"]["pulses"] = PULSES
     sections["aircraft"]["sensors"]["dropout"] = 0.2
@@ -63,8 +86,12 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
 
 
 @pytest.mark.usefixtures("_example")
-def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(start: Start, tmp_path: Path) -> None:
-    """In four processes and in one. tests/nodes/flight_bringup/test_lockstep.py flies the other laws."""
+def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
+    start: Start, tmp_path: Path
+) -> None:
+    """In four processes and in one. tests/nodes/flight_bringup/test_lockstep.py flies the other
+    laws.
+    """
     scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     runs = []
     for folder, options in OPTIONS.items():

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and of the recorder too."""
+"""Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and
+of the recorder too.
+"""
 
 import json
 import time
@@ -24,7 +26,9 @@ PEER_TOPICS = ("internals", "/diagnostics")
 
 
 def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
-    """The JSON output of `rise-di replay`, whose exit status tells a log without 99 % of the ticks."""
+    """The JSON output of `rise-di replay`, whose exit status tells a log without 99 % of the
+    ticks.
+    """
     process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
     status = process.end()
     output: dict[str, Any] = json.loads(process.output)
@@ -43,7 +47,9 @@ def receive_more(peer_node: Peer, count: int) -> None:
 def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
+    flight = start(
+        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust"))
+    )  # ended below
 
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
@@ -58,7 +64,9 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     peer_node.until(lambda: modes() == [Mode.INACTIVE], "the law inactive")
     receive_more(peer_node, 20)
     assert peer_node.transition(Transition.TRANSITION_CLEANUP)
-    assert peer_node.transition(Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
+    assert peer_node.transition(
+        Transition.TRANSITION_CONFIGURE
+    )  # the law re-engages from its last u
     assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
     peer_node.until(lambda: modes() == [Mode.ENGAGED], "the law engaged again")
     receive_more(peer_node, 50)
@@ -67,12 +75,20 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     run = tmp_path / "runs" / "latest"
     output = replayed(start, run)
     # the host can stop a tick half-way, which then publishes no u to compare
-    unsent = [note.split()[0] for note in output["notes"] if "ticks have no sample on the topic u" in note]
+    unsent = [
+        note.split()[0] for note in output["notes"] if "ticks have no sample on the topic u" in note
+    ]
     assert output["ticks"] - sum(map(int, unsent)) == output["checked"] > 150, output["notes"]
-    changes = [note.split(": ")[1] for note in output["notes"] if note.startswith("parameters changed before tick")]
+    changes = [
+        note.split(": ")[1]
+        for note in output["notes"]
+        if note.startswith("parameters changed before tick")
+    ]
     assert changes == ["Lambda, k_g", "upper"]
     # a change of one bit in one gain is detected
-    assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", equal=False)["open_loop"]
+    assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", equal=False)[
+        "open_loop"
+    ]
 
 
 def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
@@ -84,9 +100,19 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{package}.main", *parameters)
     more_than_history = publisher_qos(period).depth + 200
-    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history, "more ticks than the publishers keep")
+    peer_node.until(
+        lambda: len(peer_node.received["internals"]) > more_than_history,
+        "more ticks than the publishers keep",
+    )
     begin = time.time()
-    recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
+    recorder = start(
+        "flight_recorder.main",
+        *parameters,
+        "-p",
+        f"scenario_file:={scenario}",
+        "-p",
+        "directory:=run",
+    )
     recorder.wait_for("recording to")
     with_history = 2 * publisher_qos(period).depth
     peer_node.until(
@@ -96,7 +122,8 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     recorder.interrupt().succeed()
     output = replayed(start, tmp_path / "run")
     assert output["checked"] < 0.99 * output["expected"]
-    # the recorder is matched with one topic after the other: further first ticks may lack y or u, 7 on a busy host
+    # the recorder is matched with one topic after the other: further first ticks may lack y or u, 7
+    # on a busy host
     delayed = host_delays.since(begin) * NANOSECONDS / period
     assert 0 < output["ticks"] - output["checked"] < 50 + delayed
     assert output["checked"] > 150

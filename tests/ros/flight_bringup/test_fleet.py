@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fleets over topics: in lockstep as lone flights, in real time without an effect of one aircraft on another."""
+"""Fleets over topics: in lockstep as lone flights, in real time without an effect of one aircraft
+on another.
+"""
 
 import re
 import signal
@@ -20,14 +22,17 @@ from flight_log.tape_reader import read_run
 def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(
-        "{lockstep: true, composed: true, duration: 0.6, aircraft: {one: {}, two: {start: {east: 90.0, heading: 1.0}}}}",
+        "{lockstep: true, composed: true, duration: 0.6, aircraft: {one: {}, two: {start: "
+        "{east: 90.0, heading: 1.0}}}}",
         encoding="utf-8",
     )
     fleet = read_fleet(file)
     for flown in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
         assert flown.outcome == "completed"
         recorded, alone = read_run(flown.run), simulate(flown.member.scenario)
-        assert {topic.split("/")[1] for topic in recorded.topics if topic.endswith(("/y", "/u"))} == {flown.member.name}
+        assert {
+            topic.split("/")[1] for topic in recorded.topics if topic.endswith(("/y", "/u"))
+        } == {flown.member.name}
         for name in ("y", "y_m", "u_m", "u", "pose"):
             of_log, of_simulation = recorded.tape[name], alone[name]
             assert len(of_log.stamp_ns) > 20
@@ -36,19 +41,28 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
             assert values.tobytes() == of_simulation.values.tobytes(), (flown.member.name, name)
 
 
-def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(start: Start, tmp_path: Path) -> None:
-    (tmp_path / "fleet.yaml").write_text("{composed: true, aircraft: {one: {}, two: {}}}", encoding="utf-8")
+def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(
+    start: Start, tmp_path: Path
+) -> None:
+    (tmp_path / "fleet.yaml").write_text(
+        "{composed: true, aircraft: {one: {}, two: {}}}", encoding="utf-8"
+    )
     fleet = start("flight_cli.cli", "fly", "fleet.yaml")
 
     def engaged(name: str) -> bool:
-        return any("OFF -> ENGAGED" in log.read_text() for log in tmp_path.glob(f"runs/*-{name}-*/log/one_process.log"))
+        return any(
+            "OFF -> ENGAGED" in log.read_text()
+            for log in tmp_path.glob(f"runs/*-{name}-*/log/one_process.log")
+        )
 
     fleet.until(lambda: engaged("one") and engaged("two"), "both aircraft engaged")
     target = [sys.executable, "-m", "flight_cli.cli", "guide", "heading=90"]
     missing = subprocess.Popen(target, stderr=subprocess.PIPE, text=True)
     nodes = fleet.children()
     next(node for node in nodes if "__ns:=/one" in node.cmdline()).kill()
-    commanded = subprocess.run([*target, "--namespace", "two"], check=False, capture_output=True, text=True)
+    commanded = subprocess.run(
+        [*target, "--namespace", "two"], check=False, capture_output=True, text=True
+    )
     assert commanded.returncode == 0, commanded.stderr
     assert re.search("aircraft fly in (/one, )?/two: --namespace", missing.communicate()[1])
     fleet.interrupt()

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -32,14 +33,23 @@ def engaged(start: Start, tmp_path: Path) -> Engaged:
 
 def is_engaged(folder: Path) -> bool:
     """Whether the controller of a flight below a folder has engaged."""
-    return any("ENGAGED" in log.read_text(encoding="utf-8") for log in folder.glob("runs/*/log/controller.log"))
+    return any(
+        "ENGAGED" in log.read_text(encoding="utf-8")
+        for log in folder.glob("runs/*/log/controller.log")
+    )
 
 
-def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start, engaged: Engaged, tmp_path: Path) -> None:
-    """The first by one interrupt, the one beside it by three: the further ones do not interrupt its shutdown."""
+def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
+    start: Start, engaged: Engaged, tmp_path: Path
+) -> None:
+    """The first by one interrupt, the one beside it by three: the further ones do not interrupt its
+    shutdown.
+    """
     flight, nodes = engaged
     assert len(nodes) == 4
-    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
+    beside = start(
+        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs"
+    )
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
     flight.interrupt()
@@ -68,8 +78,19 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start
 
 def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
     terminal, of_flight = pty.openpty()
-    words = [*DEFAULT_SIGHUP, "setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
-    flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
+    words = [
+        *DEFAULT_SIGHUP,
+        "setsid",
+        "--ctty",
+        sys.executable,
+        "-m",
+        "flight_cli.cli",
+        "fly",
+        "osprey_gust",
+    ]
+    flight = subprocess.Popen(
+        words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight
+    )
     os.close(of_flight)
     try:
         until(lambda: is_engaged(tmp_path), "a flight that has engaged")
@@ -84,10 +105,15 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
 
 
 def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
-    for seconds in (0.3, 0.6):  # of processor time; an earlier interrupt stops the interpreter itself
+    # Seconds of processor time; an earlier interrupt stops the interpreter itself.
+    for seconds in (0.3, 0.6):
         flight = start("flight_cli.cli", "fly", "osprey_gust")
         used = psutil.Process(flight.popen.pid).cpu_times
-        flight.until(lambda: used().user + used().system >= seconds, "the processor time of the interrupt")  # noqa: B023
+
+        def is_due(used: Any = used, seconds: float = seconds) -> bool:
+            return bool(used().user + used().system >= seconds)
+
+        flight.until(is_due, "the processor time of the interrupt")
         nodes = flight.children()
         flight.interrupt()
         assert flight.end() in {130, -signal.SIGINT}, flight.output
@@ -99,12 +125,17 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
     flight, nodes = engaged
-    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
+    beside = start(
+        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs"
+    )
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
     refused = start("flight_cli.cli", "fly", "osprey_gust")
     assert refused.end() == 2
-    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in refused.output
+    assert (
+        "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own"
+        in refused.output
+    )
     flight.child("rise_di_controller.main").kill()
     beside.popen.kill()
     assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The way of the pose to FlightGear over UDP; tests/nodes/flight_bringup/test_flightgear.py has its packet."""
+"""The way of the pose to FlightGear over UDP; tests/nodes/flight_bringup/test_flightgear.py has its
+packet.
+"""
 
 import socket
 import time
@@ -29,7 +31,13 @@ def test_pose_of_flight_reaches_flightgear(start: Start, peer_node: Peer) -> Non
             except BlockingIOError:
                 return
 
-        words = ("--set", "origin=47.38,8.54", "--set", "altitude=400", f"--flightgear=127.0.0.1:{viewer.getsockname()[1]}")
+        words = (
+            "--set",
+            "origin=47.38,8.54",
+            "--set",
+            "altitude=400",
+            f"--flightgear=127.0.0.1:{viewer.getsockname()[1]}",
+        )
         command = start("flight_cli.cli", "watch", "--namespace", "uav1", *words)
         peer_node.until(lambda: bool(received), "a packet for FlightGear", each=send)
     assert [fields(raw)["altitude"] for raw in received] == [450.0]  # m above sea level

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lockstep over real DDS: repeatable to the byte, equal to the loop in one process, and free of deadlocks."""
+"""Lockstep over real DDS: repeatable to the byte, equal to the loop in one process, and free of
+deadlocks.
+"""
 
 import json
 import re
@@ -29,23 +31,36 @@ from flight_log.tape_reader import read_run
 
 TOPICS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
-# All random inputs of a scenario, and late or lost samples: at their instants a message has no channels.
+# All random inputs of a scenario, and late or lost samples: at their instants a message has no
+# channels.
 ROUGH = {
     "turbulence": {"altitude": 100.0, "wind": 7.7, "seed": 1},
     "uncertainty": {"A": 0.2, "B": 0.2, "seed": 7},
     "gusts": {"vertical": {"start": 0.5, "speed": 10.12, "length": 15.24}},
-    "sensors": {"noise": [0.0017, 0.03, 0.0017, 0.0017], "drift": [0.0001] * 4, "delay": 0.01, "dropout": 0.2, "seed": 7},
+    "sensors": {
+        "noise": [0.0017, 0.03, 0.0017, 0.0017],
+        "drift": [0.0001] * 4,
+        "delay": 0.01,
+        "dropout": 0.2,
+        "seed": 7,
+    },
 }
 
 
-def scenario_file(folder: Path, duration: float, name: str = "osprey_servo", **sections: Mapping[str, Any]) -> Path:
+def scenario_file(
+    folder: Path, duration: float, name: str = "osprey_servo", **sections: Mapping[str, Any]
+) -> Path:
     """A shortened scenario with changes to its sections."""
-    return recordings.scenario_file(folder / "rough.yaml", find_scenario(name).path, flight={"duration": duration}, **sections)
+    return recordings.scenario_file(
+        folder / "rough.yaml", find_scenario(name).path, flight={"duration": duration}, **sections
+    )
 
 
 def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0) -> Path:
     """Fly to the end; return the folder of the run."""
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}", *options)
+    command = start(
+        "flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}", *options
+    )
     assert command.end() == status, command.output
     return scenario.parent / runs / "latest"
 
@@ -78,12 +93,21 @@ def with_limits(path: Path) -> Path:
     return recordings.scenario_file(path, path, controller=as_json | limits)
 
 
-def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are_replayed(start: Start, tmp_path: Path) -> None:
+def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are_replayed(
+    start: Start, tmp_path: Path
+) -> None:
     scenario = with_limits(scenario_file(tmp_path, 2.5, aircraft=ROUGH))
     with both_cores_busy():
         busy = tmp_path / "busy"  # without the command, in the process of its caller
-        assert fly_over_topics(load_scenario(scenario), busy, lambda t, shown: None, lockstep=True) == "completed"
-    runs = [busy, fly(start, scenario, "idle"), fly(start, scenario, "together", "--set", "composed")]
+        assert (
+            fly_over_topics(load_scenario(scenario), busy, lambda t, shown: None, lockstep=True)
+            == "completed"
+        )
+    runs = [
+        busy,
+        fly(start, scenario, "idle"),
+        fly(start, scenario, "together", "--set", "composed"),
+    ]
     first, *others = map(payloads, runs)
     for topic in TOPICS:
         assert all(first[topic] == payload[topic] for payload in others), topic
@@ -108,13 +132,19 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
 def nodes(start: Start, scenario: Path, run: str) -> dict[str, Process]:
     """The four nodes, started one by one as a user does, in an endless lockstep flight."""
     overrides = {
-        "recorder": ("flight_recorder", ["-p", f"directory:={run}", "-p", f"scenario_file:={scenario}"]),
+        "recorder": (
+            "flight_recorder",
+            ["-p", f"directory:={run}", "-p", f"scenario_file:={scenario}"],
+        ),
         "controller": ("rise_di_controller", ["-p", "y_rate:=500.0"]),
         "reference_model": ("reference_model", []),
         "aircraft": ("aircraft_sim", ["-p", "control_rate:=100.0", "-p", "recorded:=true"]),
     }
     shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true")
-    return {role: start(f"{package}.main", *shared, *words) for role, (package, words) in overrides.items()}
+    return {
+        role: start(f"{package}.main", *shared, *words)
+        for role, (package, words) in overrides.items()
+    }
 
 
 FIRST_CHUNKS = 100_000  # bytes of a log
@@ -146,9 +176,15 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
 
 def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:
     wrong = {"D": [-1, 1, 1, 1]}
-    scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)  # no saturation limits the wrong input
+    scenario = scenario_file(
+        tmp_path, 60.0, "osprey_gust", controller=wrong
+    )  # no saturation limits the wrong input
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", "runs=runs")
     assert command.end() == 3, command.output
-    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
-    assert re.fullmatch(r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"])
+    summary = json.loads(
+        (tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
+    )
+    assert re.fullmatch(
+        r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"]
+    )
     assert summary["duration"] > 1.0

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `node_state`: readiness and completion of nodes, for late subscribers and for the process runner."""
+"""The topic `node_state`: readiness and completion of nodes, for late subscribers and for the
+process runner.
+"""
 
 import json
 import time
@@ -20,14 +22,18 @@ from flight_ros.topics import NODE_STATE, START, STATE, STATES
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
     """The newest state by process, filled while the peer spins."""
     states: dict[str, str] = {}
-    peer_node.node.create_subscription(KeyValue, topic, lambda message: states.update({message.key: message.value}), STATES)
+    peer_node.node.create_subscription(
+        KeyValue, topic, lambda message: states.update({message.key: message.value}), STATES
+    )
     return states
 
 
 def test_state_of_each_process_for_late_subscriber_and_monitor_and_aircraft_that_waits_for_start(
     start_node: Start, osprey_gust: Scenario
 ) -> None:
-    """The aircraft is matched with the publisher of u before t = 0, and its y have stamps from t = 0 on."""
+    """The aircraft is matched with the publisher of u before t = 0, and its y have stamps from t =
+    0 on.
+    """
     in_namespace = ("-r", "__ns:=/one")
     nodes = {
         "controller": start_node("rise_di_controller", *in_namespace),
@@ -38,14 +44,24 @@ def test_state_of_each_process_for_late_subscriber_and_monitor_and_aircraft_that
     with peer(topics=("/one/y",)) as peer_node:
         states = received_states(peer_node, "/one/node_state")
         send = peer_node.node.create_publisher(START.type, f"/one/{START.name}", STATE)
-        expected = {"controller": "ready", "aircraft": "matched"}  # the controller lacks the publisher of y_m
+        expected = {
+            "controller": "ready",
+            "aircraft": "matched",
+        }  # the controller lacks the publisher of y_m
         peer_node.until(
-            lambda: states == {f"/one/{name}#{node.popen.pid}": expected[name] for name, node in nodes.items()},
+            lambda: (
+                states
+                == {f"/one/{name}#{node.popen.pid}": expected[name] for name, node in nodes.items()}
+            ),
             "the state of each process",
         )
-        with FlightMonitor(osprey_gust.controller.outputs, lockstep=True, namespace="one") as monitor:
+        with FlightMonitor(
+            osprey_gust.controller.outputs, lockstep=True, namespace="one"
+        ) as monitor:
             pid = nodes["controller"].popen.pid
-            nodes["controller"].until(lambda: monitor.is_ready("controller", pid), "a controller that is ready")
+            nodes["controller"].until(
+                lambda: monitor.is_ready("controller", pid), "a controller that is ready"
+            )
             assert not monitor.is_ready("controller", pid + 1)
             assert not monitor.is_ready("recorder", pid)
         assert peer_node.received["/one/y"] == []
@@ -62,10 +78,15 @@ def test_aircraft_completes_lockstep_flight_and_process_has_id(
 ) -> None:
     short = osprey_gust.vary(flight={"duration": 0.2})
     overrides = parameter_overrides(ONE_PROCESS, short, tmp_path, 0.0, lockstep=True)
-    words = [word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
+    words = [
+        word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")
+    ]
     flight = start_node("flight_bringup", *words).wait_for("flight completed at t = 0.2 s")
     with peer(topics=()) as peer_node:
         states = received_states(peer_node)
         roles = ("aircraft", "controller", "recorder", "reference_model")
-        expected = {f"/{role}#{flight.popen.pid}": "completed" if role == "aircraft" else "ready" for role in roles}
+        expected = {
+            f"/{role}#{flight.popen.pid}": "completed" if role == "aircraft" else "ready"
+            for role in roles
+        }
         peer_node.until(lambda: states == expected, "the completed flight and the ready nodes")

@@ -36,7 +36,9 @@ def test_node_that_cannot_start_ends_with_status_2_and_one_sentence(start: Start
         "failed to initialize rcl: Couldn't parse params file": start(
             "rise_di_controller.main", "--ros-args", "--params-file", "nowhere.yaml"
         ),
-        "FASTRTPS_DEFAULT_PROFILES_FILE: /nowhere/profile.xml cannot be read": start("aircraft_sim.main", within=no_profile),
+        "FASTRTPS_DEFAULT_PROFILES_FILE: /nowhere/profile.xml cannot be read": start(
+            "aircraft_sim.main", within=no_profile
+        ),
     }
     usage = start("rise_di_controller.main", "--help").succeed()
     assert usage.output.startswith("usage: ")
@@ -46,9 +48,14 @@ def test_node_that_cannot_start_ends_with_status_2_and_one_sentence(start: Start
         assert "Traceback" not in node.output
     for package, executable in NODES.items():
         script = REPOSITORY / "ros_ws" / "install" / package / "lib" / package / executable
-        process = subprocess.run([script], capture_output=True, text=True, timeout=HANG, check=False)
+        process = subprocess.run(
+            [script], capture_output=True, text=True, timeout=HANG, check=False
+        )
         assert process.returncode == 2
-        assert f"error: {executable}: found no parameters, expected a section for /{executable}" in process.stderr
+        assert (
+            f"error: {executable}: found no parameters, expected a section for /{executable}"
+            in process.stderr
+        )
 
 
 def test_waiting_nodes_report_unfit_publishers_and_shut_down_cleanly(start_node: Start) -> None:
@@ -58,21 +65,34 @@ def test_waiting_nodes_report_unfit_publishers_and_shut_down_cleanly(start_node:
     aircraft.wait_for("waiting for /u: no publisher")
     with peer(topics=()) as peer_node:
         peer_node.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))
-        aircraft.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
+        aircraft.wait_for(
+            "/u: /peer publishes std_msgs/msg/Float64MultiArray, expected "
+            "sensor_msgs/msg/JointState"
+        )
         recorder = start_node("flight_recorder")
-        peer_node.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+        peer_node.node.create_publisher(
+            JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
         recorder.wait_for("/truth: /peer publishes with incompatible quality of service")
     controller.interrupt()
     recorder.popen.terminate()
-    for _ in range(50):  # a lock in the signal handler would deadlock: the second signal interrupts the first handler
+    for _ in range(
+        50
+        # a lock in the signal handler would deadlock: the second signal interrupts the first
+        # handler
+    ):
         aircraft.popen.send_signal(signal.SIGTERM)
         aircraft.popen.send_signal(signal.SIGINT)
     for node in (controller, recorder, aircraft):
         assert "Traceback" not in node.succeed().output
 
 
-def test_start_has_early_participant_and_late_replies_leave_controller_ticks(start_node: Start, peer_node: Peer) -> None:
-    """The middleware blocks for 0.1 s before a reply whose reader does not match: here one that requires another durability."""
+def test_start_has_early_participant_and_late_replies_leave_controller_ticks(
+    start_node: Start, peer_node: Peer
+) -> None:
+    """The middleware blocks for 0.1 s before a reply whose reader does not match: here one that
+    requires another durability.
+    """
     stopped = start_node("rise_di_controller")
     early_participant = f"_start_{stopped.popen.pid}"
     # The start may be faster than the discovery.
@@ -84,36 +104,61 @@ def test_start_has_early_participant_and_late_replies_leave_controller_ticks(sta
     assert "Traceback" not in stopped.succeed().output
 
     node = start_node("rise_di_controller").wait_for("ready")
-    peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"}, "no early participant")
+    peer_node.until(
+        lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"},
+        "no early participant",
+    )
     unmatched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    client = peer_node.node.create_client(SetParameters, "controller/set_parameters", qos_profile=unmatched)
+    client = peer_node.node.create_client(
+        SetParameters, "controller/set_parameters", qos_profile=unmatched
+    )
     request = SetParameters.Request(parameters=[Parameter("k_g", value=0.5).to_parameter_msg()])
 
     def changes() -> list[float]:
-        return [float(stamp) for stamp in re.findall(r"\[([\d.]+)\] \[controller\]: k_g: ", node.output)]
+        return [
+            float(stamp) for stamp in re.findall(r"\[([\d.]+)\] \[controller\]: k_g: ", node.output)
+        ]
 
-    peer_node.until(lambda: len(changes()) >= 3, "three changes of a gain", each=lambda: client.call_async(request))
+    peer_node.until(
+        lambda: len(changes()) >= 3,
+        "three changes of a gain",
+        each=lambda: client.call_async(request),
+    )
     assert np.diff(changes()).min() > 0.9  # s; without a pause 0.11
 
 
-def test_no_module_imported_by_ready_node(start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer) -> None:
+def test_no_module_imported_by_ready_node(
+    start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer
+) -> None:
     # A library function that imports modules at its first call would do so inside a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
     nodes = [start_node(package) for package in NODES]
 
     def reports(name: str) -> int:
-        return sum(message.status[0].name == f"/{name}" for message in peer_node.received["/diagnostics"])
+        return sum(
+            message.status[0].name == f"/{name}" for message in peer_node.received["/diagnostics"]
+        )
 
-    peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()), "three reports of each node")
+    peer_node.until(
+        lambda: all(reports(name) >= 3 for name in NODES.values()), "three reports of each node"
+    )
     assert any("ENGAGED" in node.output for node in nodes)
     for node in nodes:
-        assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
+        assert [
+            line
+            for line in node.output.partition("]: ready")[2].splitlines()
+            if "import time:" in line
+        ] == []
 
 
 def test_node_of_longer_period_has_lower_real_time_priority(start_node: Start) -> None:
     packages = {"reference_model": 50, "rise_di_controller": 49, "flight_recorder": 47}
-    nodes = {package: start_node(package, within=with_policy("--fifo", "50")) for package in packages}
+    nodes = {
+        package: start_node(package, within=with_policy("--fifo", "50")) for package in packages
+    }
     for package, node in nodes.items():
         threads = psutil.Process(node.wait_for("ready").popen.pid).threads()
-        assert {os.sched_getparam(thread.id).sched_priority for thread in threads} == {packages[package]}
+        assert {os.sched_getparam(thread.id).sched_priority for thread in threads} == {
+            packages[package]
+        }
         node.interrupt().succeed()

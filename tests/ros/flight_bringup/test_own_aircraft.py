@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The shells of docs/ros.md that start single nodes run as they stand, each in a shell of its own, to their last command."""
+"""The shells of docs/ros.md that start single nodes run as they stand, each in a shell of its own,
+to their last command.
+"""
 
 import re
 import signal
@@ -23,7 +25,9 @@ FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
 
 
 def shells(section: str) -> tuple[list[str], list[str]]:
-    """The lines of a section that each shell begins with, and the commands, each of a shell of its own."""
+    """The lines of a section that each shell begins with, and the commands, each of a shell of its
+    own.
+    """
     text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     text = re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     lines = re.findall(r"^    (\S.*)$", text, re.MULTILINE)
@@ -33,7 +37,9 @@ def shells(section: str) -> tuple[list[str], list[str]]:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A folder with what the commands of a page need of a checkout, and the programs of the page."""
+    """A folder with what the commands of a page need of a checkout, and the programs of the
+    page.
+    """
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
     (program,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -52,7 +58,9 @@ def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 @pytest.mark.parametrize("section", ["Nodes one by one", "Your own aircraft"])
-def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, shell: list[subprocess.Popen[bytes]]) -> None:
+def test_shells_of_page_run_to_the_last_command(
+    section: str, checkout: Path, shell: list[subprocess.Popen[bytes]]
+) -> None:
     common, commands = shells(section)
     nodes = [command for command in commands if "rise-di " not in command]
     after = [command for command in commands if command not in nodes]
@@ -63,13 +71,18 @@ def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, sh
             script = "\n".join([*common, f"exec {command}"])
             shell.append(
                 subprocess.Popen(
-                    [*end_with_parent(), "bash", "-c", script], cwd=checkout, stdout=output, stderr=subprocess.STDOUT
+                    [*end_with_parent(), "bash", "-c", script],
+                    cwd=checkout,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
                 )
             )
     recorder = shell[-1]
 
     def texts() -> str:
-        return "\n".join(path.read_text(encoding="utf-8") for path in sorted(checkout.glob("*.txt")))
+        return "\n".join(
+            path.read_text(encoding="utf-8") for path in sorted(checkout.glob("*.txt"))
+        )
 
     def flies() -> bool:
         assert [process.poll() for process in shell] == [None] * len(shell), texts()
@@ -87,7 +100,9 @@ def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, sh
     until(commanded, "a log with a command")
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(timeout=60) == 0
-    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")  # of the recorder
+    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(
+        encoding="utf-8"
+    )  # of the recorder
     for command in after:
         done = subprocess.run(
             ["/bin/bash", "-c", "\n".join([*common, command])],
@@ -97,8 +112,12 @@ def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, sh
             timeout=120,
             check=False,
         )
-        assert done.returncode in {0, 4}, done.stdout + done.stderr  # 4: the recorder began after the controller
+        assert done.returncode in {0, 4}, (
+            done.stdout + done.stderr
+        )  # 4: the recorder began after the controller
     tape = read_run(checkout / "runs" / "latest").tape
     q, reference = (abs(tape[topic]["q"]) for topic in ("y", "y_m"))
     assert len(q) > SAMPLES
-    assert max(q) > 0.7 * max(reference) > 0.0  # without control q of the page's aircraft would stay 0
+    assert (
+        max(q) > 0.7 * max(reference) > 0.0
+    )  # without control q of the page's aircraft would stay 0

@@ -20,7 +20,15 @@ from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, parameter_override
 from flight_bringup.monitor import FlightMonitor
 
 SETTLED = 1.0  # s without a change of the graph
-POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "flight_bringup" / "security" / "flight.policy.xml"
+POLICY = (
+    REPOSITORY
+    / "ros_ws"
+    / "src"
+    / "flight_bringup"
+    / "flight_bringup"
+    / "security"
+    / "flight.policy.xml"
+)
 
 
 class Access(NamedTuple):
@@ -37,7 +45,9 @@ class Access(NamedTuple):
 
 
 def in_full(name: str, node: str) -> str:
-    """The full name, resolved as in the policy format: "~" is the node's name; the namespace is the root."""
+    """The full name, resolved as in the policy format: "~" is the node's name; the namespace is the
+    root.
+    """
     return f"/{node}/{name[1:]}" if name.startswith("~") else f"/{name.removeprefix('/')}"
 
 
@@ -68,7 +78,9 @@ def graph(peer_node: Peer, node: str) -> Access:
 
 
 def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
-    """The topics and services of the nodes, once the discovery has settled: its endpoints are discovered one by one."""
+    """The topics and services of the nodes, once the discovery has settled: its endpoints are
+    discovered one by one.
+    """
     found: dict[str, Access] = {}
     changed = time.monotonic()
 
@@ -88,7 +100,10 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
-FURTHER = {"guidance": (GUIDANCE, "osprey_route"), "learner": (LEARNER, "osprey_learn")}  # nodes that few scenarios have
+FURTHER = {
+    "guidance": (GUIDANCE, "osprey_route"),
+    "learner": (LEARNER, "osprey_learn"),
+}  # nodes that few scenarios have
 
 
 def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
@@ -97,10 +112,20 @@ def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
     for spec, name in FURTHER.values():
         scenario = find_scenario(name)
         overrides = parameter_overrides(spec, scenario, run, ON_START, lockstep=lockstep)
-        words = (word for key, value in overrides.items() for word in ("-p", f"{key}:={json.dumps(value)}"))
-        processes.append(start(spec.module, "--ros-args", "--params-file", str(scenario.path), *words))
+        words = (
+            word
+            for key, value in overrides.items()
+            for word in ("-p", f"{key}:={json.dumps(value)}")
+        )
+        processes.append(
+            start(spec.module, "--ros-args", "--params-file", str(scenario.path), *words)
+        )
     if not lockstep:
-        processes.append(start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}"))
+        processes.append(
+            start(
+                "autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}"
+            )
+        )
     return processes
 
 
@@ -109,8 +134,14 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
 ) -> None:
     """In a flight in real time with a learner, and in one in lockstep without."""
     policy, learning = allowed(), str(find_scenario("osprey_learn").path)
-    processes = [start_node(package, "-p", "start_time:=-1.0") for package in ("reference_model", "aircraft_sim")]
-    processes += [start("rise_di_controller.main", "--ros-args", "--params-file", learning), start_node("flight_recorder")]
+    processes = [
+        start_node(package, "-p", "start_time:=-1.0")
+        for package in ("reference_model", "aircraft_sim")
+    ]
+    processes += [
+        start("rise_di_controller.main", "--ros-args", "--params-file", learning),
+        start_node("flight_recorder"),
+    ]
     processes += start_further(start, tmp_path, lockstep=False)
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=False, learns=True):
         real_time = discovered(peer_node, (*ROLES, *FURTHER, "bridge", "monitor"))
@@ -122,25 +153,44 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
         process.end()
     peer_node.until(lambda: peer_node.node.get_node_names() == ["peer"], "the end of the nodes")
 
-    overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
+    overrides = [f"{role}:lockstep:=true" for role in ROLES] + [
+        "aircraft:control_rate:=100.0",
+        "controller:y_rate:=500.0",
+    ]
     overrides.append(f"recorder:directory:={tmp_path / 'run'}")
     start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
     start_further(start, tmp_path, lockstep=True)
     lockstep = discovered(peer_node, (*ROLES, *FURTHER))
-    further = {"guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)}  # where tf2_msgs is installed
+    further = {
+        "guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)
+    }  # where tf2_msgs is installed
     for role in lockstep:
-        assert real_time[role].merged(lockstep[role]).merged(further.get(role, lockstep[role])) == policy[role], role
+        assert (
+            real_time[role].merged(lockstep[role]).merged(further.get(role, lockstep[role]))
+            == policy[role]
+        ), role
 
 
 def check_bridge(own: Access, policy: Access) -> None:
     """Check the policy of the bridge: what it has with one map, and what the other maps add."""
     used = [row for name in MAP_FILES for row in named_map(name).used_topics()]
-    sent, received = ([row for row in used if row[0].startswith("messages.") is is_sent] for is_sent in (True, False))
+    sent, received = (
+        [row for row in used if row[0].startswith("messages.") is is_sent]
+        for is_sent in (True, False)
+    )
     # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
     requested = {topic for _, topic, kind in sent if "/srv/" in kind}
-    published = {in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")} - requested
-    published |= {in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")}
-    subscribed = {in_full(topic, "bridge") for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
+    published = {
+        in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")
+    } - requested
+    published |= {
+        in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")
+    }
+    subscribed = {
+        in_full(topic, "bridge")
+        for _, topic, kind in received
+        if not kind.startswith(f"{MAVLINK}/")
+    }
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe
     assert (own.reply, own.request | requested) == (policy.reply, policy.request)

@@ -32,7 +32,10 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
         ("start: 40.0", "start: 7.0"),
         ("start: 46.0", "start: 9.5"),
         ("{start: [10.0], stop: [30.0]", "{start: [1.0], stop: [30.0]"),
-        ("{start: [12.0, 17.0, 20.0, 24.0], stop: [13.5, 18.5,", "{start: [1.0, 4.0, 20.0, 24.0], stop: [2.0, 5.0,"),
+        (
+            "{start: [12.0, 17.0, 20.0, 24.0], stop: [13.5, 18.5,",
+            "{start: [1.0, 4.0, 20.0, 24.0], stop: [2.0, 5.0,",
+        ),
     ):
         assert old in text
         text = text.replace(old, new)
@@ -54,9 +57,10 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
 ) -> None:
     scenario = load_scenario(short_scenario)
     bound = 1.5 * rms(tracking_error(simulate(scenario)).values)
-    # The bounds are for the loop, not for the host. Such a flight is repeated, at most three times. Host delays count that made
-    # the controller late by more than a quarter of its period, or the aircraft or the reference model by more than a sample.
-    # Those of u on its way to the aircraft are in no topic, so that one flight beyond the bounds proves nothing.
+    # The bounds are for the loop, not for the host. Such a flight is repeated, at most three times.
+    # Host delays count that made the controller late by more than a quarter of its period, or the
+    # aircraft or the reference model by more than a sample. Those of u on its way to the aircraft
+    # are in no topic, so that one flight beyond the bounds proves nothing.
     delays = []
     for _ in range(4):
         start("flight_cli.cli", "fly", str(short_scenario)).succeed()
@@ -64,15 +68,22 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
         gap = max(np.diff(tape[topic].stamp_ns).max() for topic in ("y", "y_m"))
-        delays.append(bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000))
+        delays.append(
+            bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000)
+        )
         errors = rms(tracking_error(tape).values)
         accurate = bool((errors <= bound).all())
         with AnyReader([run]) as reader:
             counts = {connection.topic: connection.msgcount for connection in reader.connections}
-            connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/internals"]))
+            connection, _, raw = next(
+                reader.messages([c for c in reader.connections if c.topic == "/internals"])
+            )
             internals: Any = reader.deserialize(raw, connection.msgtype)
-        # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the start
-        missing = [topic for topic, rate in RATES.items() if not rate * DURATION * 0.98 <= counts[topic]]
+        # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the
+        # start
+        missing = [
+            topic for topic, rate in RATES.items() if not rate * DURATION * 0.98 <= counts[topic]
+        ]
         if accurate and not missing:
             break
     assert all(counts[topic] <= rate * (DURATION + 2.0) for topic, rate in RATES.items()), counts
@@ -81,12 +92,14 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     assert internals.header.frame_id.startswith("/controller#")
     assert tape["y"].stamp_ns[0] == tape.start_ns  # the log begins with the first sample
     assert delays[-1] or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
-    # Ticks are due 1 ms after whole periods of 10 ms, and y at whole 2 ms: a clock that is slewed differs by less than 0.1 ms.
+    # Ticks are due 1 ms after whole periods of 10 ms, and y at whole 2 ms: a clock that is slewed
+    # differs by less than 0.1 ms.
     logged = tape["internals"]
     due = logged["age"] - logged["late"] + (logged.stamp_ns % 10_000_000) / 1e9
     assert np.abs(due % 0.01 - 0.001).max() < 1e-4
     assert np.abs((tape["y"].stamp_ns + 1_000_000) % 2_000_000 - 1_000_000).max() < 1000  # ns
-    # u carries the stamp of the y from which it was computed; one that is held on a busy host, that of its tick
+    # u carries the stamp of the y from which it was computed; one that is held on a busy host, that
+    # of its tick
     held = tape["internals"].stamp_ns[tape["internals"]["mode"] != Mode.ENGAGED]
     assert set(tape["u"].stamp_ns.tolist()) - set(held.tolist()) <= set(tape["y"].stamp_ns.tolist())
     if delays.count(False) <= 1 and (missing or not accurate):

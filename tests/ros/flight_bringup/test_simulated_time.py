@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The example simulator with its own /clock over real DDS: slow, fast and in lockstep the aircraft tracks alike."""
+"""The example simulator with its own /clock over real DDS: slow, fast and in lockstep the aircraft
+tracks alike.
+"""
 
 import shutil
 from collections.abc import Sequence
@@ -29,7 +31,9 @@ def pitch_rate(message: JointState | None) -> float:
 
 
 def error(run: Path) -> float:
-    """The rms of the error of q from the first command on, rad/s, of a flight whose ticks are computed again to the bit."""
+    """The rms of the error of q from the first command on, rad/s, of a flight whose ticks are
+    computed again to the bit.
+    """
     internals = read_run(run).tape.signals["internals"]
     command = int(np.argmax(np.abs(internals["y_m.q"]) > 0.0))
     begin_ns = internals.stamp_ns[command]
@@ -40,7 +44,9 @@ def error(run: Path) -> float:
 
 @pytest.mark.longest_pause(0.03)  # s: at 3 times real time near the age limit
 @pytest.mark.parametrize("order", ["nodes first", "simulator first"])
-def test_same_errors_at_any_speed_and_in_lockstep(order: str, start: Start, peer_node: Peer, tmp_path: Path) -> None:
+def test_same_errors_at_any_speed_and_in_lockstep(
+    order: str, start: Start, peer_node: Peer, tmp_path: Path
+) -> None:
     shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
     scenario = str(find_scenario("osprey_servo").path)
     errors: dict[float, float] = {}
@@ -63,7 +69,9 @@ def test_same_errors_at_any_speed_and_in_lockstep(order: str, start: Start, peer
             nodes[-1].wait_for("waiting for /clock: no publisher")
         simulator = first[0] if first else start("simulator", str(speed))
         peer_node.received["y_m"].clear()
-        peer_node.until(lambda: pitch_rate(peer_node.last("y_m")) > 0.095, "a command that was followed")
+        peer_node.until(
+            lambda: pitch_rate(peer_node.last("y_m")) > 0.095, "a command that was followed"
+        )
         simulator.interrupt().succeed()
         for node in reversed(nodes):  # the recorder last
             node.interrupt()
@@ -74,10 +82,16 @@ def test_same_errors_at_any_speed_and_in_lockstep(order: str, start: Start, peer
     assert errors[1.0] > 0.0
 
 
-def test_nodes_begin_again_with_a_new_simulation(start: Start, start_node: Start, recorder: Recorder, tmp_path: Path) -> None:
+def test_nodes_begin_again_with_a_new_simulation(
+    start: Start, start_node: Start, recorder: Recorder, tmp_path: Path
+) -> None:
     shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
     controller = start_node("rise_di_controller", *BY_CLOCK)
-    nodes = [controller, start_node("reference_model", *BY_CLOCK), recorder(tmp_path / "run", BY_CLOCK[1])]
+    nodes = [
+        controller,
+        start_node("reference_model", *BY_CLOCK),
+        recorder(tmp_path / "run", BY_CLOCK[1]),
+    ]
     simulator = start("simulator", "1")
     controller.wait_for("WAITING -> ENGAGED")
     nodes[-1].wait_for_log(tmp_path / "run", 30_000)
@@ -85,7 +99,9 @@ def test_nodes_begin_again_with_a_new_simulation(start: Start, start_node: Start
     start("simulator", "1")
     for node in nodes:
         node.wait_for("another simulation begins; this node begins again")
-    until(lambda: sum("WAITING -> ENGAGED" in line for line in controller.lines) == 2, "engaged again")
+    until(
+        lambda: sum("WAITING -> ENGAGED" in line for line in controller.lines) == 2, "engaged again"
+    )
     nodes[-1].wait_for("run-2_0.mcap")
     assert not [line for line in controller.lines if "already registered" in line]
     for node in nodes:

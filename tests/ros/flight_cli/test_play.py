@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""rise-di play: subscribers get every byte of a recorded flight in time; a controller reproduces its u."""
+"""rise-di play: subscribers get every byte of a recorded flight in time; a controller reproduces
+its u.
+"""
 
 import time
 from pathlib import Path
@@ -26,10 +28,14 @@ MS = 1_000_000
 
 
 class Receiver:
-    """Subscribes to topics; holds the bytes of their messages and the instants at which they were sent."""
+    """Subscribes to topics; holds the bytes of their messages and the instants at which they were
+    sent.
+    """
 
     def __init__(self, node: Node, *topics: Topic) -> None:
-        self._polled_subscriptions = [PolledSubscription(node, topic, LOCKSTEP, raw=True) for topic in topics]
+        self._polled_subscriptions = [
+            PolledSubscription(node, topic, LOCKSTEP, raw=True) for topic in topics
+        ]
         self.received: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
@@ -59,14 +65,26 @@ def test_flight_played_byte_by_byte_with_timing_and_clock_and_in_a_loop(
     run: Path, start: Start, peer_node: Peer, host_delays: HostDelays
 ) -> None:
     receiving = Receiver(peer_node.node, Y, Y_M, CLOCK)
-    process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
+    process = start(
+        "flight_cli.cli",
+        "play",
+        str(run),
+        "--topics",
+        "y,y_m",
+        "--stamps",
+        "recorded",
+        "--rate",
+        "2",
+    )
     receiving.until(Y, 1001)
     receiving.until(Y_M, 1001)
     process.succeed()
     receiving.until(CLOCK, 201)
     assert receiving.received["y"] == of(run, "y")
     assert receiving.received["y_m"] == of(run, "y_m")
-    assert [stamp_of(clock) for clock in receiving.received[CLOCK.name]] == [k * 10 * MS for k in range(201)]
+    assert [stamp_of(clock) for clock in receiving.received[CLOCK.name]] == [
+        k * 10 * MS for k in range(201)
+    ]
     # 2 s at twice the rate, on absolute deadlines: host delays do not accumulate
     sent = np.array(receiving.sent["y"])
     late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001
@@ -98,7 +116,9 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
             ("/no name", "sensor_msgs/msg/JointState", "cdr"),
             ("/json", "sensor_msgs/msg/JointState", "json"),
         ):
-            schema = writer.register_schema(kind, "ros2msg", definition("sensor_msgs/msg/JointState").text.encode())
+            schema = writer.register_schema(
+                kind, "ros2msg", definition("sensor_msgs/msg/JointState").text.encode()
+            )
             channel = writer.register_channel(topic, encoding, schema)
             writer.add_message(channel, 1, y, 1)
         writer.finish()  # type: ignore[no-untyped-call]
@@ -121,7 +141,9 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
     assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
 
 
-def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
+def test_controller_reproduces_flight_to_byte(
+    start: Start, start_node: Start, tmp_path: Path, peer_node: Peer
+) -> None:
     flight = start(
         "flight_cli.cli",
         "fly",
@@ -138,8 +160,20 @@ def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, t
     recorded = tmp_path / "latest"
     u, internals = of(recorded, "u"), of(recorded, "internals")
     receiving = Receiver(peer_node.node, U, INTERNALS)
-    start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0").wait_for("ready")
-    process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
+    start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0").wait_for(
+        "ready"
+    )
+    process = start(
+        "flight_cli.cli",
+        "play",
+        str(recorded),
+        "--topics",
+        "y,y_m",
+        "--stamps",
+        "recorded",
+        "--rate",
+        "3",
+    )
     receiving.until(U, len(u))
     receiving.until(INTERNALS, len(internals))
     process.succeed()
@@ -150,10 +184,12 @@ def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, t
 def test_controller_in_real_time_follows_flight_with_stamps_moved_to_now(
     run: Path, start: Start, start_node: Start, host_delays: HostDelays
 ) -> None:
-    # The recorded aircraft does not respond to this u, and these ticks use other samples of y than the recorded ones. So
-    # both u are close but not equal. In 2 s the recorded u reaches 0.06.
+    # The recorded aircraft does not respond to this u, and these ticks use other samples of y than
+    # the recorded ones. So both u are close but not equal. In 2 s the recorded u reaches 0.06.
     largest = np.abs(read_run(run).tape["u"].values).max()
-    for _ in range(3):  # again where the host did not run: the controller held u, or ramped it to trim
+    for _ in range(
+        3
+    ):  # again where the host did not run: the controller held u, or ramped it to trim
         begin = time.time()
         with peer() as peer_node:
             receiving = Receiver(peer_node.node, Y)
@@ -173,5 +209,8 @@ def test_controller_in_real_time_follows_flight_with_stamps_moved_to_now(
     assert set(np.diff(stamps)) == {2 * MS}
     late = np.median(np.abs(stamps - np.array(receiving.sent["y"]))) / NANOSECONDS
     assert late < 0.05 + host_delays.since(stamps[0] / NANOSECONDS)  # as fresh as they were
-    received, recorded = ([payload[:4] + payload[12:] for payload in y] for y in (receiving.received["y"], of(run, "y")))
+    received, recorded = (
+        [payload[:4] + payload[12:] for payload in y]
+        for y in (receiving.received["y"], of(run, "y"))
+    )
     assert received == recorded

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node beside the controller: lockstep, proposals of others, and a learner that is killed and started again."""
+"""The learner's node beside the controller: lockstep, proposals of others, and a learner that is
+killed and started again.
+"""
 
 from pathlib import Path
 
@@ -21,7 +23,9 @@ from rise_di_controller.proposals import Event
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
-    """osprey_learn at 100 Hz, with an aircraft that is that of the file: its search is the shortest."""
+    """osprey_learn at 100 Hz, with an aircraft that is that of the file: its search is the
+    shortest.
+    """
     chosen = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},
@@ -31,12 +35,20 @@ def scenario(folder: Path, **learn: object) -> Scenario:
     return written(chosen, folder / "learn.yaml")
 
 
-def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(tmp_path: Path) -> None:
-    # the flight ends at the tick that waits for the second proposal, and that begins the third search
+def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
+    tmp_path: Path,
+) -> None:
+    # the flight ends at the tick that waits for the second proposal, and that begins the third
+    # search
     guided = scenario(tmp_path, updates=[10.0, 10.5, 11.0]).vary(
         aircraft={"kinematics": "euler"},
         reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
-        guidance={"program": {"heading": {"start": [1.0], "value": [0.5]}, "altitude": {"start": [1.0], "value": [20.0]}}},
+        guidance={
+            "program": {
+                "heading": {"start": [1.0], "value": [0.5]},
+                "altitude": {"start": [1.0], "value": [20.0]},
+            }
+        },
     )
     chosen, events, lines = written(guided, tmp_path / "learn.yaml"), list[Event](), list[str]()
     run = tmp_path / "run"
@@ -61,17 +73,26 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
 
 def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
     chosen = scenario(tmp_path, updates=[1.0, 2.5])
-    command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--set", "runs=runs")
+    command = start(
+        "flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--set", "runs=runs"
+    )
     command.wait_for("no model: record: found")
     learning = command.child("flight_design.main")
     learning.suspend()
     logged = sum(path.stat().st_size for path in (tmp_path / "runs").rglob("*.mcap"))
-    command.wait_for_log(tmp_path / "runs", logged + 100_000)  # the flight goes on beside the stopped learner: half a second
+    command.wait_for_log(
+        tmp_path / "runs", logged + 100_000
+    )  # the flight goes on beside the stopped learner: half a second
     learning.kill()
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")
-    start("flight_design.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
-    command.until(lambda: command.output.count("no model: record") > said, "an identification of another learner")
+    start("flight_design.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for(
+        "no model: record"
+    )
+    command.until(
+        lambda: command.output.count("no model: record") > said,
+        "an identification of another learner",
+    )
     # no byte more, as on a full disk: the write fails, and Python ignores SIGXFSZ
     command.child("flight_recorder.main").rlimit(psutil.RLIMIT_FSIZE, (0, 0))
     recorder_log = next((tmp_path / "runs").rglob("recorder.log"))

@@ -55,19 +55,29 @@ def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Pa
 
 
 def tools_read(run: Path, logged: Signal) -> None:
-    """Rosbags reads what tools get as guidance had it: frames of REP 103 by SciPy, the place on WGS84 by pymap3d."""
+    """Rosbags reads what tools get as guidance had it: frames of REP 103 by SciPy, the place on
+    WGS84 by pymap3d.
+    """
     with AnyReader([run]) as reader:
         messages: dict[str, list[Any]] = {
             topic: [] for topic in ("/odometry", "/guidance/imu", "/guidance/fix", "/guidance/wind")
         }
-        for connection, _, data in reader.messages([each for each in reader.connections if each.topic in messages]):
+        for connection, _, data in reader.messages(
+            [each for each in reader.connections if each.topic in messages]
+        ):
             messages[connection.topic].append(reader.deserialize(data, connection.msgtype))
-    assert {topic: len(received) for topic, received in messages.items()} == dict.fromkeys(messages, 20)  # 2 s at 10 Hz
+    assert {topic: len(received) for topic, received in messages.items()} == dict.fromkeys(
+        messages, 20
+    )  # 2 s at 10 Hz
     for odometry, imu, fix, wind in zip(*messages.values(), strict=True):
         stamp = odometry.header.stamp
         k = logged.stamp_ns.tolist().index(stamp.sec * NANOSECONDS + stamp.nanosec)
         assert all(each.header.stamp == stamp for each in (imu, fix, wind))
-        assert (odometry.child_frame_id, imu.header.frame_id, wind.header.frame_id) == ("base_link", "base_link", "map")
+        assert (odometry.child_frame_id, imu.header.frame_id, wind.header.frame_id) == (
+            "base_link",
+            "base_link",
+            "map",
+        )
         angles = [logged[f"pose.{name}"][k] for name in ("psi", "theta", "phi")]
         flu_in_enu = ENU_OF_NED @ Rotation.from_euler("ZYX", angles).as_matrix() @ FLU_OF_FRD
         orientation = [getattr(imu.orientation, key) for key in "xyzw"]
@@ -75,24 +85,39 @@ def tools_read(run: Path, logged: Signal) -> None:
         body = imu.angular_velocity
         assert (body.x, -body.y, -body.z) == tuple(logged[f"y.{name}"][k] for name in "pqr")
         assert imu.linear_acceleration_covariance[0] == -1.0  # none: sensor_msgs/Imu
-        assert (wind.vector.y, wind.vector.x) == tuple(logged[f"wind.{name}"][k] for name in ("north", "east"))
+        assert (wind.vector.y, wind.vector.x) == tuple(
+            logged[f"wind.{name}"][k] for name in ("north", "east")
+        )
         place = [logged[f"pose.{name}"][k] for name in ("east", "north", "altitude")]
         velocity = [logged[f"pose.{name}"][k] for name in ("v_east", "v_north", "climb")]
         linear = odometry.twist.twist.linear
         assert flu_in_enu @ [linear.x, linear.y, linear.z] == pytest.approx(velocity, abs=1e-9)
-        east, north, _ = pymap3d.geodetic2enu(fix.latitude, fix.longitude, 0.0, *ORIGIN[:2], 0.0)  # on the ellipsoid
+        east, north, _ = pymap3d.geodetic2enu(
+            fix.latitude, fix.longitude, 0.0, *ORIGIN[:2], 0.0
+        )  # on the ellipsoid
         assert (east, north, fix.altitude - ORIGIN[2]) == pytest.approx(place, abs=1e-6)
 
 
-def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(start: Start, tmp_path: Path) -> None:
+def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
+    start: Start, tmp_path: Path
+) -> None:
     command = start(
-        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--set", "runs=runs"
+        "flight_cli.cli",
+        "fly",
+        str(scenario_file(tmp_path, 1e5, "osprey_route")),
+        "--lockstep",
+        "--set",
+        "runs=runs",
     )
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
-    assert "in force: altitude=60" in start("flight_cli.cli", "guide", "altitude=60").succeed().output
+    assert (
+        "in force: altitude=60" in start("flight_cli.cli", "guide", "altitude=60").succeed().output
+    )
     command.child("flight_guidance.main").kill()
     assert command.end() == 3
-    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    summary = json.loads(
+        (tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
+    )
     assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
@@ -113,16 +138,25 @@ class Flight:
 
     def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
         self.peer = peer_node
-        self.process = start("flight_guidance.main", "--ros-args", "--params-file", str(scenario), *PATIENT)
+        self.process = start(
+            "flight_guidance.main", "--ros-args", "--params-file", str(scenario), *PATIENT
+        )
         self.rng = np.random.default_rng(1)
 
     def send(self) -> None:
         """One y, one pose and one sample of internals, stamped now."""
         now_ns, pose = time.time_ns(), np.array([LEVEL.get(name, 0.0) for name in POSE])
-        pose[POSE.index("v_east")] = self.rng.normal(0.0, 0.01)  # a pose that stands still is refused
+        pose[POSE.index("v_east")] = self.rng.normal(
+            0.0, 0.01
+        )  # a pose that stands still is refused
         self.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), "/aircraft#1"))
         self.peer.publish("pose", to_message(now_ns, POSE, pose, "/aircraft#1"))
-        self.peer.publish("internals", to_message(now_ns, ["mode"], np.array([float(ControllerMode.ENGAGED)]), "/controller#1"))
+        self.peer.publish(
+            "internals",
+            to_message(
+                now_ns, ["mode"], np.array([float(ControllerMode.ENGAGED)]), "/controller#1"
+            ),
+        )
 
     def until(self, condition: Callable[[], object], because: str) -> None:
         """Send until the condition holds."""
@@ -142,14 +176,18 @@ def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     return made
 
 
-def test_command_and_page_say_what_guidance_took_and_refused(start: Start, peer_node: Peer, calm: Path) -> None:
+def test_command_and_page_say_what_guidance_took_and_refused(
+    start: Start, peer_node: Peer, calm: Path
+) -> None:
     flight = Flight(start, peer_node, calm)
     flight.until(lambda: peer_node.received["u_m"], "a u_m")
     good = start("flight_cli.cli", "guide", "heading=90", "altitude=60")
     flight.until(lambda: good.popen.poll() is not None, "the end of the command")
     assert "in force: heading=90, altitude=60" in good.succeed().output
     flight.until(
-        lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0),
+        lambda: (
+            (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0)
+        ),
         "both targets in force",
     )
     rejected = start("flight_cli.cli", "guide", "phi=80")  # degrees
@@ -168,9 +206,16 @@ def test_command_and_page_say_what_guidance_took_and_refused(start: Start, peer_
         flight.until(lambda: flight.last("target.phi") == 0.2, "the target in force")
         # The log has these values already; guidance refuses two lateral commands at once.
         refused = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
-        assert refused == "target: found theta, leg, phi, expected one lateral and one vertical command at most"
+        assert (
+            refused
+            == "target: found theta, leg, phi, expected one lateral and one vertical command at "
+            "most"
+        )
         assert answer(client.guide, "skip") == "no route with a further leg is flown"
-        assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
+        assert (
+            answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]])
+            == ""
+        )
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, "a flown route")
         flight.until(
             lambda: peer_node.node.count_publishers("route") == 0, "a route that is withdrawn"
@@ -183,7 +228,9 @@ def test_command_and_page_say_what_guidance_took_and_refused(start: Start, peer_
 
         with flight.process.stopped():  # it takes nothing: a later request ends the wait
             pending = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
-            flight.until(lambda: peer_node.node.count_publishers("route") == 1, "the publisher of the route")
+            flight.until(
+                lambda: peer_node.node.count_publishers("route") == 1, "the publisher of the route"
+            )
             client.cancel()
             with pytest.raises(ParameterError, match="cancelled by a later request"):
                 pending.result()

@@ -40,7 +40,9 @@ def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]
 
 
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
-    """Delay of a recorder's file behind the messages that another process received, of the topic with the largest delay, s."""
+    """Delay of a recorder's file behind the messages that another process received, of the topic
+    with the largest delay, s.
+    """
     by_topic = stamps_and_sequences(folder)
     received = [stamp_of(message.message) for message in witness.take()]
     if not received or set(by_topic) != set(SIGNALS):
@@ -54,7 +56,9 @@ def is_up_to_date(folder: Path, witness: PolledSubscription) -> bool:
 
 
 @pytest.mark.usefixtures("publisher")
-def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
+def test_8_killed_recorders_lose_at_most_three_tenths_of_second(
+    recorder: Recorder, tmp_path: Path, peer_node: Peer
+) -> None:
     generator = np.random.default_rng(1)
     witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
@@ -64,10 +68,14 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Record
         process.wait_for_log(folder, 50_000)
         # at first the recorder receives the history of 2 s that the publishers keep
         until(partial(is_up_to_date, folder, witness), "a log up to the newest samples")
-        begin = {topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()}
+        begin = {
+            topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()
+        }
         if k < 7:
             following = recorder(f"run{k + 1}")  # starts in the meantime
-        with pytest.raises(subprocess.TimeoutExpired):  # the random instant of the kill is the test case
+        with pytest.raises(
+            subprocess.TimeoutExpired
+        ):  # the random instant of the kill is the test case
             process.popen.wait(float(generator.uniform(0.0, 0.3)))
         process.popen.kill()
         missing.append(missing_seconds(folder, witness))
@@ -78,13 +86,18 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Record
         assert not (folder / "metadata.yaml").exists()
         tape = read_run(folder).tape
         end = max(tape.time(name)[-1] for name in tape.signals)
-        assert tape.notes[0] == f"run{k}_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
+        assert (
+            tape.notes[0]
+            == f"run{k}_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
+        )
         assert tape.notes[1] == f"metadata.yaml is missing: rise-di report --repair {folder}"
     print([round(duration, 3) for duration in missing])
     assert max(missing) < 0.3, missing
 
 
-def test_log_of_killed_recorder_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_log_of_killed_recorder_reported_and_repairable(
+    start: Start, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
     flight.wait_for_log(tmp_path / "runs", 150_000)
     node = flight.child("flight_recorder.main")
@@ -100,7 +113,9 @@ def test_log_of_killed_recorder_reported_and_repairable(start: Start, osprey_gus
     filled = {name for name in before.metadata if before.metadata[name]}
     assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
     report = start("flight_cli.cli", "report", str(run)).succeed()
-    assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
+    assert "is truncated: read up to its last complete chunk, t = " in " ".join(
+        report.output.split()
+    )
     assert (run / "report.html").stat().st_size > 10_000
     repair = start("flight_cli.cli", "report", "--repair", str(run)).succeed()
     assert "of the 30 s of the scenario" in repair.output
@@ -108,4 +123,7 @@ def test_log_of_killed_recorder_reported_and_repairable(start: Start, osprey_gus
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
-    assert json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"] == "recorder was killed by SIGKILL"
+    assert (
+        json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"]
+        == "recorder was killed by SIGKILL"
+    )

@@ -25,16 +25,30 @@ def test_refusal_names_clock_of_the_other_node(start_node: Start, tmp_path: Path
     name = f"/aircraft#{aircraft.popen.pid}"
     estimate = rf"the clock of {name} is (0\.\d+) s behind this one"
 
-    def told(sentence: str) -> bool:  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
-        return any(float(offset) == pytest.approx(0.15, abs=0.01) for offset in re.findall(sentence, controller.output))
+    def told(
+        sentence: str,
+    ) -> (
+        bool
+    ):  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
+        return any(
+            float(offset) == pytest.approx(0.15, abs=0.01)
+            for offset in re.findall(sentence, controller.output)
+        )
 
-    controller.until(partial(told, f"{estimate}: the system clock of this host was set"), "the difference of the clocks, told")
-    controller.until(partial(told, f"old: {estimate}"), "the refusal, with the difference of the clocks")
+    controller.until(
+        partial(told, f"{estimate}: the system clock of this host was set"),
+        "the difference of the clocks, told",
+    )
+    controller.until(
+        partial(told, f"old: {estimate}"), "the refusal, with the difference of the clocks"
+    )
     with peer(topics=()) as peer_node:
         found: list[float] = []
 
         def take(message: DiagnosticArray) -> None:
-            values = {value.key: value.value for status in message.status for value in status.values}
+            values = {
+                value.key: value.value for status in message.status for value in status.values
+            }
             found.extend(float(values[key]) for key in [f"clock of {name} (s)"] if key in values)
 
         peer_node.node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, take, 10)

@@ -13,7 +13,13 @@ HEALTH = REPOSITORY / "docker" / "health.py"
 
 
 def check(*names: str) -> tuple[int, str]:
-    result = subprocess.run([sys.executable, str(HEALTH), *names], capture_output=True, text=True, timeout=HANG, check=False)
+    result = subprocess.run(
+        [sys.executable, str(HEALTH), *names],
+        capture_output=True,
+        text=True,
+        timeout=HANG,
+        check=False,
+    )
     return result.returncode, result.stdout
 
 

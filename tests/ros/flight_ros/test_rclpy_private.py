@@ -19,12 +19,18 @@ def test_messages_participants_and_callbacks_without_an_executor(peer_node: Peer
     rclpy_private.destroy_participant(participant)
     peer_node.until(lambda: "_early" not in peer_node.node.get_node_names(), "no participant")
 
-    subscription = peer_node.node.create_subscription(Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True)
+    subscription = peer_node.node.create_subscription(
+        Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True
+    )
     publish = peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)).publish
     wait_set = rclpy_private.WaitSet([subscription], context)
     assert not wait_set.wait(0)
     peer_node.until(lambda: peer_node.node.count_subscribers("number") == 1, "the subscription")
-    peer_node.until(lambda: wait_set.wait(1_000_000), "a message", each=lambda: publish(serialize_message(Int64(data=7))))
+    peer_node.until(
+        lambda: wait_set.wait(1_000_000),
+        "a message",
+        each=lambda: publish(serialize_message(Int64(data=7))),
+    )
     raw, information = rclpy_private.take_messages(subscription, 1)[0]
     assert deserialize_message(raw, Int64).data == 7
     assert information["source_timestamp"] <= information["received_timestamp"]

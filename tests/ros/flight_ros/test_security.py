@@ -18,7 +18,8 @@ from tests.ros.waiting import until
 from flight_ros.transport import LOOPBACK_PROFILE
 
 PATIENCE = 5.0
-"""s of an attack. A successful one takes 1 s on an idle host (discovery 0.1 s, then y at 500 Hz)."""
+"""s of an attack. A successful one takes 1 s on an idle host (discovery 0.1 s, then y at 500
+Hz)."""
 
 
 # Attacks from this host
@@ -29,10 +30,17 @@ def aircraft(start_node: Start, *arguments: str, within: tuple[str, ...] = ()) -
 
 
 def environment(**variables: str) -> tuple[str, ...]:
-    return ("env", f"PYTHONPATH={REPOSITORY}", *(f"{name}={value}" for name, value in variables.items()))
+    return (
+        "env",
+        f"PYTHONPATH={REPOSITORY}",
+        *(f"{name}={value}" for name, value in variables.items()),
+    )
 
 
-ON_LOOPBACK = environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOOPBACK_PROFILE), ROS_AUTOMATIC_DISCOVERY_RANGE="SYSTEM_DEFAULT")
+ON_LOOPBACK = environment(
+    FASTRTPS_DEFAULT_PROFILES_FILE=str(LOOPBACK_PROFILE),
+    ROS_AUTOMATIC_DISCOVERY_RANGE="SYSTEM_DEFAULT",
+)
 
 
 def received(attacker: Process) -> int:
@@ -48,7 +56,8 @@ def test_process_of_this_host_receives_y_and_commands_u(start: Start, start_node
     assert "sample refused" not in node.output
 
 
-# Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet devices
+# Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet
+# devices
 
 
 class Hosts(NamedTuple):
@@ -74,14 +83,19 @@ def hosts() -> Iterator[Hosts]:
     unshare, nsenter, ip = (shutil.which(command) or "" for command in ("unshare", "nsenter", "ip"))
     if not (unshare and nsenter and ip):
         pytest.skip("no unshare, nsenter (util-linux) or ip (iproute2) here")
-    holders = [subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE) for _ in range(2)]
+    holders = [
+        subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE)
+        for _ in range(2)
+    ]
     try:
         places = [(nsenter, f"--net=/proc/{holder.pid}/ns/net") for holder in holders]
         for holder in holders:
             until(partial(is_separate, holder), "a namespace of its own")
             if holder.poll() is not None:
                 assert holder.stderr is not None
-                pytest.skip(f"no network namespace for this user: {holder.stderr.read().decode().strip()}")
+                pytest.skip(
+                    f"no network namespace for this user: {holder.stderr.read().decode().strip()}"
+                )
         name = f"rd{holders[0].pid % 100_000}"
         first, second = (holder.pid for holder in holders)
         pair = f"link add {name} netns {first} type veth peer name {name} netns {second}"
@@ -89,9 +103,15 @@ def hosts() -> Iterator[Hosts]:
         if made.returncode:
             pytest.skip(f"no virtual Ethernet devices for this user: {made.stderr.strip()}")
         for number, place in enumerate(places, start=1):
-            for command in (f"addr add 10.77.0.{number}/24 dev {name}", f"link set {name} up", "link set lo up"):
+            for command in (
+                f"addr add 10.77.0.{number}/24 dev {name}",
+                f"link set {name} up",
+                "link set lo up",
+            ):
                 subprocess.run([*place, ip, *command.split()], check=True)
-        for place in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
+        for (
+            place
+        ) in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
             until(partial(is_up, [*place, ip, "link", "show", name]), "a device that is up")
         yield Hosts(*places)
     finally:
@@ -116,16 +136,24 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
     """The environment of a process with network transport."""
     profile = tmp_path / "open.xml"
     profile.write_text(OPEN_PROFILE, encoding="utf-8")
-    discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": "10.77.0.1;10.77.0.2"}
+    discovery = {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "ROS_STATIC_PEERS": "10.77.0.1;10.77.0.2",
+    }
     return environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(profile), **discovery)
 
 
 def test_second_host_has_access_by_network_profile_alone(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    """Without the profile the host neither receives y nor commands u. With it each of two hosts says so of the other."""
+    """Without the profile the host neither receives y nor commands u. With it each of two hosts
+    says so of the other.
+    """
     node = aircraft(start_node, within=hosts.first)
-    assert received(start("tests.ros.attacker", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
+    assert (
+        received(start("tests.ros.attacker", f"{PATIENCE}", within=(*hosts.second, *on_network)))
+        == 0
+    )
     assert "receiving u from" not in node.output
     assert "sample refused" not in node.output  # no sample has arrived
     node.interrupt().succeed()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An aircraft and its controller on two hosts: network namespaces, with a network of delay and loss between them."""
+"""An aircraft and its controller on two hosts: network namespaces, with a network of delay and loss
+between them.
+"""
 
 import re
 import shutil
@@ -26,28 +28,53 @@ OFFSET_NS = -50_000_000  # of the clock of the aircraft
 REPORTS = 3  # of the aircraft, one a second
 
 
-def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(start: Start, start_node: Start, tmp_path: Path) -> None:
-    """The age as the aircraft tells it, by its clock alone, is that of a node beside it without code of the stack."""
+def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(
+    start: Start, start_node: Start, tmp_path: Path
+) -> None:
+    """The age as the aircraft tells it, by its clock alone, is that of a node beside it without
+    code of the stack.
+    """
     unshare, nsenter, ip = (shutil.which(command) or "" for command in ("unshare", "nsenter", "ip"))
     if not (unshare and nsenter and ip and Path("/dev/net/tun").exists()):
         pytest.skip("no unshare, nsenter (util-linux), ip (iproute2) or /dev/net/tun here")
-    holders = [subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE) for _ in ADDRESSES]
+    holders = [
+        subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE)
+        for _ in ADDRESSES
+    ]
     try:
         for holder in holders:
             until(partial(is_separate, holder), "a namespace of its own")
             if holder.poll() is not None:
                 pytest.skip("no network namespace for this user")
-        relay = start("tests.ros.relay", *(str(holder.pid) for holder in holders), str(DELAY), str(LOSS), within=environment())
+        relay = start(
+            "tests.ros.relay",
+            *(str(holder.pid) for holder in holders),
+            str(DELAY),
+            str(LOSS),
+            within=environment(),
+        )
         relay.wait_for("up")
         (step := tmp_path / "step").write_bytes(struct.pack("=q", OFFSET_NS))
-        clocks: tuple[dict[str, str], ...] = ({}, {"LD_PRELOAD": str(settable_clock(tmp_path)), "FAULTS_CLOCK": str(step)})
+        clocks: tuple[dict[str, str], ...] = (
+            {},
+            {"LD_PRELOAD": str(settable_clock(tmp_path)), "FAULTS_CLOCK": str(step)},
+        )
         hosts = []
         for holder, address, clock in zip(holders, ADDRESSES, clocks, strict=True):
             place = (nsenter, f"--net=/proc/{holder.pid}/ns/net")
-            for command in ("link set lo up", f"addr add {address}/24 dev net0", "link set net0 up"):
+            for command in (
+                "link set lo up",
+                f"addr add {address}/24 dev net0",
+                "link set net0 up",
+            ):
                 subprocess.run([*place, ip, *command.split()], check=True)
-            (profile := tmp_path / f"{address}.xml").write_text(network_profile(address, ADDRESSES), encoding="utf-8")
-            variables = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profile), "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
+            (profile := tmp_path / f"{address}.xml").write_text(
+                network_profile(address, ADDRESSES), encoding="utf-8"
+            )
+            variables = {
+                "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),
+                "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+            }
             hosts.append((*place, *environment(**variables, **clock)))
         controller = start_node("rise_di_controller", within=hosts[0])
         start_node("reference_model", within=hosts[0])
@@ -57,8 +84,11 @@ def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(start: Start, start
         controller.wait_for(f"the clock of /aircraft#{aircraft.popen.pid} is 0.0")
         stopwatch.until(lambda: len(stopwatch.lines) > REPORTS, "the reports of the aircraft")
         rows = [re.fullmatch("told (.*) measured (.*)", line) for line in stopwatch.lines]
-        told, measured = np.array([[float(value) for value in row.groups()] for row in rows if row][1:]).T
-        # The aircraft looks for u every 2 ms, 1 ms late on average. Measured 0.5 to 1.2 ms; a second clock would give 50 ms.
+        told, measured = np.array(
+            [[float(value) for value in row.groups()] for row in rows if row][1:]
+        ).T
+        # The aircraft looks for u every 2 ms, 1 ms late on average. Measured 0.5 to 1.2 ms; a
+        # second clock would give 50 ms.
         assert np.median(np.abs(told - measured)) < 0.002, (told, measured)
         assert np.median(told) > 2 * DELAY
         relay.popen.send_signal(signal.SIGUSR1)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control of a real flight over the page's server: gains, faults, a gust, the controller; in the log, and replayed."""
+"""Control of a real flight over the page's server: gains, faults, a gust, the controller; in the
+log, and replayed.
+"""
 
 import json
 import re
@@ -28,13 +30,21 @@ class Page:
 
     def __init__(self, address: str, key: str) -> None:
         self._base, _, token = address.partition("#token=")
-        self._headers = {"Origin": self._base.rstrip("/"), "Content-Type": "application/json", "X-Control-Key": key}
+        self._headers = {
+            "Origin": self._base.rstrip("/"),
+            "Content-Type": "application/json",
+            "X-Control-Key": key,
+        }
         self._headers["X-Page-Token"] = token
 
     def post(self, do: str, **request: Any) -> tuple[int, dict[str, Any]]:
         """Status and answer of a request, which is sent again where the server limits the rate."""
-        status, content = until(lambda: self._answer(do, **request), "an answer within the rate limit")
-        self._headers["X-Control-Lease"] = content.get("lease", self._headers.get("X-Control-Lease", ""))
+        status, content = until(
+            lambda: self._answer(do, **request), "an answer within the rate limit"
+        )
+        self._headers["X-Control-Lease"] = content.get(
+            "lease", self._headers.get("X-Control-Lease", "")
+        )
         return status, content
 
     def _answer(self, do: str, **request: Any) -> tuple[int, dict[str, Any]] | None:
@@ -53,9 +63,13 @@ class Page:
 
     def until_flown(self, flight: Process) -> dict[str, Any]:
         """Ask for the state until the log has the digest that the page knows of the controller."""
-        return self._until(flight, lambda found: "digest" in found and found["digest"] == found["logged"])
+        return self._until(
+            flight, lambda found: "digest" in found and found["digest"] == found["logged"]
+        )
 
-    def _until(self, flight: Process, is_expected: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    def _until(
+        self, flight: Process, is_expected: Callable[[dict[str, Any]], bool]
+    ) -> dict[str, Any]:
         found: dict[str, Any] = {}
 
         def as_expected() -> bool:
@@ -67,18 +81,28 @@ class Page:
         return found
 
 
-def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path: Path, peer_node: Peer) -> None:
-    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
+def test_flight_commanded_from_page_recorded_and_replayed(
+    start: Start, tmp_path: Path, peer_node: Peer
+) -> None:
+    flight = start(
+        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust"))
+    )  # ended below
     flight.wait_for_log(tmp_path / "runs", 50_000)
-    run = next(path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink())
-    watch = start("flight_cli.cli", "watch", str(run), "--control", "--port", "0").wait_for("http://")
+    run = next(
+        path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink()
+    )
+    watch = start("flight_cli.cli", "watch", str(run), "--control", "--port", "0").wait_for(
+        "http://"
+    )
     key = next(line for line in watch.lines if line.startswith("control key: ")).rpartition(" ")[2]
     page = Page(next(line for line in watch.lines if line.startswith("http://")), key)
     page.until(flight, nodes=["aircraft", "controller"])
     state = page.until_flown(flight)
     k_g = next(gain["values"][0] for gain in state["gains"] if gain["name"] == "k_g")
 
-    status, changed = page.post("gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]})
+    status, changed = page.post(
+        "gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]}
+    )
     assert (status, changed["undo"]) == (200, 1), changed
     page.until(flight, logged=changed["digest"])  # the controller flies them
     assert page.post("gains", digest=state["digest"], values={"k_g": [k_g]})[0] == 409
@@ -89,10 +113,14 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
 
     assert page.post("fault", values={"sensors.bias": [0.01, 0.0, 0.0, 0.0]})[0] == 200
     assert page.post("fault", values={"actuators.stuck_at": [None, None, None, 0]})[0] == 200
-    assert page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200  # 4 s: a pause of the host hides no gust
+    assert (
+        page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200
+    )  # 4 s: a pause of the host hides no gust
     truth = peer_node.received["truth"]
     peer_node.until(
-        lambda: any(message.position[message.name.index("gust.vertical")] > 2.0 for message in truth[-1:]),
+        lambda: any(
+            message.position[message.name.index("gust.vertical")] > 2.0 for message in truth[-1:]
+        ),
         "a gust in the truth",
     )
     status, refused = page.post("fault", values={"sensors.dropout": 2.0})
@@ -103,15 +131,19 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
     assert flight.end() == 130, flight.output
     assert watch.interrupt().end() == 0, watch.output
 
-    changes = parameter_changes(run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None})
+    changes = parameter_changes(
+        run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None}
+    )
     assert [sorted(change) for change in changes[-3:]] == [
-        ["sensors.bias"], ["actuators.stuck_at"], ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
+        ["sensors.bias"], ["actuators.stuck_at"],
+        ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
     ]  # fmt: skip
     log = Flight(run)
     log.update()
     requests = [event.text for event in log.events if event.kind == "control"]
     assert [(re.findall(r"'do': '(\w+)'", text)[0], "refused: " in text) for text in requests] == [
-        ("gains", False), ("gains", True), ("gains", True), ("undo", False), ("fault", False), ("fault", False),
+        ("gains", False), ("gains", True), ("gains", True), ("undo", False), ("fault", False),
+        ("fault", False),
         ("gust", False), ("fault", True), ("deactivate", False), ("activate", False),
     ]  # fmt: skip
     tape = read_run(run).tape

@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft: dead zone, lag, rate and position saturation; faults of effectors."""
+"""Actuators between the command u and the aircraft: dead zone, lag, rate and position saturation;
+faults of effectors.
+"""
 
 from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-MIN_LAG = 1e-30  # s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0
+# s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0
+MIN_LAG = 1e-30
 
 
 class Actuators(NamedTuple):
-    """Parameters of m actuators, SI. An ideal actuator has lag 0 and infinite limits. None: no actuator has this property."""
+    """Parameters of m actuators, SI. An ideal actuator has lag 0 and infinite limits. None: no
+    actuator has this property.
+    """
 
     lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
     lower: Array | None = None  # (m,) lower end stop, deviation from trim, -inf = none
@@ -18,31 +23,46 @@ class Actuators(NamedTuple):
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
     stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
-    lost_at: Array | None = None  # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
-    weak_at: Array | None = None  # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
+    lost_at: Array | None = (
+        None  # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
+    )
+    weak_at: Array | None = (
+        # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
+        None
+    )
     weak_effect: Array | None = None  # (m,) factor
-    slow_at: Array | None = None  # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
+    slow_at: Array | None = (
+        None  # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
+    )
     slow_lag: Array | None = None  # (m,) s
-    loose_at: Array | None = None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
+    loose_at: Array | None = (
+        None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
+    )
     loose_play: Array | None = None  # (m,) half-width of the backlash
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
-    no_thrust: Array | None = None  # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
+    no_thrust: Array | None = (
+        None  # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
+    )
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        wanted  = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at the edge
-        input   = clip(position, wanted - backlash, wanted + backlash)         the play operator; wanted without backlash
-        lagged  = input - (input - position) exp(-dt / lag)                    exact solution of lag p_dot = input - p
+        wanted  = command - clip(command, -dead_zone, dead_zone)
+            dead zone: zero inside, no jump at the edge
+        input   = clip(position, wanted - backlash, wanted + backlash)
+            the play operator; wanted without backlash
+        lagged  = input - (input - position) exp(-dt / lag)  exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
-    A line is a property of the actuator and takes the result of the line before. An ideal actuator passes the command on
-    to the last bit: the difference is zero, and the limits only choose between values.
+    A line is a property of the actuator and takes the result of the line before. An ideal actuator
+    passes the command on to the last bit: the difference is zero, and the limits only choose
+    between values.
 
     Shapes: position, command (m,), dt (). Units: SI, deviations from trim; dt > 0 in s.
-    Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
+    Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman,
+    Digital Control, 4.3.
     """
     xp = array_namespace(position)
     new = _input(position, command, params)
@@ -57,15 +77,19 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
 
 
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
-    """Mean of the actuator positions over a step from `position` to `new`, shape (m,): the input of the aircraft in this step.
+    """Mean of the actuator positions over a step from `position` to `new`, shape (m,): the input of
+    the aircraft in this step.
 
         input                                                                     as in `step`
-        lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))        exact mean of lag p_dot = input - p
-        limited = clip(lagged, position - rate dt / 2, position + rate dt / 2)    exact mean of a motion at the rate limit
-        mean    = clip(limited, min(position, new), max(position, new))           the motion is monotonic and has end stops
+        lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))
+            exact mean of lag p_dot = input - p
+        limited = clip(lagged, position - rate dt / 2, position + rate dt / 2)
+            exact mean of a motion at the rate limit
+        mean    = clip(limited, min(position, new), max(position, new))
+            the motion is monotonic and has end stops
 
-    The step in which a limit begins or ceases to act has an approximate mean, between the two ends. An ideal actuator has
-    mean = new, to the last bit.
+    The step in which a limit begins or ceases to act has an approximate mean, between the two ends.
+    An ideal actuator has mean = new, to the last bit.
 
     Shapes and units as in `step`; `new` is the result of `step`.
     """
@@ -74,36 +98,51 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
     xp = array_namespace(position)
     mean = _input(position, command, params)
     if params.lag is not None:
-        mean = mean + (mean - position) * (params.lag / dt * xp.expm1(-dt / xp.maximum(params.lag, MIN_LAG)))
+        mean = mean + (mean - position) * (
+            params.lag / dt * xp.expm1(-dt / xp.maximum(params.lag, MIN_LAG))
+        )
     if params.rate is not None:
         largest = params.rate * (0.5 * dt)
         mean = xp.minimum(xp.maximum(mean, position - largest), position + largest)
     return xp.minimum(xp.maximum(mean, xp.minimum(position, new)), xp.maximum(position, new))
 
 
-def move(t: Any, position: Array, command: Array, dt: Any, params: Actuators) -> tuple[Array, Array]:
-    """Positions at the end of a step from t on, and the mean input of the aircraft over the step, with faults, shapes (m,)."""
+def move(
+    t: Any, position: Array, command: Array, dt: Any, params: Actuators
+) -> tuple[Array, Array]:
+    """Positions at the end of a step from t on, and the mean input of the aircraft over the step,
+    with faults, shapes (m,).
+    """
     now = in_force(t, position, params)
     new = step(position, command, dt, now)
     mean = mean_position(position, command, new, dt, now)
-    return apply_faults(t, position, new, params), effect(t, apply_faults(t, position, mean, params), params)
+    return apply_faults(t, position, new, params), effect(
+        t, apply_faults(t, position, mean, params), params
+    )
 
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
-    """Parameters of a step from t on: a slow actuator has at least `slow_lag`, a loose one the backlash `loose_play`."""
+    """Parameters of a step from t on: a slow actuator has at least `slow_lag`, a loose one the
+    backlash `loose_play`.
+    """
     xp = array_namespace(position)
     if params.slow_at is not None:
         lag = 0.0 * position if params.lag is None else params.lag
-        params = params._replace(lag=xp.where(t >= params.slow_at, xp.maximum(lag, params.slow_lag), lag))
+        params = params._replace(
+            lag=xp.where(t >= params.slow_at, xp.maximum(lag, params.slow_lag), lag)
+        )
     if params.loose_at is not None:
-        params = params._replace(backlash=xp.where(t >= params.loose_at, params.loose_play, 0.0 * position))
+        params = params._replace(
+            backlash=xp.where(t >= params.loose_at, params.loose_play, 0.0 * position)
+        )
     return params
 
 
 def effect(t: Any, position: Array, params: Actuators) -> Array:
     """The input of the aircraft at these positions, shape (m,).
 
-        t >= weak_at    no_thrust + weak_effect (position - no_thrust)    a part of the thrust, also of that in trim
+        t >= weak_at    no_thrust + weak_effect (position - no_thrust)
+            a part of the thrust, also of that in trim
         else            position
 
     Arguments: `position` at t, after `apply_faults`.
@@ -125,18 +164,25 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Actuator positions at the end of a step from t on, or means over the step, with faults applied, shape (m,).
+    """Actuator positions at the end of a step from t on, or means over the step, with faults
+    applied, shape (m,).
 
         t >= stuck_at    position    the actuator keeps the position
-        t >= lost_at     no_thrust   an engine or a rotor stops at once, a surface floats at trim; also if stuck before
+        t >= lost_at     no_thrust
+            an engine or a rotor stops at once, a surface floats at trim; also if stuck before
         else             new
 
-    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next step on.
+    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next step
+    on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:
         new = xp.where(t >= params.stuck_at, position, new)
-    return new if params.lost_at is None else xp.where(t >= params.lost_at, _no_thrust(new, params), new)
+    return (
+        new
+        if params.lost_at is None
+        else xp.where(t >= params.lost_at, _no_thrust(new, params), new)
+    )
 
 
 def _no_thrust(position: Array, params: Actuators) -> Array:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
+"""Airframe files: published matrices with their units and signs, converted to SI here and nowhere
+else.
+"""
 
 import math
 import os
@@ -32,12 +34,16 @@ Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
 class Input(Config):
-    """An input: the unit of the column of B, the effect of a positive value, and where an engine or a rotor stands still."""
+    """An input: the unit of the column of B, the effect of a positive value, and where an engine or
+    a rotor stands still.
+    """
 
     unit: Unit = Field(description="the unit of this column of B")
     positive: str = Field(description="what a positive value does")
     no_thrust: Number | None = Field(
-        default=None, description="the value without thrust, deviation from trim; absent: 0 of an angle, else unknown"
+        default=None,
+        description="the value without thrust, deviation from trim; absent: 0 of an angle, else "
+        "unknown",
     )
 
 
@@ -69,18 +75,28 @@ class Airframe(Config):
     A: Matrix = Field(description="A, a row a state")
     B: Matrix = Field(description="B, a row a state, a column an input")
     C: tuple[Numbers, ...] = Field(
-        default=(), description="C, a row an output, a column a state; absent: the outputs are states"
+        default=(),
+        description="C, a row an output, a column a state; absent: the outputs are states",
     )
-    D: tuple[Numbers, ...] = Field(default=(), description="the feedthrough of other tools' models; 0 or absent")
-    output_units: dict[Name, Unit] = Field(default={}, description="units of the outputs of C that are not states")
+    D: tuple[Numbers, ...] = Field(
+        default=(), description="the feedthrough of other tools' models; 0 or absent"
+    )
+    output_units: dict[Name, Unit] = Field(
+        default={}, description="units of the outputs of C that are not states"
+    )
     identities: bool = Field(
-        default=True, description="check what physics fixes, as theta_dot = q; false for a model that differs on purpose"
+        default=True,
+        description="check what physics fixes, as theta_dot = q; false for a model that differs "
+        "on purpose",
     )
     gravity: tuple[Gravity, ...] = Field(default=(), description="sine terms of f")
-    inertial_coupling: tuple[Product, ...] = Field(default=(), description="terms of f from products of states")
+    inertial_coupling: tuple[Product, ...] = Field(
+        default=(), description="terms of f from products of states"
+    )
     gusts: dict[str, dict[str, Number]] = Field(
         default={},
-        description="what wind w along each axis adds to each x_dot, per w / V0; axes: longitudinal, lateral, vertical",
+        description="what wind w along each axis adds to each x_dot, per w / V0; axes: "
+        "longitudinal, lateral, vertical",
     )
 
     def _check(self) -> None:
@@ -88,22 +104,48 @@ class Airframe(Config):
         m = len(self.inputs)
         for key, columns in (("A", n), ("B", m)):
             shape = [len(row) for row in getattr(self, key)]
-            require(shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}")
+            require(
+                shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}"
+            )
         fewer = f"{m} or fewer, as many as inputs or fewer"
         require(0 < len(self.outputs) <= m, "outputs", f"{len(self.outputs)} of them", fewer)
-        for key, unit in (*self._units(), *((f"output_units.{name}", unit) for name, unit in self.output_units.items())):
+        for key, unit in (
+            *self._units(),
+            *((f"output_units.{name}", unit) for name, unit in self.output_units.items()),
+        ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
         named = {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
         named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
-        named |= {f"inertial_coupling[{i}].into": term.into for i, term in enumerate(self.inertial_coupling)}
+        named |= {
+            f"inertial_coupling[{i}].into": term.into
+            for i, term in enumerate(self.inertial_coupling)
+        }
         for i, term in enumerate(self.inertial_coupling):
-            require(len(term.product) == 2, f"inertial_coupling[{i}].product", f"{len(term.product)} states", "two of them")
-            named |= {f"inertial_coupling[{i}].product[{k}]": state for k, state in enumerate(term.product)}
-        require(not self.gusts or self.speed > 0.0, "speed", self.speed, "above 0 m/s beside gusts, which are per w / V0")
+            require(
+                len(term.product) == 2,
+                f"inertial_coupling[{i}].product",
+                f"{len(term.product)} states",
+                "two of them",
+            )
+            named |= {
+                f"inertial_coupling[{i}].product[{k}]": state
+                for k, state in enumerate(term.product)
+            }
+        require(
+            not self.gusts or self.speed > 0.0,
+            "speed",
+            self.speed,
+            "above 0 m/s beside gusts, which are per w / V0",
+        )
         for gust in self.gusts:
-            require(gust in AXES, f"gusts.{gust}", f"{gust!r}", f"an axis of the wind: {', '.join(AXES)}")
+            require(
+                gust in AXES,
+                f"gusts.{gust}",
+                f"{gust!r}",
+                f"an axis of the wind: {', '.join(AXES)}",
+            )
         for gust, direction in self.gusts.items():
             named |= {f"gusts.{gust}.{state}": state for state in direction}
         for key, name in named.items():
@@ -112,24 +154,51 @@ class Airframe(Config):
     def _units(self) -> list[tuple[str, Unit]]:
         """Units of states and inputs with their keys."""
         states = [(f"states.{name}", unit) for name, unit in self.states.items()]
-        return states + [(f"inputs.{name}.unit", channel.unit) for name, channel in self.inputs.items()]
+        return states + [
+            (f"inputs.{name}.unit", channel.unit) for name, channel in self.inputs.items()
+        ]
 
     def _check_outputs(self, n: int, m: int) -> None:
         """Check C, D and output_units: shapes, a unit for each output, no feedthrough."""
         shape = [len(row) for row in self.C]
-        require(shape in ([], [n] * m), "C", f"rows of {shape} values", f"{m} rows of {n}: a row an output, a column a state")
+        require(
+            shape in ([], [n] * m),
+            "C",
+            f"rows of {shape} values",
+            f"{m} rows of {n}: a row an output, a column a state",
+        )
         largest = max(map(abs, chain.from_iterable(self.D)), default=0.0)
-        way_out = "none: take an output that no input moves at once, such as a speed in place of an acceleration"
+        way_out = (
+            "none: take an output that no input moves at once, such as a speed in place "
+            "of an acceleration"
+        )
         require(largest == 0.0, "D", f"a feedthrough of {largest:g}", way_out)
         for name in self.output_units:
-            expected = f"an output of C that is no state: {', '.join(set(self.outputs) - set(self.states)) or 'none'}"
-            require(bool(self.C) and name in self.outputs and name not in self.states, "output_units", f"{name!r}", expected)
+            expected = (
+                "an output of C that is no state: "
+                f"{', '.join(set(self.outputs) - set(self.states)) or 'none'}"
+            )
+            require(
+                bool(self.C) and name in self.outputs and name not in self.states,
+                "output_units",
+                f"{name!r}",
+                expected,
+            )
         for name, row in zip(self.outputs, self.C, strict=bool(self.C)):
-            require(name in self.states or name in self.output_units, f"output_units.{name}", "none", "the unit of this output")
+            require(
+                name in self.states or name in self.output_units,
+                f"output_units.{name}",
+                "none",
+                "the unit of this output",
+            )
             picked = [state for state, value in zip(self.states, row, strict=True) if value != 0.0]
-            same = name not in self.states or (picked == [name] and row[list(self.states).index(name)] == 1.0)
+            same = name not in self.states or (
+                picked == [name] and row[list(self.states).index(name)] == 1.0
+            )
             row_of_it = f"the state {name} alone: give another combination another name"
-            require(same, "C", f"a row of {name} with {' and '.join(picked) or 'no state'}", row_of_it)
+            require(
+                same, "C", f"a row of {name} with {' and '.join(picked) or 'no state'}", row_of_it
+            )
 
     def units_of_outputs(self) -> dict[str, Unit]:
         """Units of the outputs, in their order."""
@@ -153,17 +222,25 @@ class Airframe(Config):
         return matrix * row[:, None] / column[None, :]
 
     def no_thrust(self) -> FloatArray:
-        """The inputs without thrust, deviations from trim, shape (p,), SI: 0 of a surface, nan where the file has none."""
+        """The inputs without thrust, deviations from trim, shape (p,), SI: 0 of a surface, nan
+        where the file has none.
+        """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
         said = [channel.no_thrust for channel in self.inputs.values()]
         pairs = zip(said, units, unsaid, strict=True)
-        return np.array([default if value is None else value * unit.si for value, unit, default in pairs])
+        return np.array(
+            [default if value is None else value * unit.si for value, unit, default in pairs]
+        )
 
     def matrix_c(self) -> FloatArray:
         """C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
         if self.C:
-            return np.array(self.C) * _si(self.units_of_outputs().values())[:, None] / _si(self.states.values())
+            return (
+                np.array(self.C)
+                * _si(self.units_of_outputs().values())[:, None]
+                / _si(self.states.values())
+            )
         return selection_matrix(self.outputs, [*self.states])
 
     def matrix_gravity(self) -> FloatArray:
@@ -174,7 +251,9 @@ class Airframe(Config):
         return matrix
 
     def products(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]), shapes (n, P), (P,) and (P,)."""
+        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]), shapes (n, P), (P,) and
+        (P,).
+        """
         terms = self.inertial_coupling
         gain = np.zeros((len(self.states), len(terms)))
         for k, term in enumerate(terms):
@@ -184,23 +263,33 @@ class Airframe(Config):
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
-        """A copy with new A, shape (n, n), and B, shape (n, m), given in SI and stored in the units of the file.
+        """A copy with new A, shape (n, n), and B, shape (n, m), given in SI and stored in the units
+        of the file.
 
-        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries
-        need not meet the identities of physics, so the copy is not checked for these.
+        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`.
+        Sampled and identified entries need not meet the identities of physics, so the copy is not
+        checked for these.
         """
         state = _si(self.states.values())
         inputs = _si(i.unit for i in self.inputs.values())
-        values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
+        values = {
+            "A": (A / state[:, None] * state).tolist(),
+            "B": (B / state[:, None] * inputs).tolist(),
+        }
         gusts = {}
         for (axis, direction), factor in zip(self.gusts.items(), wind_factor.T, strict=True):
-            gusts[axis] = {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
+            gusts[axis] = {
+                name: value * float(factor[self.index(name)]) for name, value in direction.items()
+            }
         return self.validate_mapping(
-            self.model_dump() | values | {"gusts": gusts, "identities": False}, f"airframe {self.name}"
+            self.model_dump() | values | {"gusts": gusts, "identities": False},
+            f"airframe {self.name}",
         )
 
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
-        """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order; physics unchecked."""
+        """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order;
+        physics unchecked.
+        """
         B = self.matrix_b() @ T / _si(self.states.values())[:, None]
         channels = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
         values = {"inputs": channels, "B": B.tolist(), "identities": False}
@@ -208,11 +297,22 @@ class Airframe(Config):
 
     def matrix_gusts(self) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
-        return np.array([self.gust_direction(axis) for axis in self.gusts]).reshape(-1, len(self.states)).T
+        return (
+            np.array([self.gust_direction(axis) for axis in self.gusts])
+            .reshape(-1, len(self.states))
+            .T
+        )
 
     def gust_direction(self, gust: str) -> FloatArray:
-        """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an axis not in the file."""
-        require(gust in self.gusts, "gusts", f"{gust!r}", f"a gust of the airframe {self.name}: {', '.join(self.gusts)}")
+        """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an
+        axis not in the file.
+        """
+        require(
+            gust in self.gusts,
+            "gusts",
+            f"{gust!r}",
+            f"a gust of the airframe {self.name}: {', '.join(self.gusts)}",
+        )
         direction = np.zeros(len(self.states))
         for state, value in self.gusts[gust].items():
             direction[self.index(state)] = value / self.speed
@@ -225,14 +325,20 @@ def _si(units: Iterable[Unit]) -> FloatArray:
 
 
 def check_identities(airframe: Airframe) -> None:
-    """Raise ParameterError for an airframe that contradicts what physics fixes, unless the file says `identities: false`."""
+    """Raise ParameterError for an airframe that contradicts what physics fixes, unless the file
+    says `identities: false`.
+    """
     if airframe.identities:
         effects = {name: channel.positive for name, channel in airframe.inputs.items()}
         units = tuple(channel.unit for channel in airframe.inputs.values())
         A = np.array(airframe.A)
         B = np.array(airframe.B)
         gravity = airframe.matrix_gravity()
-        identities.check(identities.Model(airframe.name, airframe.states, effects, units, airframe.speed, A, B, gravity))
+        identities.check(
+            identities.Model(
+                airframe.name, airframe.states, effects, units, airframe.speed, A, B, gravity
+            )
+        )
 
 
 def airframes() -> list[str]:
@@ -241,7 +347,9 @@ def airframes() -> list[str]:
 
 
 def load_airframe(name: FilePath | Airframe) -> Airframe:
-    """An airframe by name in the library, or by the path of a file; an Airframe as it is. Raises ParameterError."""
+    """An airframe by name in the library, or by the path of a file; an Airframe as it is. Raises
+    ParameterError.
+    """
     if isinstance(name, Airframe):
         return name
     path = find_file(name, LIBRARY, "airframe", EXPECTED)
@@ -250,7 +358,9 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
 
 @lru_cache(maxsize=8)
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
-    """An airframe from the content of a file, cached: a node that checks a change in flight saves 15 ms."""
+    """An airframe from the content of a file, cached: a node that checks a change in flight saves
+    15 ms.
+    """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
     airframe = Airframe.validate_mapping(parsed, f"airframe {name}")

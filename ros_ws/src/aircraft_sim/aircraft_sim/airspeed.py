@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe away from the trim speed: A, B and trim in level flight at the same altitude, by powers of the airspeed."""
+"""An airframe away from the trim speed: A, B and trim in level flight at the same altitude, by
+powers of the airspeed.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -33,8 +35,8 @@ EXPONENTS: Mapping[str, Mapping[str, float]] = {
 }
 """Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
 
-In level flight lift is weight at any speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about the trim, so A[alpha,V] is
--2 g / V^2.
+In level flight lift is weight at any speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about
+the trim, so A[alpha,V] is -2 g / V^2.
 """
 
 OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
@@ -61,9 +63,16 @@ class Exponents(NamedTuple):
 
 
 def exponents(airframe: Airframe, thrust: str) -> Exponents:
-    """The exponents for the input `thrust`. Raises ParameterError for a state whose exponents are not known."""
+    """The exponents for the input `thrust`. Raises ParameterError for a state whose exponents are
+    not known.
+    """
     unknown = [name for name in airframe.states if name not in STATES]
-    require(not unknown, f"airframe {airframe.name}", f"the states {', '.join(unknown)}", f"some of {', '.join(STATES)}")
+    require(
+        not unknown,
+        f"airframe {airframe.name}",
+        f"the states {', '.join(unknown)}",
+        f"some of {', '.join(STATES)}",
+    )
     kinds = [STATES[name] for name in airframe.states]
     n = len(kinds)
     axes = [WIND_STATE[axis] for axis in airframe.gusts]
@@ -83,28 +92,36 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
 def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
     """The airframe trimmed at `ratio` times its speed V0, shape and units as before.
 
-    Moments by an angle of incidence or by a surface grow with V^2, dampings with V, what a force does to an angle of incidence
-    with the force over V; thrust, gravity and kinematics stay, and so does lift, the weight. Every entry is scaled by a power
-    of the ratio: EXPONENTS, OF_SURFACE and OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of
-    the trim: no Mach number, none changes with C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation",
-    2.6, dimensional derivatives. Raises as `exponents`.
+    Moments by an angle of incidence or by a surface grow with V^2, dampings with V, what a force
+    does to an angle of incidence with the force over V; thrust, gravity and kinematics stay, and so
+    does lift, the weight. Every entry is scaled by a power of the ratio: EXPONENTS, OF_SURFACE and
+    OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of the trim: no
+    Mach number, none changes with C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and
+    Simulation", 2.6, dimensional derivatives. Raises as `exponents`.
     """
     powers = exponents(airframe, thrust)
     wind = ratio ** (powers.wind + 1.0)  # the file has the effect per w / V0
-    moved = airframe.with_matrices(airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind)
+    moved = airframe.with_matrices(
+        airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
+    )
     gravity = [
-        {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][ANGLE]} for term in airframe.gravity
+        {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][ANGLE]}
+        for term in airframe.gravity
     ]
     changed = {"speed": ratio * airframe.speed, "gravity": gravity}
-    return type(airframe).validate_mapping(moved.model_dump() | changed, f"airframe {airframe.name}")
+    return type(airframe).validate_mapping(
+        moved.model_dump() | changed, f"airframe {airframe.name}"
+    )
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
     """Trim at `ratio` times V0 as deviations x, (n,), and u, (p,), from the trim at V0, SI.
 
-        (A + gravity) dx + B du = 0,  dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
+        (A + gravity) dx + B du = 0,
+            dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
 
-    with A, B of the airspeed and the least du where several inputs serve, in TRIM_STEPS steps. Raises as `exponents`.
+    with A, B of the airspeed and the least du where several inputs serve, in TRIM_STEPS steps.
+    Raises as `exponents`.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)
@@ -120,17 +137,37 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
         middle = 1.0 + width * (k + 0.5)
         moved = A * middle**powers.A + gravity * middle**powers.gravity
         dx = airframe.speed * width * faster
-        change = np.linalg.lstsq(np.column_stack([moved @ higher, B * middle**powers.B]), -moved @ dx, rcond=None)[0]
+        change = np.linalg.lstsq(
+            np.column_stack([moved @ higher, B * middle**powers.B]), -moved @ dx, rcond=None
+        )[0]
         x = x + dx + change[0] * higher
         u = u + change[1:]
     return x, u
 
 
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
-    """How matrices and trim of an airframe follow the airspeed. Raises as `exponents`, and without V or a speed."""
-    require("V" in airframe.states and airframe.speed > 0.0, "over_airspeed", f"{airframe.name} without V or speed", "both")
-    require(thrust in airframe.inputs, "over_airspeed", thrust, f"an input: {', '.join(airframe.inputs)}")
+    """How matrices and trim of an airframe follow the airspeed. Raises as `exponents`, and without
+    V or a speed.
+    """
+    require(
+        "V" in airframe.states and airframe.speed > 0.0,
+        "over_airspeed",
+        f"{airframe.name} without V or speed",
+        "both",
+    )
+    require(
+        thrust in airframe.inputs,
+        "over_airspeed",
+        thrust,
+        f"an input: {', '.join(airframe.inputs)}",
+    )
     ratio = np.arange(SLOWEST, FASTEST + SPACING / 2.0, SPACING)
     trims = [level_flight(airframe, float(part), thrust) for part in ratio]
     powers = exponents(airframe, thrust)
-    return OverAirspeed(airframe.speed, airframe.index("V"), *powers, ratio, *map(np.array, zip(*trims, strict=True)))
+    return OverAirspeed(
+        airframe.speed,
+        airframe.index("V"),
+        *powers,
+        ratio,
+        *map(np.array, zip(*trims, strict=True)),
+    )

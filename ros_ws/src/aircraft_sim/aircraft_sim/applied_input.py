@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""u that the aircraft applies: the received u, the failsafe of a u that times out, and a bumpless return."""
+"""u that the aircraft applies: the received u, the failsafe of a u that times out, and a bumpless
+return.
+"""
 
 import numpy as np
 
@@ -13,9 +15,10 @@ class AppliedInput:
 
         u_applied(t) = s(t - t_u) u + r(t - t_0) offset,    offset = u_applied(t_0) - u(t_0)
 
-    u is the last received u and t_u the instant of receipt. s is 1 for `hold_ns`, then falls to 0 within `ramp_ns`. t_0 is the
-    instant of the last bumpless transfer: to a new publisher, or to a u after the ramp has begun. r falls from 1 to 0 within
-    `ramp_ns`, so that u_applied does not jump at t_0.
+    u is the last received u and t_u the instant of receipt. s is 1 for `hold_ns`, then falls to 0
+    within `ramp_ns`. t_0 is the instant of the last bumpless transfer: to a new publisher, or to a
+    u after the ramp has begun. r falls from 1 to 0 within `ramp_ns`, so that u_applied does not
+    jump at t_0.
     """
 
     def __init__(self, m: int, hold_ns: int, ramp_ns: int) -> None:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Disturbances as functions of time: 1-cosine gusts, biases and sines on x_dot.
 
-Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it. A bias with rise 0 is a
-step, does not meet Assumption 2 and lies outside the theorem.
+Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it.
+A bias with rise 0 is a step, does not meet Assumption 2 and lies outside the theorem.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,12 @@ AXES = ("longitudinal", "lateral", "vertical")
 """Axes of the wind, FRD axes of trim. Positive: tail wind, wind to the right, wind down."""
 
 AIR_STATE = {"longitudinal": "V", "lateral": "beta", "vertical": "alpha"}
-"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0, small angles."""
+"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w /
+V0, small angles."""
 
-MIN_RISE = 1e-30  # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division by 0
+# s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division
+# by 0
+MIN_RISE = 1e-30
 
 
 class Gusts(NamedTuple):
@@ -25,7 +28,9 @@ class Gusts(NamedTuple):
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
     length: Array  # (G,) distance H from entry to peak, m, > 0
-    every: Array | None = None  # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
+    every: Array | None = (
+        None  # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
+    )
 
 
 class Bias(NamedTuple):
@@ -45,25 +50,29 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 ((t - start) mod every) up to 2H.
+    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 ((t - start) mod
+    every) up to 2H.
 
-    Zero before entry, and after 2H/V0 seconds until it comes again. The derivative is continuous and at most U_ds/2 pi V0/H,
-    which meets Assumption 2. Source of the form: FAR/CS 25.341(a).
+    Zero before entry, and after 2H/V0 seconds until it comes again. The derivative is continuous
+    and at most U_ds/2 pi V0/H, which meets Assumption 2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     since = t - gusts.start
     if gusts.every is not None:
         since = xp.where(since > 0.0, since % gusts.every, since)
-    # minimum and maximum are several times faster than clip, which checks the types of its limits first
+    # minimum and maximum are several times faster than clip, which checks the types of its limits
+    # first
     s = xp.minimum(xp.maximum(airspeed * since / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
 
 
 def bias(t: Array, params: Bias) -> Array:
-    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise clipped to [0, 1].
+    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise clipped to [0,
+    1].
 
-    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 the bias is a step: zero up to
-    start, `value` afterwards. Assumption 2 does not hold at the instant of the step.
+    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 the bias
+    is a step: zero up to start, `value` afterwards. Assumption 2 does not hold at the instant of
+    the step.
     """
     xp = array_namespace(params.value)
     s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, MIN_RISE), 0.0), 1.0)
@@ -71,5 +80,9 @@ def bias(t: Array, params: Bias) -> Array:
 
 
 def sines(t: Array, params: Sines) -> Array:
-    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). The derivative is at most amplitude frequency."""
-    return params.amplitude * array_namespace(params.amplitude).sin(params.frequency * t + params.phase)
+    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). The derivative is at most
+    amplitude frequency.
+    """
+    return params.amplitude * array_namespace(params.amplitude).sin(
+        params.frequency * t + params.phase
+    )

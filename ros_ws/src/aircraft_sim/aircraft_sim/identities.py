@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What physics fixes in the matrices of an aircraft: kinematics, gravity, trim speed, the sign and the size of a control.
+"""What physics fixes in the matrices of an aircraft: kinematics, gravity, trim speed, the sign and
+the size of a control.
 
-The names of the states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q, r angular rates,
-h a height; FRD axes. A state of a different name is not checked. Source of the identities: the linear equations of motion about
-straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D. Reid,
-Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
+The names of the states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles,
+p, q, r angular rates, h a height; FRD axes. A state of a different name is not checked. Source of
+the identities: the linear equations of motion about straight flight, B. L. Stevens, F. L. Lewis,
+Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight,
+3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,14 +27,21 @@ KINDS = {
     **dict.fromkeys(("h", "altitude"), (LENGTH, "a height, as m or ft")),
 }
 """Dimension of the states that have a name of the field."""
-OF_RATES = {"theta": "q r phi", "phi": "p q r theta phi", "psi": "q r theta phi", "h": None, "altitude": None}
+OF_RATES = {
+    "theta": "q r phi",
+    "phi": "p q r theta phi",
+    "psi": "q r theta phi",
+    "h": None,
+    "altitude": None,
+}
 """States whose derivative no force changes, and the named states that enter it; None: any."""
 
 TURNED = (0.7, 1.02)
 COUPLED = (0.6, 1.35)
 LIFT = (0.3, 2.8)
-"""Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a rate, Z_q or Y_r; of the
-change of lift = weight with speed, which compressibility and thrust change: published aircraft have 0.78 to 1.02."""
+"""Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a
+rate, Z_q or Y_r; of the change of lift = weight with speed, which compressibility and thrust
+change: published aircraft have 0.78 to 1.02."""
 MANY = 4  # states of which every order is tried: 24
 FOREIGN = 0.02  # 1, the largest entry of an unrelated state in the row of an angle, SI
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
@@ -53,12 +62,16 @@ EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("h", "alpha"): (-1.0, "V0", COUPLED),
     ("h", "w"): (-1.0, "", TURNED),
 }
-"""Entries of A by row and column: sign, value in SI, and accepted parts; about straight flight without bank."""
+"""Entries of A by row and column: sign, value in SI, and accepted parts; about straight flight
+without bank."""
 
 EFFECTS = {
-    "nose down": ("q", -1.0), "pitch down": ("q", -1.0), "nose up": ("q", 1.0), "pitch up": ("q", 1.0),
-    "roll right": ("p", 1.0), "right wing down": ("p", 1.0), "roll left": ("p", -1.0), "left wing down": ("p", -1.0),
-    "nose right": ("r", 1.0), "yaw right": ("r", 1.0), "nose left": ("r", -1.0), "yaw left": ("r", -1.0),
+    "nose down": ("q", -1.0), "pitch down": ("q", -1.0), "nose up": ("q", 1.0),
+    "pitch up": ("q", 1.0),
+    "roll right": ("p", 1.0), "right wing down": ("p", 1.0), "roll left": ("p", -1.0),
+    "left wing down": ("p", -1.0),
+    "nose right": ("r", 1.0), "yaw right": ("r", 1.0), "nose left": ("r", -1.0),
+    "yaw left": ("r", -1.0),
     "more thrust": ("V u", 1.0), "more power": ("V u", 1.0),
 }  # fmt: skip
 """What `positive` may say of an input: the states that it moves, and the sign."""
@@ -68,9 +81,11 @@ CONTROLS = {
     "aileron": ("p", "beta v", 0.015, 8.0),
     "rudder": ("r", "beta v", 0.015, 8.0),
 }
-"""By input the rate that it moves, the angle of the flow, and the range of effect / (stiffness + damping): `_strengths`.
+"""By input the rate that it moves, the angle of the flow, and the range of effect / (stiffness +
+damping): `_strengths`.
 
-Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. A column per deg taken per rad is 57 times off.
+Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. A column per deg taken per rad is
+57 times off.
 """
 
 FACTORS = {
@@ -123,15 +138,21 @@ class Finding(NamedTuple):
 
 
 def check(model: Model) -> None:
-    """Raise ParameterError for the first contradiction, with the rearrangement of A or B that mends every contradiction."""
+    """Raise ParameterError for the first contradiction, with the rearrangement of A or B that mends
+    every contradiction.
+    """
     findings = list(contradictions(model))
     if not findings:
         return
     key, actual, expected, mend = findings[0]
-    mend = next((text for text, changed in rearranged(model) if not any(contradictions(changed))), mend)
+    mend = next(
+        (text for text, changed in rearranged(model) if not any(contradictions(changed))), mend
+    )
     way_out = f": {mend}" if mend else ""
     skip = "(identities: false in the file skips this check)"
-    raise ParameterError(f"airframe {model.name}: {key}: found {actual}, expected {expected}{way_out} {skip}")
+    raise ParameterError(
+        f"airframe {model.name}: {key}: found {actual}, expected {expected}{way_out} {skip}"
+    )
 
 
 def contradictions(model: Model) -> Iterator[Finding]:
@@ -151,12 +172,17 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
     names = list(model.states)
     inputs = list(model.effects)
     units = list(model.states.items())
-    yield "A is transposed: write a row a state derivative, a column a state", model._replace(file_A=A.T)
+    yield (
+        "A is transposed: write a row a state derivative, a column a state",
+        model._replace(file_A=A.T),
+    )
     one_order = "A and B need one order of the states"
     for order in _orders(len(A)):
         listed = ", ".join(names[k] for k in order)
         place = np.argsort(order)
-        renamed = model._replace(states=dict(units[k] for k in order), gravity=model.gravity[np.ix_(order, order)])
+        renamed = model._replace(
+            states=dict(units[k] for k in order), gravity=model.gravity[np.ix_(order, order)]
+        )
         yield f"the matrices have the states in the order {listed}: name the states so", renamed
         yield f"the rows of A have the order {listed}", model._replace(file_A=A[place])
         yield f"the columns of A have the order {listed}", model._replace(file_A=A[:, place])
@@ -165,11 +191,16 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
         yield f"A has the states in the order {listed}, unlike B: {one_order}", both
     for order in _orders(len(inputs)):
         listed = ", ".join(inputs[k] for k in order)
-        yield f"the columns of B have the order {listed}", model._replace(file_B=B[:, np.argsort(order)])
+        yield (
+            f"the columns of B have the order {listed}",
+            model._replace(file_B=B[:, np.argsort(order)]),
+        )
 
 
 def _orders(count: int) -> Iterator[list[int]]:
-    """Orders other than the first: any of a few items, with the fewest moves first; of more items the exchange of two."""
+    """Orders other than the first: any of a few items, with the fewest moves first; of more items
+    the exchange of two.
+    """
     first = list(range(count))
     pairs = []
     for i, j in combinations(first, 2):
@@ -187,7 +218,12 @@ def _dimensions(model: Model) -> Iterator[Finding]:
         dimension, words = KINDS.get(name, (None, ""))
         if dimension is not None and quantity(unit).dimension != dimension:
             near = {"w": "alpha", "v": "beta", "alpha": "w", "beta": "v"}.get(name)
-            yield Finding(f"states.{name}", unit, words, f"a state in {unit} is {near} perhaps" if near else "")
+            yield Finding(
+                f"states.{name}",
+                unit,
+                words,
+                f"a state in {unit} is {near} perhaps" if near else "",
+            )
 
 
 def _entries(model: Model) -> Iterator[Finding]:
@@ -199,7 +235,11 @@ def _entries(model: Model) -> Iterator[Finding]:
         "V0": V0,
     }
     if V0 > 0.0:
-        values |= {"g/V0": GRAVITY / V0, "2 g/V0": 2.0 * GRAVITY / V0, "2 g/V0^2": 2.0 * GRAVITY / V0**2}
+        values |= {
+            "g/V0": GRAVITY / V0,
+            "2 g/V0": 2.0 * GRAVITY / V0,
+            "2 g/V0^2": 2.0 * GRAVITY / V0**2,
+        }
     right = dict.fromkeys(values, True)
     for (row, column), (sign, symbol, (least, most)) in EXPECTED.items():
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
@@ -207,7 +247,9 @@ def _entries(model: Model) -> Iterator[Finding]:
             continue
         entry = float(model.matrix_a()[names.index(row), names.index(column)])
         expected = sign * values[symbol]
-        left_out = entry == 0.0 and (symbol.startswith("2 g") or (symbol == "V0" and not model.angular))  # a multirotor hovers
+        left_out = entry == 0.0 and (
+            symbol.startswith("2 g") or (symbol == "V0" and not model.angular)
+        )  # a multirotor hovers
         if least <= entry / expected <= most or left_out:
             continue
         right[symbol] = False
@@ -229,7 +271,9 @@ def _mend(ratio: float) -> str:
     size = abs(ratio)
     for words, factor in FACTORS.items():
         if min(abs(size / factor - 1.0), abs(size * factor - 1.0)) < 0.06:
-            return f"{words} are mixed up, give each state the unit that A has" + (", and " + sign if sign else "")
+            return f"{words} are mixed up, give each state the unit that A has" + (
+                ", and " + sign if sign else ""
+            )
     return sign
 
 
@@ -246,17 +290,25 @@ def _kinematic_rows(model: Model) -> Iterator[Finding]:
                 else 0.0
             )
             if abs(value) > FOREIGN:
-                yield Finding("A", f"{row}_dot = {value:.4g} {column} in SI", f"no {column} in {row}_dot")
+                yield Finding(
+                    "A", f"{row}_dot = {value:.4g} {column} in SI", f"no {column} in {row}_dot"
+                )
         for k, name in enumerate(model.effects):
             if abs(model.matrix_b()[i, k]) > 1e-6 * scale:
-                yield Finding("B", f"{row}_dot = {model.matrix_b()[i, k]:.4g} {name}", f"0: no input moves {row} at once")
+                yield Finding(
+                    "B",
+                    f"{row}_dot = {model.matrix_b()[i, k]:.4g} {name}",
+                    f"0: no input moves {row} at once",
+                )
 
 
 def _dampings(model: Model) -> Iterator[Finding]:
     for i, name in enumerate(model.states):
         damping = float(model.matrix_a()[i, i])
         if name in {"p", "q", "r", "alpha", "beta", "w", "v"} and damping > 0.0:
-            yield Finding("A", f"{name}_dot = {damping:.4g} {name}", "0 or less: air damps this motion")
+            yield Finding(
+                "A", f"{name}_dot = {damping:.4g} {name}", "0 or less: air damps this motion"
+            )
 
 
 def _effects(model: Model) -> Iterator[Finding]:
@@ -269,7 +321,11 @@ def _effects(model: Model) -> Iterator[Finding]:
         row = next((row for row in rows.split() if row in names), None)
         value = 0.0 if row is None else float(model.matrix_b()[names.index(row), k])
         if row is not None and value * sign <= 0.0:
-            mend = f"correct `positive`, or the sign of the column {name} of B" if value else "the entry is missing"
+            mend = (
+                f"correct `positive`, or the sign of the column {name} of B"
+                if value
+                else "the entry is missing"
+            )
             yield Finding(
                 f"inputs.{name}",
                 f"{row}_dot = {value:.4g} {name} beside {phrase!r}",
@@ -279,7 +335,9 @@ def _effects(model: Model) -> Iterator[Finding]:
 
 
 def _strengths(model: Model) -> Iterator[Finding]:
-    """Size of a control: angular acceleration per rad over stiffness + damping, |M_alpha| + |M_q| (|M_q| + |Z_alpha|)."""
+    """Size of a control: angular acceleration per rad over stiffness + damping, |M_alpha| + |M_q|
+    (|M_q| + |Z_alpha|).
+    """
     names = list(model.states)
     for k, name in enumerate(model.effects):
         rate, flows, least, most = CONTROLS.get(name, ("", "", 0.0, 0.0))
@@ -289,10 +347,17 @@ def _strengths(model: Model) -> Iterator[Finding]:
         i = names.index(rate)
         j = names.index(flow)
         stiffness = abs(model.matrix_a()[i, j]) * (model.speed if flow in "wv" else 1.0)
-        scale = stiffness + abs(model.matrix_a()[i, i]) * (abs(model.matrix_a()[i, i]) + abs(model.matrix_a()[j, j]))
+        scale = stiffness + abs(model.matrix_a()[i, i]) * (
+            abs(model.matrix_a()[i, i]) + abs(model.matrix_a()[j, j])
+        )
         ratio = abs(float(model.matrix_b()[i, k])) / scale if scale > 0.0 else least
         if not least <= ratio <= most:
             large = ratio > most
             mend = "B is per rad, and the unit deg?" if large else "B is per deg, and the unit rad?"
             known = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
-            yield Finding(f"inputs.{name}.unit", f"{rate}_dot = {model.matrix_b()[i, k]:.3g} {name} in SI", known, mend)
+            yield Finding(
+                f"inputs.{name}.unit",
+                f"{rate}_dot = {model.matrix_b()[i, k]:.3g} {name} in SI",
+                known,
+                mend,
+            )

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim: names, channel tables, flight condition, wind. The import of JSBSim waits for the first use.
+"""Aircraft of JSBSim: names, channel tables, flight condition, wind. The import of JSBSim waits for
+the first use.
 
-JSBSim uses feet and normalised commands from stop to stop. u, y and truth are deviations from trim in SI. The tables INPUTS and
-STATES alone map between the two, with units and signs.
+JSBSim uses feet and normalised commands from stop to stop. u, y and truth are deviations from trim
+in SI. The tables INPUTS and STATES alone map between the two, with units and signs.
 """
 
 import difflib
@@ -23,8 +24,11 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
-PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
-ROOT_VARIABLE = "JSBSIM_ROOT"  # environment: a folder with aircraft, engine and systems in place of the package's
+PREFIX = (
+    "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
+)
+# environment: a folder with aircraft, engine and systems in place of the package's
+ROOT_VARIABLE = "JSBSIM_ROOT"
 # of the file of a model
 SUFFIX = ".xml"
 MODEL_ELEMENT = "fdm_config"
@@ -46,14 +50,19 @@ NamedProperties = tuple[tuple[str, float], ...]
 """Properties of a model, and the value of each at the command 1."""
 
 
-PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")  # outside of JSBSim's settings
+PROPERTY = re.compile(
+    r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+"
+)  # outside of JSBSim's settings
 
 
-def named_properties(commands: Mapping[str, str], key: str) -> tuple[tuple[str, NamedProperties], ...]:
-    """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5".
+def named_properties(
+    commands: Mapping[str, str], key: str
+) -> tuple[tuple[str, NamedProperties], ...]:
+    """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5
+    fcs/cmdAilL_rad=-0.5".
 
-    The number is the property's value at the command 1, which is the default. Raises ParameterError for an unknown input, for
-    what is no property of an aircraft, and for the value 0.
+    The number is the property's value at the command 1, which is the default. Raises ParameterError
+    for an unknown input, for what is no property of an aircraft, and for the value 0.
     """
     named = []
     for name, text in commands.items():
@@ -63,7 +72,12 @@ def named_properties(commands: Mapping[str, str], key: str) -> tuple[tuple[str, 
             path, _, number = word.partition("=")
             at_one = _number(number or "1")
             fits = PROPERTY.fullmatch(path) is not None and math.isfinite(at_one) and at_one != 0.0
-            require(fits, f"{key}.{name}", repr(word), "PROPERTY=VALUE of the aircraft, as fcs/cmdElev_rad=0.5")
+            require(
+                fits,
+                f"{key}.{name}",
+                repr(word),
+                "PROPERTY=VALUE of the aircraft, as fcs/cmdElev_rad=0.5",
+            )
             paths.append((path, at_one))
         require(bool(paths), f"{key}.{name}", repr(text), "a property of the aircraft")
         named.append((name, tuple(paths)))
@@ -86,10 +100,16 @@ class Quantity(NamedTuple):
 
 
 INPUTS: Mapping[str, Command] = {
-    "elevator": Command("fcs/elevator-cmd-norm", "fcs/pitch-trim-cmd-norm", -1.0, 1.0, False, "nose down"),
+    "elevator": Command(
+        "fcs/elevator-cmd-norm", "fcs/pitch-trim-cmd-norm", -1.0, 1.0, False, "nose down"
+    ),
     "throttle": Command("fcs/throttle-cmd-norm", None, 0.0, 1.0, True, "more thrust"),
-    "aileron": Command("fcs/aileron-cmd-norm", "fcs/roll-trim-cmd-norm", -1.0, 1.0, False, "roll right"),
-    "rudder": Command("fcs/rudder-cmd-norm", "fcs/yaw-trim-cmd-norm", -1.0, 1.0, False, "nose left"),
+    "aileron": Command(
+        "fcs/aileron-cmd-norm", "fcs/roll-trim-cmd-norm", -1.0, 1.0, False, "roll right"
+    ),
+    "rudder": Command(
+        "fcs/rudder-cmd-norm", "fcs/yaw-trim-cmd-norm", -1.0, 1.0, False, "nose left"
+    ),
 }
 
 STATES: Mapping[str, Quantity] = {
@@ -105,7 +125,9 @@ STATES: Mapping[str, Quantity] = {
 }
 """States x.* of `truth`, deviations from trim: the outputs in the order of y, then the rest."""
 
-OUTPUTS: Mapping[str, Unit] = {name: quantity.unit for name, quantity in STATES.items() if quantity.unit is not None}
+OUTPUTS: Mapping[str, Unit] = {
+    name: quantity.unit for name, quantity in STATES.items() if quantity.unit is not None
+}
 
 RESIDUALS: Mapping[str, float] = {
     "udot-ft_sec2": FOOT,
@@ -119,7 +141,9 @@ RESIDUALS: Mapping[str, float] = {
 
 
 class FlightCondition(NamedTuple):
-    """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running, heading north, no wind."""
+    """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running,
+    heading north, no wind.
+    """
 
     name: str  # of the aircraft, without PREFIX, or the absolute path of its model
     speed: float  # true airspeed, m/s
@@ -136,7 +160,9 @@ class FlightCondition(NamedTuple):
         """INPUTS, with the user's own properties."""
         named = dict(self.named)
         return {
-            name: command._replace(trim_property=None, named=named[name]) if name in named else command
+            name: command._replace(trim_property=None, named=named[name])
+            if name in named
+            else command
             for name, command in INPUTS.items()
         }
 
@@ -161,32 +187,47 @@ class WindModel(NamedTuple):
 @cache
 def aircraft_names() -> tuple[str, ...]:
     """Names of the aircraft of JSBSim. Raises ParameterError where JSBSim is not installed."""
-    return tuple(sorted(path.parent.name for path in (root() / "aircraft").glob("*/*.xml") if path.stem == path.parent.name))
+    return tuple(
+        sorted(
+            path.parent.name
+            for path in (root() / "aircraft").glob("*/*.xml")
+            if path.stem == path.parent.name
+        )
+    )
 
 
 def root() -> Path:
-    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or that of the package jsbsim.
+    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or that of the
+    package jsbsim.
 
-    Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such folder.
+    Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such
+    folder.
     """
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
     except ModuleNotFoundError:
-        raise ParameterError("airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim") from None
+        raise ParameterError(
+            "airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim"
+        ) from None
     chosen = os.environ.get(ROOT_VARIABLE)
     if not chosen:
         return Path(jsbsim.get_default_root_dir())
     folder = Path(chosen).expanduser().absolute()
     parts = ("aircraft", "engine")
-    require(all((folder / part).is_dir() for part in parts), ROOT_VARIABLE, chosen, f"a folder with {' and '.join(parts)}")
+    require(
+        all((folder / part).is_dir() for part in parts),
+        ROOT_VARIABLE,
+        chosen,
+        f"a folder with {' and '.join(parts)}",
+    )
     return folder
 
 
 def require_aircraft(airframe: str) -> str:
     """Name of the aircraft in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
 
-    PATH is the XML file of a model, or its folder; its text has a "/" or ends with ".xml". Raises ParameterError, for a name
-    with the closest known name, for a path with what is there.
+    PATH is the XML file of a model, or its folder; its text has a "/" or ends with ".xml". Raises
+    ParameterError, for a name with the closest known name, for a path with what is there.
     """
     name = airframe.removeprefix(PREFIX)
     if "/" in name or name.endswith(SUFFIX):
@@ -200,19 +241,26 @@ def require_aircraft(airframe: str) -> str:
 
 
 def foreign_model(name: str) -> Path | None:
-    """The file of an aircraft's model that is not one of the package jsbsim: the user's own, or of $JSBSIM_ROOT; else None."""
+    """The file of an aircraft's model that is not one of the package jsbsim: the user's own, or of
+    $JSBSIM_ROOT; else None.
+    """
     if Path(name).is_absolute():
         return Path(name)
     return root() / "aircraft" / name / f"{name}{SUFFIX}" if os.environ.get(ROOT_VARIABLE) else None
 
 
 def root_of(model: Path) -> Path:
-    """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package.
+    """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of
+    ROOT/aircraft/NAME/NAME.xml, or the package.
 
     JSBSim looks for the files of a model beside the model first.
     """
     folder = model.parents[min(2, len(model.parents) - 1)]
-    is_tree = not os.environ.get(ROOT_VARIABLE) and model.parents[1].name == "aircraft" and (folder / "engine").is_dir()
+    is_tree = (
+        not os.environ.get(ROOT_VARIABLE)
+        and model.parents[1].name == "aircraft"
+        and (folder / "engine").is_dir()
+    )
     return folder if is_tree else root()
 
 
@@ -222,14 +270,26 @@ def _model_file(path: Path, airframe: str) -> Path:
     if not path.is_dir():
         require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)
         element = _first_element(path)
-        require(element == MODEL_ELEMENT, "airframe", f"{airframe!r}, a file with {element or 'no XML'}", expected)
+        require(
+            element == MODEL_ELEMENT,
+            "airframe",
+            f"{airframe!r}, a file with {element or 'no XML'}",
+            expected,
+        )
         return path
     named = path / f"{path.name}{SUFFIX}"
     if named.is_file():
         return _model_file(named, airframe)
-    models = sorted(file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT)
+    models = sorted(
+        file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT
+    )
     names = ", ".join(model.name for model in models) or "no model"
-    require(len(models) == 1, "airframe", f"{airframe!r}, a folder with {names}", f"a folder with one model, or {expected}")
+    require(
+        len(models) == 1,
+        "airframe",
+        f"{airframe!r}, a folder with {names}",
+        f"a folder with one model, or {expected}",
+    )
     return models[0]
 
 

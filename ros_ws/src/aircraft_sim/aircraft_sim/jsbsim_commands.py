@@ -21,12 +21,14 @@ FROZEN: Mapping[str, float] = {
     "simulation/integrator/position/translational": 0.0,
     "propulsion/fuel_freeze": 1.0,
 }
-"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems still run."""
+"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems
+still run."""
 
 PART = 0.2  # of a command, moved to see the effect
 MOVED = 0.5  # s of frozen flight after it: an engine begins to respond
 AFTERWARDS = 10.0  # s: an engine returns
-NOISE = 2.0  # of the difference between two equal runs, of an engine that settles: a change beyond is an effect
+# of the difference between two equal runs, of an engine that settles: a change beyond is an effect
+NOISE = 2.0
 SYSTEMS = ("flight_control", "autopilot", "system")
 CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
 LEAST = 1e-6  # m/s^2, rad/s^2
@@ -49,10 +51,16 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 
 def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
-    """The properties of a command with the value of each at the command 1, a property per engine for one of the engines."""
+    """The properties of a command with the value of each at the command 1, a property per engine
+    for one of the engines.
+    """
     if command.named:
         return list(command.named)
-    return [(f"{command.property}[{i}]", 1.0) for i in range(engines)] if command.each_engine else [(command.property, 1.0)]
+    return (
+        [(f"{command.property}[{i}]", 1.0) for i in range(engines)]
+        if command.each_engine
+        else [(command.property, 1.0)]
+    )
 
 
 def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
@@ -66,15 +74,25 @@ def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
     return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
 
 
-def commands_and_limits(fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whole commands, the trim's part included, and the distances to the lower and upper stops, shapes (4,)."""
+def commands_and_limits(
+    fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whole commands, the trim's part included, and the distances to the lower and upper stops,
+    shapes (4,).
+    """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
     commands = np.array([fdm[path] / at_one for path, at_one in first])
-    trim = np.array([0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs])
+    trim = np.array(
+        [0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs]
+    )
     lower = np.array([command.lower for command in inputs])
     upper = np.array([command.upper for command in inputs])
-    return commands + trim, lower - np.minimum(commands, commands + trim), upper - np.maximum(commands, commands + trim)
+    return (
+        commands + trim,
+        lower - np.minimum(commands, commands + trim),
+        upper - np.maximum(commands, commands + trim),
+    )
 
 
 def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> list[str]:
@@ -82,7 +100,11 @@ def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> li
     return [
         name
         for name, command in commands.items()
-        if not _moves(fdm, command_paths(command, engine_count(fdm)), -PART if fdm[_first(command)] > PART else PART)
+        if not _moves(
+            fdm,
+            command_paths(command, engine_count(fdm)),
+            -PART if fdm[_first(command)] > PART else PART,
+        )
     ]
 
 
@@ -109,22 +131,35 @@ def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: floa
 def sentence_without_effect(
     fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command], names: Iterable[str], model: Path | None
 ) -> str:
-    """A sentence on inputs without effect: the properties that move nothing, and those that the model reads."""
-    parts = [f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}" for name in names]
+    """A sentence on inputs without effect: the properties that move nothing, and those that the
+    model reads.
+    """
+    parts = [
+        f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"
+        for name in names
+    ]
     manager = fdm.get_property_manager()
-    read = [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
+    read = (
+        [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
+    )
     acting = [path for path in read if _moves(fdm, [(path, 1.0)], PART)]
-    reads = f"; its flight control reads {', '.join(acting)}: name them in `commands`" if acting else ""
+    reads = (
+        f"; its flight control reads {', '.join(acting)}: name them in `commands`" if acting else ""
+    )
     return f"{', '.join(parts)} moves no acceleration{reads}"
 
 
 def _read_by_model(model: Path) -> list[str]:
-    """The properties that the control systems of a model read or declare, and no component writes."""
+    """The properties that the control systems of a model read or declare, and no component
+    writes.
+    """
     read: set[str] = set()
     written: set[str] = set()
     for content in model_files(model).members.values():
         tree = ElementTree.fromstring(content)  # noqa: S314 - model_files has read it
-        for element in chain.from_iterable(section.iter() for section in tree.iter() if section.tag in SYSTEMS):
+        for element in chain.from_iterable(
+            section.iter() for section in tree.iter() if section.tag in SYSTEMS
+        ):
             text = (element.text or "").strip()
             if element.tag in {"input", "p", "property"}:
                 read.add(text.lstrip("-"))
@@ -132,4 +167,6 @@ def _read_by_model(model: Path) -> list[str]:
                 written.add(text)
             elif name := element.get("name"):
                 written |= {name, f"fcs/{'-'.join(name.lower().split())}"}
-    return sorted(path for path in read - written if path.startswith("fcs/") and not path.endswith(CONVENTION))
+    return sorted(
+        path for path in read - written if path.startswith("fcs/") and not path.endswith(CONVENTION)
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like the linear aircraft."""
+"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like
+the linear aircraft.
+"""
 
 import math
 
@@ -34,7 +36,8 @@ POSE = (
 """Properties of the pose other than the position, with the SI value of their units."""
 
 SOFT = 7.0 * FOOT
-"""Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14 CFR 23.473(d), 7 ft/s."""
+"""Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14
+CFR 23.473(d), 7 ft/s."""
 
 THROTTLE = list(INPUTS).index("throttle")
 
@@ -43,7 +46,8 @@ LEAST_FUEL = 1.0
 
 
 class JsbsimModel:
-    """An aircraft of JSBSim behind its actuators, in trim at t = 0: a `simulator.FlightDynamicsModel`.
+    """An aircraft of JSBSim behind its actuators, in trim at t = 0: a
+    `simulator.FlightDynamicsModel`.
 
     A step of the integration, from t_k to t_k + dt:
 
@@ -53,39 +57,61 @@ class JsbsimModel:
 
     Engines whose throttle is lost have the throttle at 0 and no fuel or ignition.
 
-    JSBSim integrates the forces of the step before, then computes the forces of the new commands and the new wind: commands and
-    wind act a step later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is right: the mean
-    over the past step would be half a step older.
+    JSBSim integrates the forces of the step before, then computes the forces of the new commands
+    and the new wind: commands and wind act a step later. JSBSim computes forces at an instant, t_k
+    + dt, so the position at this instant is right: the mean over the past step would be half a step
+    older.
 
-    Raises FlightEnded where the aircraft does not trim, crashes or hangs. An isolated process tries the aircraft first.
+    Raises FlightEnded where the aircraft does not trim, crashes or hangs. An isolated process tries
+    the aircraft first.
     """
 
-    def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:
+    def __init__(
+        self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel
+    ) -> None:
         self.condition = condition
-        self._fdm, self.trim = jsbsim_trim.trimmed_fdm(condition, jsbsim_trim.trim_solution(condition))
+        self._fdm, self.trim = jsbsim_trim.trimmed_fdm(
+            condition, jsbsim_trim.trim_solution(condition)
+        )
         engines = engine_count(self._fdm)
         self._commands = [  # of an input: the nodes, their values in trim and at the command 1
-            [(node := self._node(path), node.get_double_value(), at_one) for path, at_one in command_paths(command, engines)]
+            [
+                (node := self._node(path), node.get_double_value(), at_one)
+                for path, at_one in command_paths(command, engines)
+            ]
             for command in condition.commands().values()
         ]
         self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
-        self._state_nodes = [(self._node(quantity.property), quantity.si) for quantity in STATES.values()]
+        self._state_nodes = [
+            (self._node(quantity.property), quantity.si) for quantity in STATES.values()
+        ]
         self._heading, self._height, self._contact = (
-            self._node(path) for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
+            self._node(path)
+            for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
         )
         # the number and the flag of the engines that can stop: an electric engine has no flag
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
-        self._engines = {number: node for number, node in running.items() if node.get_double_value()}
+        self._engines = {
+            number: node for number, node in running.items() if node.get_double_value()
+        }
         self._cut = False
         self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
         self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
-        self._no_thrust = np.where([command.each_engine for command in INPUTS.values()], -self.trim.commands, 0.0)
+        self._no_thrust = np.where(
+            [command.each_engine for command in INPUTS.values()], -self.trim.commands, 0.0
+        )
         self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
         self._wind_model = wind_model
-        self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
+        self._z = (
+            None
+            if wind_model.turbulence is None
+            else turbulence.initial_state(wind_model.turbulence)
+        )
         self._position = np.zeros(len(INPUTS))
         self._apply_wind(self._wind(0))
-        settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
+        settle(
+            self._fdm, seconds(condition.step_ns)
+        )  # one step: the wind of t = 0 acts from t = 0 on
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
         self._position_ground = np.zeros(2)  # to the north and the east of the start
@@ -99,8 +125,8 @@ class JsbsimModel:
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, shape (4,), deviations from trim.
 
-        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground: landed on the wheels with a
-        sink of at most SOFT, else the aircraft has hit the ground.
+        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground:
+        landed on the wheels with a sink of at most SOFT, else the aircraft has hit the ground.
         """
         step_ns = self.condition.step_ns
         model = self._actuator_model
@@ -108,10 +134,14 @@ class JsbsimModel:
         dt = seconds(step_ns)
         steps = divide(duration_ns, step_ns, "step", "the duration")
         filters = self._wind_model.turbulence
-        normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
+        normals = (
+            () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
+        )
         for k in range(steps):
             t = seconds(t_ns + k * step_ns)
-            position = actuators.step(self._position, u, dt, actuators.in_force(t, self._position, model))
+            position = actuators.step(
+                self._position, u, dt, actuators.in_force(t, self._position, model)
+            )
             self._position = actuators.apply_faults(t, self._position, position, model)
             deviations = actuators.effect(t, self._position, model).tolist()
             for nodes, deviation in zip(self._commands, deviations, strict=True):
@@ -128,27 +158,41 @@ class JsbsimModel:
             except jsbsim.BaseError as error:
                 title = self.condition.title
                 after = seconds(after_ns)
-                raise FlightEnded(f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}") from None
+                raise FlightEnded(
+                    f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}"
+                ) from None
         self._x = self._deviations()
         before = self._velocity
         self._velocity = self._ground_velocity()
-        self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (before + self._velocity)
+        self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (
+            before + self._velocity
+        )
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             on_wheels = not any(node.get_double_value() for node in self._structure)
             if on_wheels and sink <= SOFT:
-                raise FlightEnded(f"{self.condition.title}{LANDED}{now}, with a sink of {sink:.2f} m/s")
-            raise FlightEnded(f"{self.condition.title} hit the ground {now}, with a sink of {sink:.2f} m/s")
-        if stopped := [str(number) for number, node in self._engines.items() if not node.get_double_value()]:
+                raise FlightEnded(
+                    f"{self.condition.title}{LANDED}{now}, with a sink of {sink:.2f} m/s"
+                )
+            raise FlightEnded(
+                f"{self.condition.title} hit the ground {now}, with a sink of {sink:.2f} m/s"
+            )
+        if stopped := [
+            str(number) for number, node in self._engines.items() if not node.get_double_value()
+        ]:
             why = ", out of fuel" if self._fuel.get_double_value() < LEAST_FUEL else ""
-            raise FlightEnded(f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}{why}")
+            raise FlightEnded(
+                f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}{why}"
+            )
 
     def y(self) -> FloatArray:
         """[q, V, p, r], deviations from trim, shape (4,)."""
         return self._x[: len(OUTPUTS)]
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`; alpha and beta of JSBSim are those relative to the air."""
+        """See `simulator.FlightDynamicsModel`; alpha and beta of JSBSim are those relative to the
+        air.
+        """
         return self._x[[list(STATES).index(name) for name in ANGLES]]
 
     def truth(self, t_ns: int) -> FloatArray:
@@ -156,9 +200,15 @@ class JsbsimModel:
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def pose(self) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`. Position is integrated from the velocity by the trapezoidal rule."""
-        phi, theta, psi, altitude, *velocity, beta = (node.get_double_value() * si for node, si in self._pose_nodes)
-        return np.array([phi, theta, pose.wrapped(psi), *self._position_ground, altitude, *velocity, beta])
+        """See `simulator.FlightDynamicsModel`. Position is integrated from the velocity by the
+        trapezoidal rule.
+        """
+        phi, theta, psi, altitude, *velocity, beta = (
+            node.get_double_value() * si for node, si in self._pose_nodes
+        )
+        return np.array(
+            [phi, theta, pose.wrapped(psi), *self._position_ground, altitude, *velocity, beta]
+        )
 
     def _ground_velocity(self) -> FloatArray:
         return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
@@ -173,7 +223,9 @@ class JsbsimModel:
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines with the begin of their loss, and start them with its end. Whether they run is then no outcome."""
+        """Stop the engines with the begin of their loss, and start them with its end. Whether they
+        run is then no outcome.
+        """
         if cut == self._cut:
             return
         jsbsim_trim.cut_engines(self._fdm, cut)
@@ -181,7 +233,10 @@ class JsbsimModel:
         self._engines = {}  # one that was cut off may need longer than a step to run again
 
     def _deviations(self) -> FloatArray:
-        return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states
+        return (
+            np.array([node.get_double_value() * si for node, si in self._state_nodes])
+            - self.trim.states
+        )
 
     def _node(self, path: str) -> jsbsim.FGPropertyNode:
         node = self._fdm.get_property_manager().get_node(path)
@@ -191,7 +246,9 @@ class JsbsimModel:
 
     def _wind(self, t_ns: int) -> FloatArray:
         """Wind along AXES in m/s, shape (3,), at the instant of the turbulence's state."""
-        gusts = one_minus_cosine(np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed))
+        gusts = one_minus_cosine(
+            np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
+        )
         filters = self._wind_model.turbulence
         return np.asarray(gusts if filters is None else gusts + turbulence.wind(self._z, filters))
 
@@ -201,6 +258,8 @@ class JsbsimModel:
         north = math.cos(heading)
         east = math.sin(heading)
         for node, value in zip(
-            self._wind_nodes, (along * north - right * east, along * east + right * north, down), strict=True
+            self._wind_nodes,
+            (along * north - right * east, along * east + right * north, down),
+            strict=True,
         ):
             node.set_double_value(value)

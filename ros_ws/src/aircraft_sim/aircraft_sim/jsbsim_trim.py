@@ -55,33 +55,49 @@ SETTLE = 10.0  # s of frozen flight: for running engines
 SPIN_UP = 30.0  # and for engines that have just been started
 SLOW_SETTLE = 80.0
 SLOW_SPIN_UP = 300.0
-"""The same for a propeller that is slow to reach its speed, such as one of an electric engine with a time constant of 10 s."""
+"""The same for a propeller that is slow to reach its speed, such as one of an electric engine with
+a time constant of 10 s."""
 
-ATTEMPTS = ((SETTLE, SPIN_UP, 0.0), (SLOW_SETTLE, SLOW_SPIN_UP, 0.0), (SETTLE, SPIN_UP, 1.0), (SLOW_SETTLE, SLOW_SPIN_UP, 1.0))
-"""Settling times, s, and the part of the pitch trim given by the elevator: all, for a model without a trim of its own."""
+ATTEMPTS = (
+    (SETTLE, SPIN_UP, 0.0),
+    (SLOW_SETTLE, SLOW_SPIN_UP, 0.0),
+    (SETTLE, SPIN_UP, 1.0),
+    (SLOW_SETTLE, SLOW_SPIN_UP, 1.0),
+)
+"""Settling times, s, and the part of the pitch trim given by the elevator: all, for a model without
+a trim of its own."""
 
-NEAR = 100.0  # of TOLERANCE: accelerations that an engine leaves which has not settled; with more it is not the engine
+# of TOLERANCE: accelerations that an engine leaves which has not settled; with more it is not the
+# engine
+NEAR = 100.0
 FAR = 1e6  # of TOLERANCE: of a motion whose accelerations are not finite
 IDLE = 0.01  # throttle below which an engine without thrust is no failure
 
-START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
+START = np.array(
+    [0.05, 0.7, 0.0, 0.0, 0.0, 0.0]
+)  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
 # of these unknowns
 LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
 HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
-TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])  # m/s^2, rad/s^2: a tenth of a degree of attitude
+TOLERANCE = np.array(
+    [0.02, 0.02, 0.02, 0.002, 0.002, 0.002]
+)  # m/s^2, rad/s^2: a tenth of a degree of attitude
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
 PROBE_SIZE = 0.02  # how far the test flight moves each command
-TIMEOUT = 30.0  # s of processor time for trim and test flight; every aircraft that trims needs less than one
+# s of processor time for trim and test flight; every aircraft that trims needs less than one
+TIMEOUT = 30.0
 
 TrimSolution = tuple[float, ...] | None
-"""The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None where JSBSim's own trim
-succeeds. It gives the same bits everywhere."""
+"""The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None
+where JSBSim's own trim succeeds. It gives the same bits everywhere."""
 
 
 class _Log(jsbsim.FGLogger):
-    """Keeps JSBSim's output off the console. `last` has the last two errors: the second often says only where."""
+    """Keeps JSBSim's output off the console. `last` has the last two errors: the second often says
+    only where.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,7 +125,8 @@ class _Log(jsbsim.FGLogger):
 
 @cache
 def trim_solution(condition: FlightCondition) -> TrimSolution:
-    """Find the trim and make a short test flight in an isolated process, where JSBSim may crash or hang.
+    """Find the trim and make a short test flight in an isolated process, where JSBSim may crash or
+    hang.
 
     Raises FlightEnded.
     """
@@ -122,16 +139,24 @@ def trim_solution(condition: FlightCondition) -> TrimSolution:
 
 
 def solve_and_probe(
-    name: str, speed: float, altitude: float, step_ns: int, named: tuple[tuple[str, NamedProperties], ...] = ()
+    name: str,
+    speed: float,
+    altitude: float,
+    step_ns: int,
+    named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> TrimSolution:
-    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE. Raises FlightEnded."""
+    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE. Raises
+    FlightEnded.
+    """
     condition = FlightCondition(name, speed, altitude, step_ns, named)
     solution = _solve_trim(condition)
     fdm, _ = trimmed_fdm(condition, solution)
     try:
         for command in condition.commands().values():
             for path, at_one in command_paths(command, engine_count(fdm)):
-                size = PROBE_SIZE if fdm[path] / at_one < command.upper - PROBE_SIZE else -PROBE_SIZE
+                size = (
+                    PROBE_SIZE if fdm[path] / at_one < command.upper - PROBE_SIZE else -PROBE_SIZE
+                )
                 fdm[path] += at_one * size
             for _ in range(nanoseconds(PROBE_TIME) // step_ns // len(INPUTS)):
                 fdm.run()
@@ -140,8 +165,12 @@ def solve_and_probe(
     return solution
 
 
-def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsbsim.FGFDMExec, Trim]:
-    """The aircraft in the trim of a solution. Raises FlightEnded where the aircraft cannot be loaded."""
+def trimmed_fdm(
+    condition: FlightCondition, solution: TrimSolution
+) -> tuple[jsbsim.FGFDMExec, Trim]:
+    """The aircraft in the trim of a solution. Raises FlightEnded where the aircraft cannot be
+    loaded.
+    """
     fdm = _load(condition)
     if solution is None:
         _jsbsim_trim(fdm, condition)
@@ -151,17 +180,22 @@ def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsb
         _set_unknowns(fdm, condition, np.array(unknowns), by_elevator)
         settle(fdm, spin_up)
     states = np.array([fdm[quantity.property] * quantity.si for quantity in STATES.values()])
-    return fdm, Trim(*commands_and_limits(fdm, condition.commands().values()), states, residuals(fdm))
+    return fdm, Trim(
+        *commands_and_limits(fdm, condition.commands().values()), states, residuals(fdm)
+    )
 
 
 def sideslip_zero(condition: FlightCondition) -> float:
-    """Rate of decay (negative) or growth of sideslip while p and r are held in trim, 1/s: a zero of the aircraft.
+    """Rate of decay (negative) or growth of sideslip while p and r are held in trim, 1/s: a zero of
+    the aircraft.
 
-        beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->  beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
+        beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->
+            beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
 
-    Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central differences in frozen
-    flight give the derivatives. Gravity is left out: the coupling of bank to sideslip is much slower. Where the rate is
-    positive, Assumption 3 does not hold. Raises FlightEnded.
+    Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central
+    differences in frozen flight give the derivatives. Gravity is left out: the coupling of bank to
+    sideslip is much slower. Where the rate is positive, Assumption 3 does not hold. Raises
+    FlightEnded.
     """
     solution = trim_solution(condition)
 
@@ -191,7 +225,9 @@ def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
 
 
 def running_property(engine: int) -> str:
-    """The property with the value 1 while an engine runs. An electric engine of JSBSim never has this value."""
+    """The property with the value 1 while an engine runs. An electric engine of JSBSim never has
+    this value.
+    """
     return f"propulsion/engine[{engine}]/set-running"
 
 
@@ -201,28 +237,37 @@ def thrust_property(engine: int) -> str:
 
 
 def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
-    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons, or switch both on again.
+    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons, or switch
+    both on again.
 
-    An electric engine and a rocket have no such switch: they stop at throttle 0, where a turbine idles and gives thrust.
+    An electric engine and a rocket have no such switch: they stop at throttle 0, where a turbine
+    idles and gives thrust.
     """
     fdm["propulsion/cutoff_cmd"] = float(cut)
     fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """JSBSim's message on a line. Most often a property of a flight simulator around JSBSim is missing."""
+    """JSBSim's message on a line. Most often a property of a flight simulator around JSBSim is
+    missing.
+    """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
-    return text if missing is None else f"its model needs the property {missing[1]}, which JSBSim alone does not have"
+    return (
+        text
+        if missing is None
+        else f"its model needs the property {missing[1]}, which JSBSim alone does not have"
+    )
 
 
 def _solve_trim(condition: FlightCondition) -> TrimSolution:
     """The trim: level, straight, sideslip 0, with the necessary bank angle.
 
-    JSBSim's own trim comes first and assumes settled engines and flight control systems, so these get time in frozen flight:
-    everything runs but position, velocity and attitude. Where JSBSim's trim fails, or does not last, a solver finds the six
-    unknowns (alpha, throttle, pitch trim, aileron, rudder, bank) in frozen flight, where everything has settled.
-    Raises FlightEnded with one sentence where there is no trim.
+    JSBSim's own trim comes first and assumes settled engines and flight control systems, so these
+    get time in frozen flight: everything runs but position, velocity and attitude. Where JSBSim's
+    trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch trim,
+    aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded with
+    one sentence where there is no trim.
     """
     fdm = _load(condition)
     try:
@@ -235,7 +280,11 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
         for settling, spin_up, by_elevator in ATTEMPTS:
             if spin_up == SLOW_SPIN_UP and residual > NEAR:
                 continue
-            solution = (*_solve_accelerations(fdm, condition, settling, by_elevator), spin_up, by_elevator)
+            solution = (
+                *_solve_accelerations(fdm, condition, settling, by_elevator),
+                spin_up,
+                by_elevator,
+            )
             attempt, _ = trimmed_fdm(condition, solution)
             if _is_trimmed(attempt, condition):
                 return solution
@@ -243,10 +292,15 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
             if residual < nearest or not problem:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
-            fdm = _load(condition)  # a solver far from a trim may have left it with numbers that are not finite
+            fdm = _load(
+                condition
+            )  # a solver far from a trim may have left it with numbers that are not finite
     except jsbsim.BaseError as error:
         problem = error_text(error)
-    raise FlightEnded(f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} m: {problem}")
+    raise FlightEnded(
+        f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} "
+        f"m: {problem}"
+    )
 
 
 def _require_effect(condition: FlightCondition) -> None:
@@ -272,7 +326,10 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     manager = fdm.get_property_manager()
     engines = engine_count(fdm)
     if not engines:
-        raise FlightEnded(f"{condition.title} has no engine to control V with: no {INPUTS['throttle'].property}[0]")
+        raise FlightEnded(
+            f"{condition.title} has no engine to control V with: no "
+            f"{INPUTS['throttle'].property}[0]"
+        )
     for path in _properties(condition, engines):  # JSBSim creates a property that it does not have
         if not manager.hasNode(path):
             raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
@@ -296,12 +353,17 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
     jsbsim.set_logger(log)  # of this thread
     fdm = jsbsim.FGFDMExec(str(root() if foreign is None else folder))
     fdm.set_debug_level(0)
-    fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
+    fdm.set_output_path(
+        os.devnull
+    )  # some models write tables into the working folder while they load
     if foreign is not None:
         files = model_files(foreign)
         fdm.set_aircraft_path(str(files.write(folder).parent))
         if files.left_out:
-            note(f"{foreign.name}: left out {', '.join(files.left_out)}: a foreign model opens no socket and writes no file")
+            note(
+                f"{foreign.name}: left out {', '.join(files.left_out)}: a foreign model opens "
+                "no socket and writes no file"
+            )
     if not fdm.load_model(name if foreign is None else foreign.stem, foreign is None):
         raise ParameterError("; ".join(log.last) or "JSBSim gives no reason")
     return fdm
@@ -310,13 +372,28 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
 def _properties(condition: FlightCondition, engines: int) -> list[str]:
     """Every property for reading or writing in flight."""
     inputs = condition.commands().values()
-    commands = [path for path, _ in chain.from_iterable(command_paths(command, engines) for command in inputs)]
+    commands = [
+        path
+        for path, _ in chain.from_iterable(command_paths(command, engines) for command in inputs)
+    ]
     trims = [command.trim_property for command in inputs if command.trim_property is not None]
     states = [quantity.property for quantity in STATES.values()]
     residuals = [f"accelerations/{name}" for name in RESIDUALS]
     running = map(running_property, range(engines))
     thrusts = map(thrust_property, range(engines))
-    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *thrusts, *FROZEN]
+    return [
+        *commands,
+        *trims,
+        *states,
+        *WIND,
+        HEADING,
+        HEIGHT,
+        CONTACT,
+        *residuals,
+        *running,
+        *thrusts,
+        *FROZEN,
+    ]
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
@@ -334,7 +411,9 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 def _solve_accelerations(
     fdm: jsbsim.FGFDMExec, condition: FlightCondition, settling: float, by_elevator: float
 ) -> tuple[float, ...]:
-    """The solver's root of the accelerations after `settling` s of frozen flight: unknowns x = START + (scaled - 1) SCALE."""
+    """The solver's root of the accelerations after `settling` s of frozen flight: unknowns x =
+    START + (scaled - 1) SCALE.
+    """
     from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 
     def accelerations(scaled: FloatArray) -> FloatArray:
@@ -343,17 +422,25 @@ def _solve_accelerations(
         return residuals(fdm)
 
     _start_engines(fdm, condition)
-    if by_elevator:  # inside the stops, also where an input has no effect: a flying wing has no rudder
+    if (
+        by_elevator
+    ):  # inside the stops, also where an input has no effect: a flying wing has no rudder
 
         def weighted(scaled: FloatArray) -> FloatArray:
-            return np.asarray(np.nan_to_num(accelerations(scaled) / TOLERANCE, nan=FAR, posinf=FAR, neginf=-FAR))
+            return np.asarray(
+                np.nan_to_num(accelerations(scaled) / TOLERANCE, nan=FAR, posinf=FAR, neginf=-FAR)
+            )
 
         low, high = (1.0 + (np.array(end) - START) / SCALE for end in (LOWEST, HIGHEST))
         steps = np.full(len(START), 1e-3)
-        fit = least_squares(weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40)
+        fit = least_squares(
+            weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40
+        )
         return tuple(fit.x.tolist())
     # Differences over a thousandth of the scales: engines settle more accurately than that.
-    scaled, *_ = fsolve(accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True)
+    scaled, *_ = fsolve(
+        accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True
+    )
     return tuple(scaled.tolist())
 
 
@@ -363,7 +450,9 @@ def _start_engines(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> None:
     settle(fdm, SPIN_UP)
 
 
-def _set_unknowns(fdm: jsbsim.FGFDMExec, condition: FlightCondition, scaled: FloatArray, by_elevator: float = 0.0) -> None:
+def _set_unknowns(
+    fdm: jsbsim.FGFDMExec, condition: FlightCondition, scaled: FloatArray, by_elevator: float = 0.0
+) -> None:
     alpha, throttle, pitch_trim, aileron, rudder, bank = (START + (scaled - 1.0) * SCALE).tolist()
     fdm["ic/alpha-rad"] = alpha
     fdm["ic/gamma-deg"] = 0.0
@@ -394,11 +483,19 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
     paths = command_paths(condition.commands()["throttle"], len(engines))
     idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
     idle += idle[-1:] * (len(engines) - len(idle))  # a property of several engines
-    stopped = [str(i + 1) for i in engines if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0]
+    stopped = [
+        str(i + 1)
+        for i in engines
+        if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0
+    ]
     if stopped:
         return f"engine {', '.join(stopped)} cannot be started"
     linear, angular = np.abs(residuals(fdm)).reshape(2, 3).max(axis=1)
     _, lower, upper = commands_and_limits(fdm, condition.commands().values())
-    stopped_inputs = [name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high]
+    stopped_inputs = [
+        name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high
+    ]
     at_stops = f", with {' and '.join(stopped_inputs)} beyond the stops" if stopped_inputs else ""
-    return f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
+    return (
+        f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
+    )

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node of the simulated aircraft: it subscribes u and publishes y, pose and truth, in real time or in lockstep.
+"""The node of the simulated aircraft: it subscribes u and publishes y, pose and truth, in real time
+or in lockstep.
 
-A watchdog measures the age of u. A u that times out gets the failsafe: hold the last value, then ramp it to trim.
+A watchdog measures the age of u. A u that times out gets the failsafe: hold the last value, then
+ramp it to trim.
 """
 
 from collections.abc import Sequence
@@ -26,14 +28,17 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
-"""Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a recorder that overruns."""
+"""Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a
+recorder that overruns."""
 
 
 class AircraftNode(FlightNode[AircraftConfig]):
-    """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
+    """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then
+    takes the newest u.
 
-    In lockstep it sets the time: it publishes y, truth and pose at its instants. At the controller's instants it waits for u,
-    then publishes clock with the next of them. Each instant has exactly one y, without channels where no sample arrives.
+    In lockstep it sets the time: it publishes y, truth and pose at its instants. At the
+    controller's instants it waits for u, then publishes clock with the next of them. Each instant
+    has exactly one y, without channels where no sample arrives.
     """
 
     def __init__(self) -> None:
@@ -44,9 +49,13 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = PublisherLock(self._timeouts_ns)
         self._timeout_logged = False
-        self._ages_of_u: list[int] = []  # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
+        self._ages_of_u: list[
+            int
+        ] = []  # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
         decode = Decoder(self._simulator.inputs).decode
-        self._u_receiver = self.receive(U, decode, self._accept_u, max_age_ns=self._max_u_age_ns, lock=self._publisher_lock)
+        self._u_receiver = self.receive(
+            U, decode, self._accept_u, max_age_ns=self._max_u_age_ns, lock=self._publisher_lock
+        )
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
         self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(channels.POSE)
         self._y_encoder = self.encoder(self._simulator.outputs)
@@ -81,7 +90,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def _fly_to(self, number: int, start_ns: int, u: FloatArray) -> list[bytes]:
         """Fly to a sample; the messages of y that arrive."""
-        return [self._y_encoder.encode(start_ns + y.stamp_ns, y.value) for y in self._simulator.sample(number, u)]
+        return [
+            self._y_encoder.encode(start_ns + y.stamp_ns, y.value)
+            for y in self._simulator.sample(number, u)
+        ]
 
     def _publish_motion(self, number: int, start_ns: int) -> None:
         stamp_ns = start_ns + number * self.period_ns()
@@ -90,7 +102,9 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
         awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
         if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
-            self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))  # no pose of this instant comes later
+            self._publish_pose(
+                self._empty_encoder.encode(stamp_ns, NO_CHANNELS)
+            )  # no pose of this instant comes later
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
     def advance(self) -> bool:
@@ -102,12 +116,18 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return False
         if self._ahead_of_log():
             return False
-        waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns  # the next instant that needs a u
+        waits_ns = (
+            -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
+        )  # the next instant that needs a u
         until_ns = min(waits_ns, self._end_ns or waits_ns)
-        self._publish_clock(instant(until_ns))  # first: the reference model computes y_m while the aircraft integrates
+        self._publish_clock(
+            instant(until_ns)
+        )  # first: the reference model computes y_m while the aircraft integrates
         messages: list[bytes] = []
         while (t_ns := self._number * self.period_ns()) <= until_ns:
-            messages += self._fly_to(self._number, 0, self._u) or [self._empty_encoder.encode(t_ns, NO_CHANNELS)]
+            messages += self._fly_to(self._number, 0, self._u) or [
+                self._empty_encoder.encode(t_ns, NO_CHANNELS)
+            ]
             self._publish_motion(self._number, 0)
             self._number += 1
         for message in messages:  # together: each y by itself would wake up the controller
@@ -120,7 +140,9 @@ class AircraftNode(FlightNode[AircraftConfig]):
         if not self._completed:
             self._completed = True
             self.publish_state(NodeState.COMPLETED)
-            self.get_logger().info(f"flight completed at t = {seconds((self._number - 1) * self.period_ns()):g} s")
+            self.get_logger().info(
+                f"flight completed at t = {seconds((self._number - 1) * self.period_ns()):g} s"
+            )
 
     def _finished(self) -> bool:
         return self._end_ns is not None and self._number * self.period_ns() > self._end_ns
@@ -138,11 +160,14 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _take_u(self, now_ns: int) -> bool:
         """Take the received u. Returns whether there was a valid message.
 
-        A message without channels is valid: the controller has no output at this instant of a lockstep flight.
+        A message without channels is valid: the controller has no output at this instant of a
+        lockstep flight.
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
+        valid = self._u_receiver.poll(
+            now_ns, 1 if self.parameters.lockstep else None
+        )  # in lockstep there is one u for each y
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
             if publisher is None and not self.parameters.lockstep:
@@ -175,14 +200,19 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def _timeouts_ns(self) -> tuple[int, int]:
         """Timeouts of the publisher of u. Another node may take over once u has reached trim."""
-        return self._max_age_ns, self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
+        return self._max_age_ns, self._max_age_ns + nanoseconds(
+            self.parameters.hold + self.parameters.ramp
+        )
 
     def _timed_out(self, now_ns: int) -> bool:
         return self._publisher_lock.timed_out(now_ns, self._max_age_ns)
 
     @property
     def _failsafe_message(self) -> str:
-        return f"failsafe: u from {self._publisher_lock.publisher} timed out: the last value is held, then ramped to trim"
+        return (
+            f"failsafe: u from {self._publisher_lock.publisher} timed out: the last value is "
+            "held, then ramped to trim"
+        )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         if self._publisher_lock.publisher is None:
@@ -196,4 +226,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
             mean = seconds(round(sum(ages) / len(ages)))
             largest = seconds(max(ages))
             figures = {"age of u mean (s)": f"{mean:.4f}", "age of u max (s)": f"{largest:.4f}"}
-        return DiagnosticStatus.OK, bounded(f"receiving u from {self._publisher_lock.publisher}"), figures
+        return (
+            DiagnosticStatus.OK,
+            bounded(f"receiving u from {self._publisher_lock.publisher}"),
+            figures,
+        )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the equations."""
+"""Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the
+equations.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -75,28 +77,46 @@ class AircraftChannels(NamedTuple):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(description="a name of the library, the path of a file, jsbsim:NAME or jsbsim:PATH")
-    speed: Positive | None = Field(default=None, description="of JSBSim: true airspeed of the trim, m/s")
-    altitude: NonNegative | None = Field(default=None, description="of JSBSim: altitude of the trim above sea level, m")
+    airframe: str = Field(
+        description="a name of the library, the path of a file, jsbsim:NAME or jsbsim:PATH"
+    )
+    speed: Positive | None = Field(
+        default=None, description="of JSBSim: true airspeed of the trim, m/s"
+    )
+    altitude: NonNegative | None = Field(
+        default=None, description="of JSBSim: altitude of the trim above sea level, m"
+    )
     commands: dict[str, str] = Field(
-        default={}, description="of JSBSim: by input, the model's own properties, each with its value at the command 1"
+        default={},
+        description="of JSBSim: by input, the model's own properties, each with its value at "
+        "the command 1",
     )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
         description="the integration step, s; a whole fraction of 1 / rate"
     )
     start_time: float = Field(
-        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
+        default=0.0,
+        ge=-1,
+        le=1e10,
+        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
     )
     start: StartConfig = Field(default=StartConfig(), description="where the aircraft is at t = 0")
-    gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
-    turbulence: TurbulenceConfig | None = Field(default=None, description="turbulence along all axes of the airframe's gusts")
+    gusts: dict[str, Gust] = Field(
+        default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical"
+    )
+    turbulence: TurbulenceConfig | None = Field(
+        default=None, description="turbulence along all axes of the airframe's gusts"
+    )
     bias: dict[str, BiasConfig] = Field(default={}, description="biases on x_dot by state")
     sines: dict[str, SineConfig] = Field(default={}, description="sines on x_dot by state")
-    inertial_coupling: float = Field(default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling")
+    inertial_coupling: float = Field(
+        default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling"
+    )
     kinematics: Literal["linear", "euler"] = Field(
         default="linear",
-        description="the attitude by A, or by Euler's equations with the loss of lift in a bank, for guidance",
+        description="the attitude by A, or by Euler's equations with the loss of lift in a "
+        "bank, for guidance",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
@@ -104,47 +124,84 @@ class AircraftConfig(NodeConfig):
     uncertainty: UncertaintyConfig = Field(
         default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
     )
-    drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
+    drift: DriftConfig | None = Field(
+        default=None, description="how A and B change in flight, as by ice"
+    )
     over_airspeed: str | None = Field(
         default=None,
-        description="the input that is a thrust: A, B and the trim follow the airspeed; none: of the trim speed",
+        description="the input that is a thrust: A, B and the trim follow the airspeed; none: "
+        "of the trim speed",
     )
-    actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators; ideal where left out")
-    sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
-    vanes: VaneSensorsConfig = Field(default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out")
-    pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
+    actuators: ActuatorConfig = Field(
+        default=ActuatorConfig(), description="the actuators; ideal where left out"
+    )
+    sensors: SensorConfig = Field(
+        default=SensorConfig(), description="the sensors, ideal where left out"
+    )
+    vanes: VaneSensorsConfig = Field(
+        default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out"
+    )
+    pose: PoseConfig = Field(
+        default=PoseConfig(), description="how pose is measured, ideal where left out"
+    )
 
-    control_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, Hz")
-    duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: flight time to stop at, s; 0: never")
+    control_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, Hz"
+    )
+    duration: float = Field(
+        default=0.0, ge=0, le=1e6, description="in lockstep: flight time to stop at, s; 0: never"
+    )
     recorded: bool = Field(default=False, description="in lockstep: wait for the recorder")
 
     max_age: float = Field(default=0.2, gt=0, le=1e6, description="age at which u times out, s")
     hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long u is held, s")
-    ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim takes, s")
+    ramp: float = Field(
+        default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim takes, s"
+    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a drift."""
+        """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a
+        drift.
+        """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         effectors = {f"actuators.{key}" for key in (*EFFECTOR_FAULTS, *SEVERITIES)}
-        sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {"vanes.frozen_at", "vanes.dropout"}
+        sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
+            "vanes.frozen_at",
+            "vanes.dropout",
+        }
         return frozenset(gusts | effectors | sensors | {"drift.start"})
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
         divide(period, self.step_ns, "step", "1 / rate")
         if self.lockstep:
-            require(self.control_rate > 0, "control_rate", "0 Hz", "the controller's rate in lockstep")
+            require(
+                self.control_rate > 0, "control_rate", "0 Hz", "the controller's rate in lockstep"
+            )
             divides = period_ns(self.control_rate, "control_rate") % period == 0
-            require(divides, "control_rate", f"{self.control_rate:g} Hz", f"a whole fraction of rate ({self.rate:g} Hz)")
+            require(
+                divides,
+                "control_rate",
+                f"{self.control_rate:g} Hz",
+                f"a whole fraction of rate ({self.rate:g} Hz)",
+            )
         if self.is_jsbsim:
             self._check_jsbsim()
         else:
             self._check_airframe()
         channels = self.channels()
         for axis, gust in self.gusts.items():
-            least = f"at least {2.0 * gust.length / channels.speed:.6g} s, which the gust takes at {channels.speed:g} m/s"
-            require(gust.every * channels.speed >= 2.0 * gust.length, f"gusts.{axis}.every", f"{gust.every:g} s", least)
+            least = (
+                f"at least {2.0 * gust.length / channels.speed:.6g} s, which the gust takes "
+                f"at {channels.speed:g} m/s"
+            )
+            require(
+                gust.every * channels.speed >= 2.0 * gust.length,
+                f"gusts.{axis}.every",
+                f"{gust.every:g} s",
+                least,
+            )
         for key, values in self.actuators.model_dump(exclude={"delay"}).items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
@@ -166,29 +223,73 @@ class AircraftConfig(NodeConfig):
     def _check_airframe(self) -> None:
         for key in ("speed", "altitude"):
             value = getattr(self, key)
-            require(value is None, key, value, f"none: the airframe {self.airframe} has a fixed trim")
-        require(not self.commands, "commands", "a value", f"none: {self.airframe} is no aircraft of JSBSim")
+            require(
+                value is None, key, value, f"none: the airframe {self.airframe} has a fixed trim"
+            )
+        require(
+            not self.commands,
+            "commands",
+            "a value",
+            f"none: {self.airframe} is no aircraft of JSBSim",
+        )
         airframe = load_airframe(self.airframe)
         for name in self.gusts:
             airframe.gust_direction(name)
         for key, named in (("bias", self.bias), ("sines", self.sines)):
             for name in named:
                 states = ", ".join(airframe.states)
-                require(name in airframe.states, f"{key}.{name}", f"{name!r}", f"a state of {airframe.name}: {states}")
+                require(
+                    name in airframe.states,
+                    f"{key}.{name}",
+                    f"{name!r}",
+                    f"a state of {airframe.name}: {states}",
+                )
         has_none = f"the airframe {airframe.name} has no"
         possible = bool(airframe.inertial_coupling) or self.inertial_coupling == 0.0
-        require(possible, "inertial_coupling", f"{self.inertial_coupling:g}", f"0: {has_none} inertial_coupling")
+        require(
+            possible,
+            "inertial_coupling",
+            f"{self.inertial_coupling:g}",
+            f"0: {has_none} inertial_coupling",
+        )
         missing = [name for name in ("alpha", *EULER_STATES) if name not in airframe.states]
         known = self.kinematics == "linear" or not missing
-        require(known, "kinematics", f"{self.kinematics!r}", f"linear: {has_none} state {', '.join(missing)}")
-        require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
+        require(
+            known,
+            "kinematics",
+            f"{self.kinematics!r}",
+            f"linear: {has_none} state {', '.join(missing)}",
+        )
+        require(
+            bool(airframe.gusts) or self.turbulence is None,
+            "turbulence",
+            "a section",
+            f"none: {has_none} gusts",
+        )
         if self.over_airspeed is not None:
             over_airspeed(airframe, self.over_airspeed)
-            require(self.kinematics == "linear", "over_airspeed", "kinematics euler beside it", "linear kinematics")
-            require(self.drift is None, "over_airspeed", "a drift beside it", "none: a drift is that of the trim speed")
+            require(
+                self.kinematics == "linear",
+                "over_airspeed",
+                "kinematics euler beside it",
+                "linear kinematics",
+            )
+            require(
+                self.drift is None,
+                "over_airspeed",
+                "a drift beside it",
+                "none: a drift is that of the trim speed",
+            )
         for name in self.vanes.channels:
-            require(name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}")
-            require(name not in airframe.outputs, "vanes.channels", name, f"none: {name} is an output of {airframe.name}")
+            require(
+                name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}"
+            )
+            require(
+                name not in airframe.outputs,
+                "vanes.channels",
+                name,
+                f"none: {name} is an output of {airframe.name}",
+            )
             require(airframe.speed > 0.0, "vanes.channels", name, f"none: {has_none} speed")
 
     def _check_losses(self) -> None:
@@ -196,19 +297,36 @@ class AircraftConfig(NodeConfig):
         airframe = load_airframe(self.airframe)
         for key in ("lost_at", "weak_at"):
             begins = getattr(self.actuators, key) or (math.inf,) * len(airframe.inputs)
-            for name, begin, position in zip(airframe.inputs, begins, airframe.no_thrust(), strict=True):
+            for name, begin, position in zip(
+                airframe.inputs, begins, airframe.no_thrust(), strict=True
+            ):
                 required = f".inf, or no_thrust of {name} in the airframe {airframe.name}"
-                meaning = f"its value without thrust, from trim, in {airframe.inputs[name].unit}; 0 for a surface"
+                meaning = (
+                    "its value without thrust, from trim, in "
+                    f"{airframe.inputs[name].unit}; 0 for a surface"
+                )
                 known = math.isinf(begin) or math.isfinite(position)
-                require(known, f"actuators.{key}", f"{begin:g} s for {name}", f"{required}: {meaning}")
+                require(
+                    known, f"actuators.{key}", f"{begin:g} s for {name}", f"{required}: {meaning}"
+                )
 
     def _check_jsbsim(self) -> None:
         require_aircraft(self.airframe)
-        for key, unit in (("speed", "true airspeed to trim at, m/s"), ("altitude", "altitude to trim at, m")):
+        for key, unit in (
+            ("speed", "true airspeed to trim at, m/s"),
+            ("altitude", "altitude to trim at, m"),
+        ):
             require(getattr(self, key) is not None, key, "none", f"the {unit}")
         for name in self.gusts:
-            require(name in AXES, f"gusts.{name}", f"{name!r}", f"an axis of the wind: {', '.join(AXES)}")
-        uncertain = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0 or bool(self.uncertainty.entries)
+            require(
+                name in AXES,
+                f"gusts.{name}",
+                f"{name!r}",
+                f"an axis of the wind: {', '.join(AXES)}",
+            )
+        uncertain = (
+            self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0 or bool(self.uncertainty.entries)
+        )
         for key, value in (
             ("bias", self.bias),
             ("sines", self.sines),
@@ -235,17 +353,32 @@ class AircraftConfig(NodeConfig):
         vanes: dict[str, Unit] = dict.fromkeys(self.vanes.channels, "rad")
         if self.is_jsbsim:
             positive = {name: command.positive for name, command in INPUTS.items()}
-            return AircraftChannels({**OUTPUTS, **vanes}, dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
+            return AircraftChannels(
+                {**OUTPUTS, **vanes},
+                dict.fromkeys(INPUTS, "1"),
+                positive,
+                self.flight_condition().speed,
+            )
         airframe = load_airframe(self.airframe)
         inputs = {name: channel.unit for name, channel in airframe.inputs.items()}
         positive = {name: channel.positive for name, channel in airframe.inputs.items()}
-        return AircraftChannels(airframe.units_of_outputs() | vanes, inputs, positive, airframe.speed)
+        return AircraftChannels(
+            airframe.units_of_outputs() | vanes, inputs, positive, airframe.speed
+        )
 
     def sampled_airframe(self) -> Airframe:
-        """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named airframe."""
+        """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named
+        airframe.
+        """
         chosen = self.uncertainty
         return uncertainty.sample_airframe(
-            load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind, chosen.spread()
+            load_airframe(self.airframe),
+            chosen.A,
+            chosen.B,
+            chosen.seed,
+            chosen.number,
+            chosen.wind,
+            chosen.spread(),
         )
 
     def drifted_airframe(self) -> Airframe:
@@ -254,13 +387,18 @@ class AircraftConfig(NodeConfig):
         chosen = self.drift
         if chosen is None:
             return airframe
-        return uncertainty.sample_airframe(airframe, chosen.A, chosen.B, chosen.seed, chosen.number, self.uncertainty.wind)
+        return uncertainty.sample_airframe(
+            airframe, chosen.A, chosen.B, chosen.seed, chosen.number, self.uncertainty.wind
+        )
 
     def drift_factors(self) -> Drift | None:
         """The drift as factors of the matrices of equation (1)."""
         if self.drift is None:
             return None
-        matrices = ((a.matrix_a(), a.matrix_b(), a.matrix_gusts()) for a in (self.sampled_airframe(), self.drifted_airframe()))
+        matrices = (
+            (a.matrix_a(), a.matrix_b(), a.matrix_gusts())
+            for a in (self.sampled_airframe(), self.drifted_airframe())
+        )
         factors = [
             np.divide(after, before, out=np.ones_like(before), where=before != 0.0)
             for before, after in zip(*matrices, strict=True)
@@ -268,7 +406,9 @@ class AircraftConfig(NodeConfig):
         return Drift(self.drift.start, self.drift.duration, *factors)
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe in flight and the arrays of equation (1) with the disturbances, for the axes of the airframe's gusts."""
+        """The airframe in flight and the arrays of equation (1) with the disturbances, for the axes
+        of the airframe's gusts.
+        """
         airframe = self.sampled_airframe()
         gain, first, second = airframe.products()
         biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
@@ -281,7 +421,9 @@ class AircraftConfig(NodeConfig):
             airframe.matrix_gusts(),
             self.gust_arrays(list(airframe.gusts)),
             np.array(airframe.speed),
-            Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,
+            Coupling(self.inertial_coupling * gain, first, second)
+            if self.inertial_coupling > 0.0
+            else None,
             Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
             Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
             _euler_kinematics(airframe) if self.kinematics == "euler" else None,
@@ -292,7 +434,9 @@ class AircraftConfig(NodeConfig):
         airframe, aircraft = self.load()
         turbulence = self._turbulence(airframe.speed, list(airframe.gusts))
         over = None if self.over_airspeed is None else over_airspeed(airframe, self.over_airspeed)
-        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors(), over)
+        return PlantParams(
+            aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors(), over
+        )
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
@@ -306,18 +450,29 @@ class AircraftConfig(NodeConfig):
                 arrays[severity] = np.full(len(times), SEVERITIES[severity])
         fails = arrays["lost_at"] is not None or arrays["weak_at"] is not None
         known = fails and not self.is_jsbsim  # the model of JSBSim has its own trim
-        return Actuators(**arrays, no_thrust=load_airframe(self.airframe).no_thrust() if known else None)
+        return Actuators(
+            **arrays, no_thrust=load_airframe(self.airframe).no_thrust() if known else None
+        )
 
     def flight_condition(self) -> FlightCondition:
-        """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""
+        """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear
+        aircraft.
+        """
         if self.speed is None or self.altitude is None:
-            raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
+            raise ParameterError(
+                f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an "
+                "altitude"
+            )
         named = named_properties(self.commands, "commands")
-        return FlightCondition(require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns, named)
+        return FlightCondition(
+            require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns, named
+        )
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on every axis."""
-        return WindModel(self.gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES))
+        return WindModel(
+            self.gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES)
+        )
 
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
         """The gusts as arrays, along these axes."""
@@ -332,15 +487,21 @@ class AircraftConfig(NodeConfig):
         section = self.turbulence
         if section is None or not (section.wind or section.sigma):  # off, or of intensity 0
             return None
-        spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)  # None where it has no effect
-        return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], section.seed)
+        spectrum = dryden(
+            section.altitude, section.wind or 0.0, section.sigma or 0.0
+        )  # None where it has no effect
+        return filters(
+            spectrum, speed, self.step, [AXES.index(axis) for axis in axes], section.seed
+        )
 
     def sensor_arrays(self) -> Sensors:
         """The sensors as arrays."""
         sensors = self.sensors
         drift = _array(sensors.drift, zero_is_none=True)
         return Sensors(
-            noise=np.array(sensors.noise) if sensors.noise else np.zeros(len(self.channels().outputs)),
+            noise=np.array(sensors.noise)
+            if sensors.noise
+            else np.zeros(len(self.channels().outputs)),
             delay_ns=nanoseconds(sensors.delay),
             dropout=sensors.dropout,
             seed=sensors.seed,
@@ -355,19 +516,33 @@ class AircraftConfig(NodeConfig):
         if not section.channels:
             return None
         frozen_at = np.array(section.frozen_at or (np.inf,) * len(section.channels))
-        return Vanes([ANGLES.index(name) for name in section.channels], frozen_at, section.dropout, self.sensors.seed)
+        return Vanes(
+            [ANGLES.index(name) for name in section.channels],
+            frozen_at,
+            section.dropout,
+            self.sensors.seed,
+        )
 
     def pose_every(self) -> int:
         """Number of the aircraft's instants from pose to pose."""
         rate = self.pose.rate
         return (
-            every(self.rate) if rate is None else divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
+            every(self.rate)
+            if rate is None
+            else divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
         )
 
     def pose_sensors(self) -> Sensors | None:
-        """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose. Independent of those of y."""
+        """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose.
+        Independent of those of y.
+        """
         pose = self.pose
-        if not (pose.delay or any(pose.bias.values()) or any(pose.drift.values()) or any(pose.noise.values())):
+        if not (
+            pose.delay
+            or any(pose.bias.values())
+            or any(pose.drift.values())
+            or any(pose.noise.values())
+        ):
             return None
         bias = np.array([pose.bias.get(name, 0.0) for name in POSE])
         drift = np.array([pose.drift.get(name, 0.0) for name in POSE])
@@ -381,7 +556,12 @@ EULER_STATES = ("phi", "theta", "p", "q", "r")
 
 
 def _euler_kinematics(airframe: Airframe) -> EulerKinematics:
-    require(airframe.speed > 0.0, "kinematics", "euler without a trim speed", "linear, or an airframe with `speed`")
+    require(
+        airframe.speed > 0.0,
+        "kinematics",
+        "euler without a trim speed",
+        "linear, or an airframe with `speed`",
+    )
     unit = np.eye(len(airframe.states))
     rows = airframe.matrix_a()
     alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
@@ -398,10 +578,16 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
     """The values as an array; None for missing values and, with zero_is_none, for zeros alone."""
-    return None if not values or (zero_is_none and not any(values)) else np.array(values, dtype=np.float64)
+    return (
+        None
+        if not values or (zero_is_none and not any(values))
+        else np.array(values, dtype=np.float64)
+    )
 
 
-def _by_state(named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
+def _by_state(
+    named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe
+) -> list[FloatArray]:
     """An array per key, over the states, with 0 for an unnamed state."""
     sections = [named.get(state) for state in airframe.states]
     arrays = []

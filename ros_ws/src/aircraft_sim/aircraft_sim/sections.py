@@ -31,13 +31,19 @@ class Gust(Config):
 
 
 class TurbulenceConfig(Config):
-    """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high altitude."""
+    """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high
+    altitude.
+    """
 
     altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m")
     wind: NonNegative | None = Field(
-        default=None, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
+        default=None,
+        description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 "
+        "severe",
     )
-    sigma: NonNegative | None = Field(default=None, description="the standard deviation at high altitude, m/s")
+    sigma: NonNegative | None = Field(
+        default=None, description="the standard deviation at high altitude, m/s"
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
     def _check(self) -> None:
@@ -47,11 +53,18 @@ class TurbulenceConfig(Config):
         ):
             value = getattr(self, key)
             actual, expected = ("none", "a value") if value is None else (f"{value:g} m/s", "none")
-            require((value is not None) == acts, key, actual, f"{expected} at {self.altitude:g} m: it acts {where}")
+            require(
+                (value is not None) == acts,
+                key,
+                actual,
+                f"{expected} at {self.altitude:g} m: it acts {where}",
+            )
 
 
 class BiasConfig(Config):
-    """A bias on x_dot of a state: a rise from 0 to the value along half a cosine, or a step with rise 0."""
+    """A bias on x_dot of a state: a rise from 0 to the value along half a cosine, or a step with
+    rise 0.
+    """
 
     start: NonNegative = Field(description="the instant at which it begins, s")
     value: Number = Field(description="the final value, SI unit of the state per s")
@@ -67,24 +80,38 @@ class SineConfig(Config):
 
 
 class UncertaintyConfig(Config):
-    """An aircraft sampled around the airframe: every entry times 1 + d, d independent; rows of angles stay."""
+    """An aircraft sampled around the airframe: every entry times 1 + d, d independent; rows of
+    angles stay.
+    """
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
-    entries: tuple[str, ...] = Field(default=(), description="entries with their own largest d, as A[q,alpha]")
-    parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(default=(), description="the largest d of these entries")
+    entries: tuple[str, ...] = Field(
+        default=(), description="entries with their own largest d, as A[q,alpha]"
+    )
+    parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(
+        default=(), description="the largest d of these entries"
+    )
     distribution: Distribution = Field(
-        default="uniform", description="of d: uniform, normal (limit at three standard deviations), its limits"
+        default="uniform",
+        description="of d: uniform, normal (limit at three standard deviations), its limits",
     )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
         description="effect of wind on x_dot: by the aircraft's own A, or as published",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
+    number: int = Field(
+        default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on"
+    )
 
     def _check(self) -> None:
-        require(len(set(self.entries)) == len(self.entries), "entries", ", ".join(self.entries), "different ones")
+        require(
+            len(set(self.entries)) == len(self.entries),
+            "entries",
+            ", ".join(self.entries),
+            "different ones",
+        )
         require_length("parts", self.parts, self.entries)
 
     def spread(self) -> Spread:
@@ -93,20 +120,29 @@ class UncertaintyConfig(Config):
 
 
 class DriftConfig(Config):
-    """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and independent."""
+    """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and
+    independent.
+    """
 
-    start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(description="when it begins, s")
-    duration: NonNegative = Field(default=60.0, description="how long the entries change, s; 0 is at once")
+    start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(
+        description="when it begins, s"
+    )
+    duration: NonNegative = Field(
+        default=60.0, description="how long the entries change, s; 0 is at once"
+    )
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's change, from 0 on")
+    number: int = Field(
+        default=0, ge=0, lt=2**32, description="the number of the seed's change, from 0 on"
+    )
 
     def _check(self) -> None:
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
 
 
-# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
+# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML):
+# no limit on that channel.
 NonNegativesOrNone = tuple[NonNegative, ...]
 
 
@@ -126,15 +162,21 @@ Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorConfig(Config):
-    """The actuators, a value per input in the airframe's order. A missing list means ideal actuators."""
+    """The actuators, a value per input in the airframe's order. A missing list means ideal
+    actuators.
+    """
 
-    lag: NonNegativesOrNone = Field(default=(), description="time constants of first order, s; 0: none")
+    lag: NonNegativesOrNone = Field(
+        default=(), description="time constants of first order, s; 0: none"
+    )
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
     stuck_at: Times = Field(default=(), description="from when on each keeps its position, s")
-    lost_at: Times = Field(default=(), description="from when on each gives no thrust or floats at trim, s")
+    lost_at: Times = Field(
+        default=(), description="from when on each gives no thrust or floats at trim, s"
+    )
     weak_at: Times = Field(default=(), description="from when on each has `weak_effect`, s")
     weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
         default=(), description="factors of the effect, below 0 reversed; none: 0.5"
@@ -142,42 +184,75 @@ class ActuatorConfig(Config):
     slow_at: Times = Field(default=(), description="from when on each has `slow_lag`, s")
     slow_lag: NonNegativesOrNone = Field(default=(), description="least lags, s; none: 0.2 s")
     loose_at: Times = Field(default=(), description="from when on each has `loose_play`, s")
-    loose_play: NonNegativesOrNone = Field(default=(), description="half-widths of the backlash, SI; none: 0.01")
+    loose_play: NonNegativesOrNone = Field(
+        default=(), description="half-widths of the backlash, SI; none: 0.01"
+    )
     delay: float = Field(
-        default=0.0, ge=0, le=10, description="delay of u before the actuators, s; whole periods of the aircraft"
+        default=0.0,
+        ge=0,
+        le=10,
+        description="delay of u before the actuators, s; whole periods of the aircraft",
     )
 
 
-EFFECTOR_FAULTS = {"stuck_at": None, "lost_at": None, "weak_at": "weak_effect", "slow_at": "slow_lag", "loose_at": "loose_play"}
+EFFECTOR_FAULTS = {
+    "stuck_at": None,
+    "lost_at": None,
+    "weak_at": "weak_effect",
+    "slow_at": "slow_lag",
+    "loose_at": "loose_play",
+}
 """Times at which faults of effectors begin, with the parameter that says how strong."""
 
 
 SEVERITIES = {"weak_effect": 0.5, "slow_lag": 0.2, "loose_play": 0.01}
-"""How strong a fault is where the scenario does not say it: half of the effect, ten times the lag of a servo of the osprey, and
-0.57 deg, or 1 % of thrust."""
+"""How strong a fault is where the scenario does not say it: half of the effect, ten times the lag
+of a servo of the osprey, and 0.57 deg, or 1 % of thrust."""
 
 
 class SensorConfig(Config):
     """The sensors. The defaults are ideal sensors."""
 
     bias: NumbersOrNone = Field(default=(), description="constant errors")
-    drift: NonNegativesOrNone = Field(default=(), description="random walks: standard deviation, SI per sqrt(s)")
-    noise: NonNegativesOrNone = Field(default=(), description="noise: standard deviation per sample")
+    drift: NonNegativesOrNone = Field(
+        default=(), description="random walks: standard deviation, SI per sqrt(s)"
+    )
+    noise: NonNegativesOrNone = Field(
+        default=(), description="noise: standard deviation per sample"
+    )
     quantisation: NonNegativesOrNone = Field(default=(), description="steps of the values; 0: none")
-    delay: float = Field(default=0.0, ge=0, le=10, description="delay from measurement to arrival, s; whole periods of `rate`")
-    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
+    delay: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="delay from measurement to arrival, s; whole periods of `rate`",
+    )
+    dropout: float = Field(
+        default=0.0, ge=0, lt=1, description="the probability that a sample is lost"
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
 class VaneSensorsConfig(Config):
-    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors` too."""
+    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors`
+    too.
+    """
 
-    channels: tuple[Literal["alpha", "beta"], ...] = Field(default=(), description="the angles that have a vane; none if empty")
+    channels: tuple[Literal["alpha", "beta"], ...] = Field(
+        default=(), description="the angles that have a vane; none if empty"
+    )
     frozen_at: Times = Field(default=(), description="from when on each keeps its angle, s")
-    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before")
+    dropout: float = Field(
+        default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before"
+    )
 
     def _check(self) -> None:
-        require(len(set(self.channels)) == len(self.channels), "channels", ", ".join(self.channels), "different ones")
+        require(
+            len(set(self.channels)) == len(self.channels),
+            "channels",
+            ", ".join(self.channels),
+            "different ones",
+        )
         if self.frozen_at:
             parameters.require_length("frozen_at", self.frozen_at, self.channels)
 
@@ -186,13 +261,26 @@ PerPose = dict[str, Number]
 
 
 class PoseConfig(Config):
-    """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to 50 Hz."""
+    """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to
+    50 Hz.
+    """
 
-    rate: Positive | None = Field(default=None, description="the rate, Hz, a whole fraction of the aircraft's; none: 50 Hz")
-    delay: float = Field(default=0.0, ge=0, le=10, description="from measurement to arrival, s; whole periods of the aircraft")
+    rate: Positive | None = Field(
+        default=None, description="the rate, Hz, a whole fraction of the aircraft's; none: 50 Hz"
+    )
+    delay: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="from measurement to arrival, s; whole periods of the aircraft",
+    )
     bias: PerPose = Field(default={}, description="constant errors")
-    drift: dict[str, NonNegative] = Field(default={}, description="random walks: standard deviation, SI per sqrt(s)")
-    noise: dict[str, NonNegative] = Field(default={}, description="noise: standard deviation per sample")
+    drift: dict[str, NonNegative] = Field(
+        default={}, description="random walks: standard deviation, SI per sqrt(s)"
+    )
+    noise: dict[str, NonNegative] = Field(
+        default={}, description="noise: standard deviation per sample"
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
 
 
@@ -201,4 +289,6 @@ class StartConfig(Config):
 
     north: Number = Field(default=0.0, description="to the north of the origin, m")
     east: Number = Field(default=0.0, description="to the east of the origin, m")
-    heading: Number = Field(default=0.0, description="the heading, rad, positive to the right of north")
+    heading: Number = Field(
+        default=0.0, description="the heading, rad, positive to the right of north"
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors between the aircraft and y: bias, drift, noise and quantisation, then loss and delay of samples."""
+"""Sensors between the aircraft and y: bias, drift, noise and quantisation, then loss and delay of
+samples.
+"""
 
 from typing import NamedTuple
 
@@ -11,14 +13,18 @@ from flight_core.vectors import Array, FloatArray, StampedVector, array_namespac
 
 
 class Sensors(NamedTuple):
-    """Parameters of the sensors of m outputs. Ideal sensors have noise 0, delay 0 and dropout 0. None: the error is absent."""
+    """Parameters of the sensors of m outputs. Ideal sensors have noise 0, delay 0 and dropout 0.
+    None: the error is absent.
+    """
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
     delay_ns: int  # transport delay, from the instant of a sample to its arrival
     dropout: float  # probability that a sample is dropped, all channels together
     seed: int
     bias: FloatArray | None = None  # (m,) SI
-    drift: FloatArray | None = None  # (m,) standard deviation of the random walk's step from sample to sample, SI
+    drift: FloatArray | None = (
+        None  # (m,) standard deviation of the random walk's step from sample to sample, SI
+    )
     quantum: FloatArray | None = None  # (m,) steps of the quantisation, SI, 0 = none
 
 
@@ -37,7 +43,9 @@ class Measured(NamedTuple):
     drift: Drift
 
 
-DelayLine = tuple[StampedVector, ...]  # samples that have been measured and have not arrived yet, the oldest first
+DelayLine = tuple[
+    StampedVector, ...
+]  # samples that have been measured and have not arrived yet, the oldest first
 
 
 def initial_drift(params: Sensors) -> Drift:
@@ -50,7 +58,8 @@ def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measur
 
         measured = quantised(y + error(number))
 
-    The error of a quantised sample is the measured value less y. Ideal sensors give y to the last bit.
+    The error of a quantised sample is the measured value less y. Ideal sensors give y to the last
+    bit.
     """  # noqa: D400, D415 - what follows is an equation
     added, drift = error(number, drift, params)
     measured = y + added
@@ -61,7 +70,9 @@ def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measur
 
 
 def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift]:
-    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,), and the walk; y plays no part."""
+    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,), and the
+    walk; y plays no part.
+    """
     drift = walk(number, drift, params)
     added = noise(number, params)
     if params.bias is not None:
@@ -70,21 +81,32 @@ def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift
 
 
 def quantised(measured: Array, quantum: Array) -> Array:
-    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0. Works on any array type."""
+    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0. Works on
+    any array type.
+    """
     xp = array_namespace(measured)
     coarse = quantum > 0.0
-    return xp.where(coarse, quantum * xp.round(measured / xp.where(coarse, quantum, xp.ones_like(quantum))), measured)
+    return xp.where(
+        coarse,
+        quantum * xp.round(measured / xp.where(coarse, quantum, xp.ones_like(quantum))),
+        measured,
+    )
 
 
 def noise(number: int, params: Sensors) -> FloatArray:
-    """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and samples; shape (m,)."""
+    """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and
+    samples; shape (m,).
+    """
     if not any(params.noise.tolist()):  # a seventh of the time of .any() for a few channels
         return params.noise
-    return params.noise * random_streams.generator(number, random_streams.NOISE, params.seed).standard_normal(len(params.noise))
+    return params.noise * random_streams.generator(
+        number, random_streams.NOISE, params.seed
+    ).standard_normal(len(params.noise))
 
 
 def walk(number: int, drift: Drift, params: Sensors) -> Drift:
-    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard normal and independent.
+    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard
+    normal and independent.
 
     Steps of skipped samples are added too, so the walk does not depend on the measured samples.
     """
@@ -98,17 +120,23 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Whether sample `number` >= 0 is not dropped: v >= dropout with v uniform in [0, 1), independent of the noise."""
+    """Whether sample `number` >= 0 is not dropped: v >= dropout with v uniform in [0, 1),
+    independent of the noise.
+    """
     return (
-        params.dropout == 0.0 or random_streams.generator(number, random_streams.LOSS, params.seed).random() >= params.dropout
+        params.dropout == 0.0
+        or random_streams.generator(number, random_streams.LOSS, params.seed).random()
+        >= params.dropout
     )
 
 
-def transmit(delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[DelayLine, DelayLine]:
+def transmit(
+    delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors
+) -> tuple[DelayLine, DelayLine]:
     """Transport delay at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
 
-    y enters the delay line with the stamp now; None: the sample is dropped. Samples as old as the delay arrive, the
-    oldest first. A stamp stays the instant of measurement.
+    y enters the delay line with the stamp now; None: the sample is dropped. Samples as old as the
+    delay arrive, the oldest first. A stamp stays the instant of measurement.
     """
     sent = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)

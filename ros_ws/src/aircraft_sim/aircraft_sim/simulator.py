@@ -52,7 +52,9 @@ class FlightDynamicsModel(Protocol):
         """Values in the order of `truth_names`."""
 
     def pose(self) -> FloatArray:
-        """The pose relative to the air mass, in the order of `channels.POSE`, absolute values, SI."""
+        """The pose relative to the air mass, in the order of `channels.POSE`, absolute values,
+        SI.
+        """
 
     def diverged(self) -> bool:
         """Whether the state is not finite or too large for a flight."""
@@ -64,9 +66,9 @@ class FlightDynamicsModel(Protocol):
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind actuators.
 
-    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading, position and altitude, no
-    states of an airframe, are integrated by the trapezoidal rule over `advance`, from 0. States missing in the airframe are 0,
-    as in trim.
+    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading,
+    position and altitude, no states of an airframe, are integrated by the trapezoidal rule over
+    `advance`, from 0. States missing in the airframe are 0, as in trim.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -88,7 +90,10 @@ class StateSpaceModel:
         # north, east, altitude
         self._psi = 0.0
         self._position = [0.0, 0.0, 0.0]
-        self._psi_dot, self._velocity = self._heading_rate(self._states()), self._air_velocity(self._states())
+        self._psi_dot, self._velocity = (
+            self._heading_rate(self._states()),
+            self._air_velocity(self._states()),
+        )
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """See FlightDynamicsModel."""
@@ -107,14 +112,19 @@ class StateSpaceModel:
         self._psi_dot = self._heading_rate(states)
         self._psi += half * (psi_dot + self._psi_dot)
         self._velocity = self._air_velocity(states)
-        self._position = [x + half * (v + w) for x, v, w in zip(self._position, velocity, self._velocity, strict=True)]
+        self._position = [
+            x + half * (v + w)
+            for x, v, w in zip(self._position, velocity, self._velocity, strict=True)
+        ]
 
     def _drifts(self, t_ns: int) -> bool:
         """Whether the aircraft at t differs from that of the block."""
         drift = self._plant.drift
         if drift is None:
             return False
-        now, before = plant.share(np.array([seconds(t_ns), seconds(self._block_ns)]), drift.start, drift.duration)
+        now, before = plant.share(
+            np.array([seconds(t_ns), seconds(self._block_ns)]), drift.start, drift.duration
+        )
         return bool(now != before)
 
     def pose(self) -> FloatArray:
@@ -144,12 +154,19 @@ class StateSpaceModel:
         return y
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See FlightDynamicsModel: x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`."""
+        """See FlightDynamicsModel: x less the wind along the axis of the angle over V0,
+        `disturbance.AIR_STATE`.
+        """
         x = self._states()
         wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]
         if self._plant.turbulence is not None:
             wind = wind + turbulence.wind(self._state.turbulence, self._plant.turbulence)
-        return np.array([x[place] - (0.0 if axis is None else wind[axis] / self._speed) for place, axis in self._angles])
+        return np.array(
+            [
+                x[place] - (0.0 if axis is None else wind[axis] / self._speed)
+                for place, axis in self._angles
+            ]
+        )
 
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
@@ -165,7 +182,9 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
         self._plant = self._plant._replace(
-            aircraft=aircraft, actuators=parameters.actuator_model(), drift=parameters.drift_factors()
+            aircraft=aircraft,
+            actuators=parameters.actuator_model(),
+            drift=parameters.drift_factors(),
         )
         self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant, self._state.x)
 
@@ -183,7 +202,9 @@ class Simulator:
         if parameters.is_jsbsim:
             from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
 
-            self._model = JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
+            self._model = JsbsimModel(
+                parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model()
+            )
         else:
             self._model = StateSpaceModel(parameters)
         self._wind = parameters.wind
@@ -197,7 +218,11 @@ class Simulator:
         self._sensors = parameters.sensor_arrays()
         self._vanes = parameters.vane_arrays()
         self._vane_state = None if self._vanes is None else vanes.initial_state(self._vanes)
-        self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
+        self.truth_names = (
+            "t",
+            *self._model.truth_names,
+            *(f"noise.{name}" for name in self.outputs),
+        )
         if self._pose_sensors is not None:
             self.truth_names += tuple(f"noise.pose.{name}" for name in POSE)
             self._pose_drift = sensors.initial_drift(self._pose_sensors)
@@ -210,20 +235,34 @@ class Simulator:
         self._commands = deque([np.zeros(len(self.inputs))] * late)  # on the way to the actuators
 
     def retune(self, parameters: AircraftConfig) -> None:
-        """Take faults and gusts of these parameters from now on. Raises ParameterError where one would change the past."""
+        """Take faults and gusts of these parameters from now on. Raises ParameterError where one
+        would change the past.
+        """
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
         for axis, gust in parameters.gusts.items():
             old = self._gusts.get(axis)
             if gust == old:
                 continue
-            require(gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s")
+            require(
+                gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s"
+            )
             end = old.start + 2.0 * old.length / self._speed if old is not None and old.speed else t
             end = math.inf if old is not None and old.speed and math.isfinite(old.every) else end
             over = old is None or t <= old.start or end <= t
-            require(over, f"gusts.{axis}", "a change of a gust that acts", f"one after its end at t = {end:g} s")
+            require(
+                over,
+                f"gusts.{axis}",
+                "a change of a gust that acts",
+                f"one after its end at t = {end:g} s",
+            )
         if (drift := parameters.drift) != (before := self._drift_section):
-            require(drift is None or drift.start >= t, "drift.start", f"{drift and drift.start:g} s", f"at least t = {t:g} s")
+            require(
+                drift is None or drift.start >= t,
+                "drift.start",
+                f"{drift and drift.start:g} s",
+                f"at least t = {t:g} s",
+            )
             acts = before is not None and before.start < t
             require(not acts, "drift", "a change of a drift that acts", "one before its start")
         self._drift_section = drift
@@ -233,22 +272,27 @@ class Simulator:
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
-        """Advance to sample `number`, at number periods of flight time, with u held since the last sample, and measure.
+        """Advance to sample `number`, at number periods of flight time, with u held since the last
+        sample, and measure.
 
-        Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
-        has diverged: its state, or an output beyond `flight_core.plausible`.
+        Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded
+        where the aircraft has diverged: its state, or an output beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)
         self._number = number
         true = self._model.y()
-        if self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():  # false for NaN too
+        if (
+            self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all()
+        ):  # false for NaN too
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         if self._vanes is not None and self._vane_state is not None:
             angles = self._model.air_angles(t_ns)
             self._vane_state = vanes.turned(seconds(t_ns), angles, self._vane_state, self._vanes)
             true = np.concatenate([true, self._vane_state.angle])
-        measured, self._error, self._drift = sensors.measure(number, true, self._drift, self._sensors)
+        measured, self._error, self._drift = sensors.measure(
+            number, true, self._drift, self._sensors
+        )
         if self._vanes is not None and self._vane_state is not None:
             size_y = len(measured) - len(self._vanes.places)
             self._vane_state = vanes.read(number, measured[size_y:], self._vane_state, self._vanes)
@@ -266,10 +310,14 @@ class Simulator:
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
-        return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind, self._start)
+        return pose.over_ground(
+            self._model.pose(), seconds(self._number * self.period_ns), self._wind, self._start
+        )
 
     def poses(self) -> DelayLine:
-        """The poses that arrive at the instant of the last sample, the oldest first, as measured; stamps are flight time."""
+        """The poses that arrive at the instant of the last sample, the oldest first, as measured;
+        stamps are flight time.
+        """
         due = self._number % self._pose_every == 0
         t_ns = self._number * self.period_ns
         if self._pose_sensors is None:

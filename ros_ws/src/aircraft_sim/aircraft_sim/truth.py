@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions. No controller receives it."""
+"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions. No
+controller receives it.
+"""
 
 import numpy as np
 
@@ -13,17 +15,25 @@ from flight_core.vectors import FloatArray
 def names(airframe: Airframe) -> tuple[str, ...]:
     """Channels of `truth`, group by group.
 
-    "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind along the axes of the airframe's
-    gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position now).
+    "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind along the
+    axes of the airframe's gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the
+    position now).
     """
-    groups = (("x", airframe.states), ("f", airframe.states), ("gust", airframe.gusts), ("actuator", airframe.inputs))
+    groups = (
+        ("x", airframe.states),
+        ("f", airframe.states),
+        ("gust", airframe.gusts),
+        ("actuator", airframe.inputs),
+    )
     channels: list[str] = []
     for group, members in groups:
         channels += [f"{group}.{name}" for name in members]
     return tuple(channels)
 
 
-def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:
+def values(
+    state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams
+) -> FloatArray:
     """Values of `truth` in the order of `names`; f and the wind act from now on.
 
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.

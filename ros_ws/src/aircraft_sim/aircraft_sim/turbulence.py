@@ -1,14 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and shaping filters driven by white noise.
+"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and shaping filters driven
+by white noise.
 
-Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bounded derivative. A Gaussian process has no
-bound, and none of the three winds has a derivative: the filters have a pole more than zeros.
+Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bounded derivative. A
+Gaussian process has no bound, and none of the three winds has a derivative: the filters have a pole
+more than zeros.
 
-The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: the rates depend on the span and on the
-aerodynamic part of A's columns of p, q, r, unstated by the airframes of the library. The effect is not small everywhere: at 100
-m, for a span of 3 m, the specification's p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two
-fifths to the pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than real ones.
+The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: the rates
+depend on the span and on the aerodynamic part of A's columns of p, q, r, unstated by the airframes
+of the library. The effect is not small everywhere: at 100 m, for a span of 3 m, the specification's
+p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to the
+pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than
+real ones.
 """
 
 from collections.abc import Sequence
@@ -24,13 +28,15 @@ FOOT = 0.3048  # m, exact
 LOWEST = 10.0 * FOOT
 LOW = 1000.0 * FOOT
 HIGH = 2000.0 * FOOT
-"""m. The low model holds from LOWEST to LOW, the high one from HIGH on; MIL-F-8785C 3.7.3.4, 3.7.2."""
+"""m. The low model holds from LOWEST to LOW, the high one from HIGH on; MIL-F-8785C 3.7.3.4,
+3.7.2."""
 
 HIGH_LENGTH = 1750.0 * FOOT  # m, MIL-F-8785C 3.7.2.1, Dryden form
 
 MODERATE_WIND = 15.4
 MODERATE_SIGMA = 3.05
-"""m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high altitude, 10 ft/s."""
+"""m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high
+altitude, 10 ft/s."""
 
 MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # m above the ground, m/s
 
@@ -46,7 +52,9 @@ class Dryden(NamedTuple):
 
 
 class Turbulence(NamedTuple):
-    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (5,), of unit variance or less."""
+    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (5,), of
+    unit variance or less.
+    """
 
     transition: Array  # (5, 5)
     spread: Array  # (5, 5), lower triangular
@@ -58,16 +66,19 @@ class Turbulence(NamedTuple):
 def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
     """Lengths and intensities at an altitude h above the ground, m.
 
-    Arguments: `wind` W_20 at 20 ft (6.1 m) above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe turbulence (15, 30,
-    45 kt); `sigma` the intensity at high altitude, m/s, from the specification's chart by altitude and exceedance.
+    Arguments: `wind` W_20 at 20 ft (6.1 m) above the ground, m/s: 7.7 light, 15.4 moderate, 23.1
+    severe turbulence (15, 30, 45 kt); `sigma` the intensity at high altitude, m/s, from the
+    specification's chart by altitude and exceedance.
 
-        h <= 1000 ft    L_w = h,  L_u = L_v = h / c^1.2,  sigma_w = 0.1 W_20,  sigma_u = sigma_v = sigma_w / c^0.4
+        h <= 1000 ft    L_w = h,  L_u = L_v = h / c^1.2,  sigma_w = 0.1 W_20,
+            sigma_u = sigma_v = sigma_w / c^0.4
                         with c = 0.177 + 0.000823 h / ft
         h >= 2000 ft    L_u = L_v = L_w = 1750 ft,  sigma_u = sigma_v = sigma_w = sigma
         in between      linear interpolation of L and of sigma
 
-    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and writes 2 L in the spectra, with
-    equal result. The axes along and across the wind are taken as along and across the trimmed flight.
+    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and
+    writes 2 L in the spectra, with equal result. The axes along and across the wind are taken as
+    along and across the trimmed flight.
     """
     low = min(altitude, LOW)
     c = 0.177 + 0.000823 * low / FOOT
@@ -77,13 +88,17 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
     return Dryden(length, intensity)
 
 
-def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], seed: int) -> Turbulence:
-    """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in continuous time.
+def filters(
+    spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], seed: int
+) -> Turbulence:
+    """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in
+    continuous time.
 
     With a = V0/L by axis and white noise n of unit intensity,
 
         u       z_dot = -a z + sqrt(2a) n,  u = sigma z
-        v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),  v = sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2)
+        v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),
+            v = sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2)
 
     have the published spectra, one-sided in omega, T = L/V0:
 
@@ -94,14 +109,19 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
 
         transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 
-    with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary stationary' belongs to h = inf.
+    with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary
+    stationary' belongs to h = inf.
 
-    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source: MIL-F-8785C, 3.7.1.2.
+    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source:
+    MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
     p = np.sqrt(1.5)
     q = (1.0 - np.sqrt(3.0)) / np.sqrt(2.0)
-    output = np.array([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, p, q, 0.0, 0.0], [0.0, 0.0, 0.0, p, q]]) * spectrum.sigma[:, None]
+    output = (
+        np.array([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, p, q, 0.0, 0.0], [0.0, 0.0, 0.0, p, q]])
+        * spectrum.sigma[:, None]
+    )
     return Turbulence(
         _axes([np.exp(-h) * np.array([[1.0, 0.0], [h, 1.0]]) for h in steps]),
         _axes([_spread(h) for h in steps]),
@@ -113,19 +133,27 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
 
 def initial_state(params: Turbulence) -> FloatArray:
     """State at t = 0, a sample of the stationary distribution, shape (5,)."""
-    normal = random_streams.generator(0, random_streams.TURBULENCE_START, params.seed).standard_normal(STATES)
+    normal = random_streams.generator(
+        0, random_streams.TURBULENCE_START, params.seed
+    ).standard_normal(STATES)
     return np.asarray(params.stationary @ normal)
 
 
 def normals(first: int, count: int, seed: int) -> FloatArray:
-    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, 5); step k depends on seed and k."""
+    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, 5); step
+    k depends on seed and k.
+    """
     skipped = first % BLOCK
-    blocks = [_block(block, seed) for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)]
+    blocks = [
+        _block(block, seed) for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)
+    ]
     return np.concatenate(blocks)[skipped : skipped + count]
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
-    """State a step later, shape (5,): transition z + spread n, with n standard normal, shape (5,)."""
+    """State a step later, shape (5,): transition z + spread n, with n standard normal, shape
+    (5,).
+    """
     return params.transition @ z + params.spread @ normal
 
 
@@ -136,7 +164,9 @@ def wind(z: Array, params: Turbulence) -> Array:
 
 @lru_cache(maxsize=64)
 def _block(block: int, seed: int) -> FloatArray:
-    numbers = random_streams.generator(block, random_streams.TURBULENCE, seed).standard_normal((BLOCK, STATES))
+    numbers = random_streams.generator(block, random_streams.TURBULENCE, seed).standard_normal(
+        (BLOCK, STATES)
+    )
     numbers.flags.writeable = False  # the cache returns it again
     return numbers
 
@@ -149,7 +179,9 @@ def _spread(h: float) -> FloatArray:
 
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix the first entry counts alone."""
+    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix the first
+    entry counts alone.
+    """
     block = np.zeros((STATES, STATES))
     block[0, 0] = matrices[0][0, 0]
     block[1:3, 1:3], block[3:, 3:] = matrices[1:]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe, repeatable by seed."""
+"""Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe,
+repeatable by seed.
+"""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -16,22 +18,26 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
 KINEMATIC = ("theta", "phi", "psi")
-"""States whose derivatives are known exactly: their rows stay as published in uncertain airframes."""
+"""States whose derivatives are known exactly: their rows stay as published in uncertain
+airframes."""
 
 WindEffect = Literal["air_relative", "published"]
-"""Effect of wind on the x_dot of an uncertain aircraft: by its own A, or that of the published airframe. See `wind_factors`."""
+"""Effect of wind on the x_dot of an uncertain aircraft: by its own A, or that of the published
+airframe. See `wind_factors`."""
 
 AIR_RELATIVE: WindEffect = "air_relative"
 
 Distribution = Literal["uniform", "normal", "corners"]
-"""Of the relative deviations d within +-uncertainty: uniform; normal, cut at three standard deviations; or
-the two limits, with equal probability."""
+"""Of the relative deviations d within +-uncertainty: uniform; normal, cut at three standard
+deviations; or the two limits, with equal probability."""
 
 
 class Spread(NamedTuple):
     """How the entries of A and B are drawn."""
 
-    entries: Mapping[str, float] = MappingProxyType({})  # uncertainty by entry, named as in `drawn_entries`
+    entries: Mapping[str, float] = MappingProxyType(
+        {}
+    )  # uncertainty by entry, named as in `drawn_entries`
     distribution: Distribution = "uniform"
 
 
@@ -41,12 +47,15 @@ UNIFORM = Spread()
 def nominal_and_sampled(
     airframe: Airframe, uncertainty: float, samples: int, seed: int, spread: Spread = UNIFORM
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published, then numbers 0, 1, ... of the seed.
+    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published, then numbers
+    0, 1, ... of the seed.
 
     Raises as `sampled_matrices`.
     """
     A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
-    return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate([airframe.matrix_b()[None], B])
+    return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate(
+        [airframe.matrix_b()[None], B]
+    )
 
 
 def sample_airframe(
@@ -58,9 +67,11 @@ def sample_airframe(
     wind: WindEffect = AIR_RELATIVE,
     spread: Spread = UNIFORM,
 ) -> Airframe:
-    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0, 0 and no entry give the published airframe.
+    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0, 0 and no entry
+    give the published airframe.
 
-    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises as `sampled_matrices`.
+    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises as
+    `sampled_matrices`.
     """
     A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
     return (
@@ -71,46 +82,71 @@ def sample_airframe(
 
 
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Factors on the published effect of wind, shape (N, n, G), of N aircraft with the matrices A, shape (N, n, n), SI.
+    """Factors on the published effect of wind, shape (N, n, G), of N aircraft with the matrices A,
+    shape (N, n, n), SI.
 
-    Wind w along an axis changes the state j of AIR_STATE relative to the air, so the wind acts as minus column j of A:
+    Wind w along an axis changes the state j of AIR_STATE relative to the air, so the wind acts as
+    minus column j of A:
 
-        air_relative    factor_i = A_ij / published A_ij    1 where the published A_ij is 0 or the airframe has no state j
+        air_relative    factor_i = A_ij / published A_ij
+            1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    A published effect equal to minus the published column, per w / V0 or w, then equals minus the aircraft's own column.
+    A published effect equal to minus the published column, per w / V0 or w, then equals minus the
+    aircraft's own column.
     """
     published = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
     for k, axis in enumerate(airframe.gusts):
         if wind == AIR_RELATIVE and AIR_STATE[axis] in airframe.states:
             j = airframe.index(AIR_STATE[axis])
-            np.divide(A[:, :, j], published[:, j], out=factors[:, :, k], where=published[:, j] != 0.0)
+            np.divide(
+                A[:, :, j], published[:, j], out=factors[:, :, k], where=published[:, j] != 0.0
+            )
     return factors
 
 
 def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft with the matrices A; `wind_factors`."""
+    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft with the
+    matrices A; `wind_factors`.
+    """
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
 
 def sampled_matrices(
-    airframe: Airframe, part_A: float, part_B: float, seed: int, first: int, count: int, spread: Spread = UNIFORM
+    airframe: Airframe,
+    part_A: float,
+    part_B: float,
+    seed: int,
+    first: int,
+    count: int,
+    spread: Spread = UNIFORM,
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
+    """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n,
+    m), SI.
 
-    Every entry is multiplied by 1 + d, d independent and within +-uncertainty, as `spread` says. The rows of angles stay. An
-    aircraft depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1), and for
-    an unknown entry.
+    Every entry is multiplied by 1 + d, d independent and within +-uncertainty, as `spread` says.
+    The rows of angles stay. An aircraft depends on seed and number alone, not on `count`. Raises
+    ParameterError for an uncertainty outside [0, 1), and for an unknown entry.
     """
-    parts = {"A": np.full(airframe.matrix_a().shape, part_A), "B": np.full(airframe.matrix_b().shape, part_B)}
+    parts = {
+        "A": np.full(airframe.matrix_a().shape, part_A),
+        "B": np.full(airframe.matrix_b().shape, part_B),
+    }
     places = _drawn_places(airframe)
     for name, part in spread.entries.items():
-        require(name in places, "uncertainty", f"entry {name}", f"an entry of the airframe: {', '.join(places)}")
+        require(
+            name in places,
+            "uncertainty",
+            f"entry {name}",
+            f"an entry of the airframe: {', '.join(places)}",
+        )
         matrix, i, j = places[name]
         parts[matrix][i, j] = part
     for part in (part_A, part_B, *spread.entries.values()):
-        require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
+        require(
+            0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1"
+        )
     A = airframe.matrix_a()
     B = airframe.matrix_b()
     uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
@@ -135,18 +171,24 @@ def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
 
 
 def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:
-    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust], each of shape (N,), SI.
+    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust], each of
+    shape (N,), SI.
 
-    A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft. Entries that are 0 as published, and the rows of
-    angles, are not drawn.
+    A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft. Entries that are 0 as
+    published, and the rows of angles, are not drawn.
     """
     matrices = {"A": A, "B": B}
-    return {name: matrices[matrix][:, i, j] for name, (matrix, i, j) in _drawn_places(airframe).items()}
+    return {
+        name: matrices[matrix][:, i, j] for name, (matrix, i, j) in _drawn_places(airframe).items()
+    }
 
 
 def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
     """The entries that `sampled_matrices` draws: matrix, row and column by name."""
-    named = {"A": (airframe.matrix_a(), [*airframe.states]), "B": (airframe.matrix_b(), [*airframe.inputs])}
+    named = {
+        "A": (airframe.matrix_a(), [*airframe.states]),
+        "B": (airframe.matrix_b(), [*airframe.inputs]),
+    }
     rows = [*airframe.states]
     places = {}
     for matrix, (published, columns) in named.items():
@@ -156,16 +198,24 @@ def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
     return places
 
 
-def with_entries(airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE) -> Airframe:
-    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`; wind as in `wind_factors`."""
+def with_entries(
+    airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE
+) -> Airframe:
+    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`; wind as
+    in `wind_factors`.
+    """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
     places = _drawn_places(airframe)
     for name, deviation in deviations.items():
         matrix, i, j = places[name]
         matrices[matrix][i, j] *= 1.0 + deviation
-    return airframe.with_matrices(matrices["A"], matrices["B"], wind_factors(airframe, matrices["A"][None], wind)[0])
+    return airframe.with_matrices(
+        matrices["A"], matrices["B"], wind_factors(airframe, matrices["A"][None], wind)[0]
+    )
 
 
 def as_yaml(airframe: Airframe) -> str:
-    """An airframe as the text of an airframe file, whose numbers read back as they are to the last bit."""
+    """An airframe as the text of an airframe file, whose numbers read back as they are to the last
+    bit.
+    """
     return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vanes: angle of attack and sideslip relative to the air, with icing before the sensor and lost readings behind it."""
+"""Vanes: angle of attack and sideslip relative to the air, with icing before the sensor and lost
+readings behind it.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -38,12 +40,18 @@ def initial_state(params: Vanes) -> VaneState:
 
 def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> VaneState:
     """The angles of the vanes at t for (alpha, beta) of the air, (2,); a frozen vane stays."""
-    return state._replace(angle=np.where(t >= params.frozen_at, state.angle, angles[list(params.places)]))
+    return state._replace(
+        angle=np.where(t >= params.frozen_at, state.angle, angles[list(params.places)])
+    )
 
 
 def read(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """The readings of sample `number`, (k,), from measured angles with errors: a lost reading repeats the last."""
+    """The readings of sample `number`, (k,), from measured angles with errors: a lost reading
+    repeats the last.
+    """
     if params.dropout == 0.0:
         return state._replace(reading=measured)
-    draws = random_streams.generator(number, random_streams.VANE_LOSS, params.seed).random(len(measured))
+    draws = random_streams.generator(number, random_streams.VANE_LOSS, params.seed).random(
+        len(measured)
+    )
     return state._replace(reading=np.where(draws < params.dropout, state.reading, measured))

@@ -1,3 +1,5 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, in place of the simulated aircraft: channel maps, conversion, engagement, failsafe, node."""
+"""Bridge to an autopilot, in place of the simulated aircraft: channel maps, conversion, engagement,
+failsafe, node.
+"""

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lock of a MAVLink link to the first autopilot, by the address of the packets and the time since boot in the messages."""
+"""Lock of a MAVLink link to the first autopilot, by the address of the packets and the time since
+boot in the messages.
+"""
 
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
@@ -10,18 +12,22 @@ CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within it a
 
 
 class AutopilotLock:
-    """Locks to the first autopilot until silence, then to the next autopilot, as a topic to a publisher.
+    """Locks to the first autopilot until silence, then to the next autopilot, as a topic to a
+    publisher.
 
-    Two autopilots behind the same address differ by the time since boot in their messages. The time since boot of an autopilot
-    never goes back, and advances by the time that passes here at most. A message may come late. An autopilot after a new start
-    is a second sender until messages of the start before have been missing for the same silence.
+    Two autopilots behind the same address differ by the time since boot in their messages. The time
+    since boot of an autopilot never goes back, and advances by the time that passes here at most. A
+    message may come late. An autopilot after a new start is a second sender until messages of the
+    start before have been missing for the same silence.
     """
 
     def __init__(self, silence_ns: int) -> None:
         self._silence_ns = silence_ns
         self._addresses, self._starts = self._new_lock(), self._new_lock()
         self._newest_ns = 0  # the largest time since boot
-        self._boot_ns = 0  # the earliest instant of the boot, by the messages so far: that of the message with the least delay
+        # the earliest instant of the boot, by the messages so far: that of the message with the
+        # least delay
+        self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:
         return PublisherLock(lambda: (self._silence_ns, self._silence_ns))
@@ -37,25 +43,34 @@ class AutopilotLock:
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a message of a second sender before the silence of the first.
+        """Raise ChannelError, reason "sender", for a message of a second sender before the silence
+        of the first.
 
         `since_boot_ns` is None for a message without the time since boot.
         """
         try:
             self._addresses.check(address, now_ns)
         except ChannelError:
-            sentence = f"a second sender, {address}, sends as the autopilot: {self.address} was first and is taken alone"
+            sentence = (
+                f"a second sender, {address}, sends as the autopilot: {self.address} was "
+                "first and is taken alone"
+            )
             raise ChannelError(SENDER, sentence) from None
         if since_boot_ns is None or address != self.address:
             return
         try:
             self._starts.check(self._start(since_boot_ns, now_ns), now_ns)
         except ChannelError:
-            sentence = f"the time since boot from {address} jumps: a second autopilot sends there, or it has started again"
+            sentence = (
+                f"the time since boot from {address} jumps: a second autopilot sends "
+                "there, or it has started again"
+            )
             raise ChannelError(SENDER, sentence) from None
 
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
-        """Lock to the sender of a message after `check`. Returns whether the sender is new, or has started again."""
+        """Lock to the sender of a message after `check`. Returns whether the sender is new, or has
+        started again.
+        """
         changed = self._addresses.refresh(address, now_ns)
         if changed:
             self._starts = self._new_lock()
@@ -67,11 +82,23 @@ class AutopilotLock:
             self._newest_ns = since_boot_ns
             self._boot_ns = boot_ns
             return changed or known
-        self._newest_ns, self._boot_ns = max(self._newest_ns, since_boot_ns), min(self._boot_ns, boot_ns)
+        self._newest_ns, self._boot_ns = (
+            max(self._newest_ns, since_boot_ns),
+            min(self._boot_ns, boot_ns),
+        )
         return changed
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """The name of the start to which a time since boot belongs: the locked start, or a new name by the instant of boot."""
+        """The name of the start to which a time since boot belongs: the locked start, or a new name
+        by the instant of boot.
+        """
         boot_ns = now_ns - since_boot_ns
-        advances = since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
-        return self._starts.publisher if self._starts.publisher is not None and advances else str(boot_ns)
+        advances = (
+            since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS
+            and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
+        )
+        return (
+            self._starts.publisher
+            if self._starts.publisher is not None and advances
+            else str(boot_ns)
+        )

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it, engagement, pilot override and failsafe.
+"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it, engagement,
+pilot override and failsafe.
 
-It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an engagement.
+It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an
+engagement.
 """
 
 import math
@@ -14,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow, OutputRow
+from autopilot_bridge.params import (
+    ROUNDING,
+    ChannelMap,
+    ConditionRow,
+    InputRow,
+    MeasuredRow,
+    OutputRow,
+)
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import (
@@ -24,8 +33,13 @@ from flight_core.vectors import (
     require_newer,
 )
 
-UNBOUNDED = "the loss of the transmitter cannot be seen over this link: set max_engaged in the map, or engage with --blind"
-LARGE = 0.5  # of the limits: beyond, a u that rests is at a limit of the law. The amplitudes of experiments are below
+UNBOUNDED = (
+    "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
+    "map, or engage with --blind"
+)
+# of the limits: beyond, a u that rests is at a limit of the law. The amplitudes of experiments are
+# below
+LARGE = 0.5
 END_WARNING_NS = 10 * NANOSECONDS  # before the end of an engagement by `max_engaged`
 
 
@@ -52,7 +66,9 @@ def trim_key(name: str) -> str:
 
 
 class Bridge:
-    """The newest y and u, the phase and the pilot override. Only `engage` engages: the bridge never re-engages by itself."""
+    """The newest y and u, the phase and the pilot override. Only `engage` engages: the bridge never
+    re-engages by itself.
+    """
 
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
         self.channel_map = channel_map
@@ -60,25 +76,39 @@ class Bridge:
         self.outputs = tuple(channel_map.outputs)
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        self.reason = "not engaged yet"  # why the bridge is not engaged, what an engagement waits for, or lacks
-        self.conflict = ""  # what refuses and ends an engagement, such as another publisher, as a sentence; set by the node
-        self.problem = ""  # what refuses an engagement and does not end one yet, as a rate of the link; set by the node
+        # why the bridge is not engaged, what an engagement waits for, or lacks
+        self.reason = "not engaged yet"
+        # what refuses and ends an engagement, such as another publisher, as a sentence; set by the
+        # node
+        self.conflict = ""
+        # what refuses an engagement and does not end one yet, as a rate of the link; set by the
+        # node
+        self.problem = ""
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
-        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.sensors, **channel_map.outputs, **sources}
+        self._rows: dict[str, MeasuredRow] = {
+            **channel_map.pose,
+            **channel_map.sensors,
+            **channel_map.outputs,
+            **sources,
+        }
         self._readings: dict[str, Reading] = {}
         self._zero: dict[str, float] = {}  # captured outputs: their value at engagement
         self._trim: dict[str, float] = {}  # captured inputs: their trim at engagement
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self._moves = np.ones(len(self.inputs), dtype=bool)  # whether the newest u differs from the one before
+        self._moves = np.ones(
+            len(self.inputs), dtype=bool
+        )  # whether the newest u differs from the one before
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self._conditions: dict[str, Reading] = {}
         self._parameters: dict[str, float] = {}
         self._overrides: dict[str, Reading] = {}
         self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
-        self._keeps_mode = True  # whether a release leaves the mode: a pilot requested it, or nothing was flown
+        self._keeps_mode = (
+            True  # whether a release leaves the mode: a pilot requested it, or nothing was flown
+        )
         self._blind = False  # whether the engagement goes on without the transmitter
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
@@ -92,34 +122,47 @@ class Bridge:
     # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """Take a value of a channel of y, of the pose or of a trim's source: sign scale raw + offset.
+        """Take a value of a channel of y, of the pose or of a trim's source: sign scale raw +
+        offset.
 
-        Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age limit, reason "order" where it
-        is not later than the previous one.
+        Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age
+        limit, reason "order" where it is not later than the previous one.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
-            hint = "" if row.stamp == "arrival" else "; set stamp: arrival in the map if the autopilot has another clock"
+            hint = (
+                ""
+                if row.stamp == "arrival"
+                else "; set stamp: arrival in the map if the autopilot has another clock"
+            )
             side = "before" if stamp_ns < now_ns else "after"
-            raise ChannelError("stamp", f"{name} is stamped {seconds(abs(now_ns - stamp_ns)):.3f} s {side} now{hint}")
+            raise ChannelError(
+                "stamp",
+                f"{name} is stamped {seconds(abs(now_ns - stamp_ns)):.3f} s {side} now{hint}",
+            )
         last = self._readings.get(name)
         value = to_channel(raw, row.line)
         if last is not None:
             require_newer(stamp_ns, last.stamp_ns, name)
             if isinstance(row, OutputRow) and row.low_pass > 0.0:
-                value = last.value - math.expm1(-seconds(stamp_ns - last.stamp_ns) / row.low_pass) * (value - last.value)
+                value = last.value - math.expm1(
+                    -seconds(stamp_ns - last.stamp_ns) / row.low_pass
+                ) * (value - last.value)
         self._readings[name] = Reading(stamp_ns, value)
 
     def _u_timeouts_ns(self) -> tuple[int, int]:
         """Timeouts of the publisher of u.
 
-        While engaged every second publisher conflicts, also after a timeout: its u would jump. The timeout ends the engagement.
+        While engaged every second publisher conflicts, also after a timeout: its u would jump. The
+        timeout ends the engagement.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Age limit of a u by the stamp, the instant of a y: a played log does not begin to fly the autopilot."""
+        """Age limit of a u by the stamp, the instant of a y: a played log does not begin to fly the
+        autopilot.
+        """
         return self._max_age_ns + self._max_y_age_ns
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
@@ -128,7 +171,9 @@ class Bridge:
         self._u = sample.value
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
+        """Take the field of a condition. A condition that is lost ends an engagement at the next
+        step.
+        """
         self._conditions[name] = Reading(now_ns, raw)
 
     def take_parameter(self, name: str, value: float) -> None:
@@ -136,7 +181,9 @@ class Bridge:
         self._parameters[name] = value
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a pilot override. Beyond its threshold the bridge disengages at once."""
+        """Take the field of a pilot override. Beyond its threshold the bridge disengages at
+        once.
+        """
         self._overrides[name] = Reading(now_ns, raw)
         if self._is_active(name, now_ns):
             self.disengage(f"pilot override by {name}", now_ns, by_pilot=True)
@@ -144,21 +191,30 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """The stale channels of y and of the envelope, each with what is wrong: "0.30 s old (/topic)"."""
+        """The stale channels of y and of the envelope, each with what is wrong: "0.30 s old
+        (/topic)".
+        """
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """What is wrong with a channel; empty where it is fresh, and where its last value is held."""
+        """What is wrong with a channel; empty where it is fresh, and where its last value is
+        held.
+        """
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
             return ""
         return _staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self, section: str = "envelope") -> str:
-        """The channels that are outside the limits of a section of the map, as a sentence. All of them were received."""
+        """The channels that are outside the limits of a section of the map, as a sentence. All of
+        them were received.
+        """
         what = "the envelope" if section == "envelope" else section
-        values = ((name, self._value(name), limits) for name, limits in getattr(self.channel_map, section).items())
+        values = (
+            (name, self._value(name), limits)
+            for name, limits in getattr(self.channel_map, section).items()
+        )
         return "; ".join(
             f"{name} is {value:.3g}, outside {what} [{lower:g}, {upper:g}]"
             for name, value, (lower, upper) in values
@@ -166,28 +222,44 @@ class Bridge:
         )
 
     def _does_not_answer(self, now_ns: int) -> str:
-        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the aircraft does not follow.
+        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the
+        aircraft does not follow.
 
-        The limits of the law may be narrower than those of the map: a large u that does not change is at one.
+        The limits of the law may be narrower than those of the map: a large u that does not change
+        is at one.
         """
         sentences = []
-        inside, small = ((factor * self._lower < self._u) & (self._u < factor * self._upper) for factor in (1.0, LARGE))
+        inside, small = (
+            (factor * self._lower < self._u) & (self._u < factor * self._upper)
+            for factor in (1.0, LARGE)
+        )
         for name, answers in zip(self.inputs, inside & (small | self._moves), strict=True):
             row = self.channel_map.inputs[name]
             if row.at_limit is None or answers:
                 self._limit_ns.pop(name, None)
             elif now_ns - self._limit_ns.setdefault(name, now_ns) >= nanoseconds(row.at_limit):
-                sentences.append(f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not answer")
+                sentences.append(
+                    f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not "
+                    "answer"
+                )
         return "; ".join(sentences)
 
     def _unmet(self, now_ns: int, *, awaited: bool) -> str:
-        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the others."""
+        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the
+        others.
+        """
         conditions = self.channel_map.conditions.items()
-        rows = ((name, row) for name, row in conditions if row.awaited is awaited and not (row.transmitter and self._blind))
+        rows = (
+            (name, row)
+            for name, row in conditions
+            if row.awaited is awaited and not (row.transmitter and self._blind)
+        )
         return "; ".join(filter(None, (self._violation(name, row, now_ns) for name, row in rows)))
 
     def _lost(self, now_ns: int) -> str:
-        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence; empty where it is."""
+        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence;
+        empty where it is.
+        """
         unmet = (self._unmet(now_ns, awaited=awaited) for awaited in (False, True))
         return "; ".join(filter(None, (self.conflict, *unmet)))
 
@@ -195,16 +267,24 @@ class Bridge:
         reading = self._conditions.get(name)
         if stale := _staleness(row.topic, reading, row.max_age, now_ns):
             return _sentence({f"{name}: {row.field}": stale})
-        return "" if reading is None or row.holds(reading.value) else f"{row.sentence} ({row.field} is {reading.value:g})"
+        return (
+            ""
+            if reading is None or row.holds(reading.value)
+            else f"{row.sentence} ({row.field} is {reading.value:g})"
+        )
 
     def _is_active(self, name: str, now_ns: int) -> bool:
-        """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""
+        """Whether a pilot override is active. It ends with its topic: an old one does not block an
+        engagement.
+        """
         row = self.channel_map.overrides[name]
         reading = self._overrides.get(name)
         if reading is None or self._is_silent(name, now_ns):
             return False
         engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
-        at_engagement = self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
+        at_engagement = (
+            self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
+        )
         return row.is_active(reading.value, at_engagement)
 
     def _is_silent(self, name: str, now_ns: int) -> bool:
@@ -214,32 +294,53 @@ class Bridge:
 
     def _silent_overrides(self, now_ns: int) -> str:
         rows = self.channel_map.overrides.items()
-        silent = [f"no message on {row.topic} for {row.max_age:g} s" for name, row in rows if self._is_silent(name, now_ns)]
+        silent = [
+            f"no message on {row.topic} for {row.max_age:g} s"
+            for name, row in rows
+            if self._is_silent(name, now_ns)
+        ]
         return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
 
     def _blindness(self) -> str:
-        """What an engagement that does not see the loss of the transmitter lacks, and what still releases, as a sentence."""
+        """What an engagement that does not see the loss of the transmitter lacks, and what still
+        releases, as a sentence.
+        """
         if self._watches_transmitter and not self._blind:
             return ""
         rows = self.channel_map.overrides.items()
         dead = ", ".join(name for name, row in rows if row.transmitter)
         working = ", ".join(name for name, row in rows if not row.transmitter)
-        conditions = ", ".join(name for name, row in self.channel_map.conditions.items() if not row.transmitter)
+        conditions = ", ".join(
+            name for name, row in self.channel_map.conditions.items() if not row.transmitter
+        )
         releases = (
             f"the override by {working}" if working else "",
             f"a lost condition ({conditions})" if conditions else "",
             "rise-di engage --off",
             f"max_engaged after {self.channel_map.max_engaged:g} s" if self._end_ns else "",
         )
-        where = "is not watched (--blind)" if self._watches_transmitter else "cannot be seen over this link"
+        where = (
+            "is not watched (--blind)"
+            if self._watches_transmitter
+            else "cannot be seen over this link"
+        )
         blind_override = f", and the override by {dead} has no effect then" if dead else ""
-        return f"the loss of the transmitter {where}{blind_override}; released by {', '.join(filter(None, releases))}"
+        return (
+            f"the loss of the transmitter {where}{blind_override}; released by "
+            f"{', '.join(filter(None, releases))}"
+        )
 
     def _lacks(self, now_ns: int) -> str:
         """What an engagement lacks, as a sentence."""
         ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
-        warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again" if ends else ""
-        return "; ".join(filter(None, (warning, self.problem, self._silent_overrides(now_ns), self._blindness())))
+        warning = (
+            f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
+            if ends
+            else ""
+        )
+        return "; ".join(
+            filter(None, (warning, self.problem, self._silent_overrides(now_ns), self._blindness()))
+        )
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -249,10 +350,15 @@ class Bridge:
         """The reason why u has timed out, as a sentence; empty where u is fresh."""
         if self.u_lock.publisher is None:
             return "u not received yet"
-        return f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old" if self.u_timed_out(now_ns) else ""
+        return (
+            f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old"
+            if self.u_timed_out(now_ns)
+            else ""
+        )
 
     def refusal(self, now_ns: int) -> str:
-        """Why `engage` would be refused now; empty where it would not. Awaited conditions do not count.
+        """Why `engage` would be refused now; empty where it would not. Awaited conditions do not
+        count.
 
         A dry run states the reason that there would be with `dry_run: false` too.
         """
@@ -262,7 +368,11 @@ class Bridge:
             lambda now_ns: self._unmet(now_ns, awaited=False),
             lambda _: self.problem,
             lambda _: self._unfit_parameters(),
-            lambda _: "" if self._blind or self._watches_transmitter or self.channel_map.max_engaged else UNBOUNDED,
+            lambda _: (
+                ""
+                if self._blind or self._watches_transmitter or self.channel_map.max_engaged
+                else UNBOUNDED
+            ),
             self._missing,
             lambda _: self._outside(),
             lambda _: self._outside("engage_if"),
@@ -270,7 +380,9 @@ class Bridge:
             lambda _: "; ".join(filter(None, map(self._beyond_range, self.channel_map.trims))),
         )
         dry_run = "dry_run is true: nothing is sent" if self.dry_run else ""
-        return "; ".join(filter(None, (dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))))
+        return "; ".join(
+            filter(None, (dry_run, next(filter(None, (check(now_ns) for check in checks)), "")))
+        )
 
     def _unfit_parameters(self) -> str:
         """The parameters of the autopilot with which the bridge does not engage, as a sentence."""
@@ -279,9 +391,14 @@ class Bridge:
             value = self._parameters.get(name)
             lower, upper = row.within
             if value is None:
-                sentences.append(f"{name} not received yet: the autopilot does not answer, or has no such parameter")
+                sentences.append(
+                    f"{name} not received yet: the autopilot does not answer, or has no such "
+                    "parameter"
+                )
             elif not lower <= value <= upper:
-                sentences.append(f"{name} is {value:g}, expected {lower:g} to {upper:g}: {row.sentence}")
+                sentences.append(
+                    f"{name} is {value:g}, expected {lower:g} to {upper:g}: {row.sentence}"
+                )
         return "; ".join(sentences)
 
     def _active_overrides(self, now_ns: int) -> str:
@@ -289,32 +406,45 @@ class Bridge:
         return f"pilot override active: {', '.join(active)}" if active else ""
 
     def _missing(self, now_ns: int) -> str:
-        """What is stale of y, of envelope and engage_if, of the trims' sources and of u, as a sentence."""
+        """What is stale of y, of envelope and engage_if, of the trims' sources and of u, as a
+        sentence.
+        """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
-        return "; ".join(filter(None, (_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns))))
+        return "; ".join(
+            filter(None, (_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns)))
+        )
 
     def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
-                return f"u.{name} is {u:.3g} from trim, more than {limit:.3g}: deactivate the controller until u is at trim"
+                return (
+                    f"u.{name} is {u:.3g} from trim, more than {limit:.3g}: deactivate the "
+                    "controller until u is at trim"
+                )
         return ""
 
     def _beyond_range(self, name: str) -> str:
-        """Why the limits around the trim of a captured input leave the range of its field; empty where they do not."""
+        """Why the limits around the trim of a captured input leave the range of its field; empty
+        where they do not.
+        """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
         if all(low - ROUNDING <= to_raw(end, row.line) <= high + ROUNDING for end in ends):
             return ""
-        return f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, {row.upper:g}] around it leave its range"
+        return (
+            f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, "
+            f"{row.upper:g}] around it leave its range"
+        )
 
     def engage(self, now_ns: int, *, blind: bool = False) -> str:
-        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence, empty where there is none.
+        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence,
+        empty where there is none.
 
-        `blind`: without regard to the loss of the transmitter, and without end. A request while engaged starts the time of
-        `max_engaged` again.
+        `blind`: without regard to the loss of the transmitter, and without end. A request while
+        engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self._blind |= blind
@@ -335,7 +465,9 @@ class Bridge:
         self._end_ns = None if bound is None else now_ns + nanoseconds(bound)
 
     def _continue_engagement(self, now_ns: int) -> None:
-        """Engage once the awaited conditions hold; give up after their time, or where something else would refuse."""
+        """Engage once the awaited conditions hold; give up after their time, or where something
+        else would refuse.
+        """
         self.reason = self._unmet(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
         if refusal := self.refusal(now_ns):
@@ -344,9 +476,15 @@ class Bridge:
             self.disengage(f"{self.reason}, after {self.channel_map.engage_timeout:g} s", now_ns)
         elif not self.reason:
             self._trim = {name: self.trim(name) for name in self.channel_map.trims}
-            self._zero = {name: self._readings[name].value for name, row in self.channel_map.outputs.items() if row.captured}
+            self._zero = {
+                name: self._readings[name].value
+                for name, row in self.channel_map.outputs.items()
+                if row.captured
+            }
             self._overrides_at_engagement = {
-                name: reading.value for name, reading in self._overrides.items() if not self._is_silent(name, now_ns)
+                name: reading.value
+                for name, reading in self._overrides.items()
+                if not self._is_silent(name, now_ns)
             }
             self._enter(Phase.ENGAGED, now_ns)
 
@@ -363,9 +501,10 @@ class Bridge:
     def step(self, now_ns: int) -> Phase:
         """Phase at an instant.
 
-        A stale y or u, a value outside the envelope, an input that stays at its limit, a lost condition, a conflicting
-        publisher or `max_engaged` ends an engagement. The phases ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL
-        also with a lost condition or a conflicting publisher.
+        A stale y or u, a value outside the envelope, an input that stays at its limit, a lost
+        condition, a conflicting publisher or `max_engaged` ends an engagement. The phases ENGAGING,
+        NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a
+        conflicting publisher.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -374,14 +513,19 @@ class Bridge:
         elif self.phase is Phase.ENGAGED:
             measured = _sentence(self.stale(now_ns))
             cause = self.problem if measured else ""
-            reasons = "; ".join(filter(None, (self._lost(now_ns), measured, cause))) or self._outside()
+            reasons = (
+                "; ".join(filter(None, (self._lost(now_ns), measured, cause))) or self._outside()
+            )
             if ended := reasons or self._does_not_answer(now_ns):
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
             elif self._end_ns is not None and now_ns >= self._end_ns:
-                self.disengage(f"engaged for {self.channel_map.max_engaged:g} s, max_engaged of the map", now_ns)
+                self.disengage(
+                    f"engaged for {self.channel_map.max_engaged:g} s, max_engaged of the map",
+                    now_ns,
+                )
             else:
                 self.reason = self._lacks(now_ns)
         times = self.channel_map.silence
@@ -394,15 +538,25 @@ class Bridge:
     # Outputs
 
     def y(self, now_ns: int) -> StampedVector | None:
-        """Sample of y at the stamp of the map's output `instant`; None where it was returned before or a channel is stale."""
+        """Sample of y at the stamp of the map's output `instant`; None where it was returned before
+        or a channel is stale.
+        """
         newest = self._readings.get(self.channel_map.instant)
-        if newest is None or newest.stamp_ns <= self._last_y_ns or any(self._staleness(name, now_ns) for name in self.outputs):
+        if (
+            newest is None
+            or newest.stamp_ns <= self._last_y_ns
+            or any(self._staleness(name, now_ns) for name in self.outputs)
+        ):
             return None
         self._last_y_ns = newest.stamp_ns
-        return StampedVector(newest.stamp_ns, np.array([self._value(name) for name in self.outputs]))
+        return StampedVector(
+            newest.stamp_ns, np.array([self._value(name) for name in self.outputs])
+        )
 
     def _value(self, name: str) -> float:
-        """The newest value of a channel. A captured output is 0 until it is engaged, then its change since engagement."""
+        """The newest value of a channel. A captured output is 0 until it is engaged, then its
+        change since engagement.
+        """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
         if row is None or not row.captured:
@@ -410,11 +564,17 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Whether the trims are those captured at engagement; otherwise they follow their sources."""
-        return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(self._zero or self._trim)
+        """Whether the trims are those captured at engagement; otherwise they follow their
+        sources.
+        """
+        return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
+            self._zero or self._trim
+        )
 
     def trim(self, name: str) -> float:
-        """The trim of an input: captured at engagement where `trims` has its source, which it follows until then."""
+        """The trim of an input: captured at engagement where `trims` has its source, which it
+        follows until then.
+        """
         row = self.channel_map.inputs[name]
         source = self._readings.get(trim_key(name))
         if name in self._trim and self._is_captured():
@@ -422,7 +582,8 @@ class Bridge:
         return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
-        """Names and values of the fresh channels of the pose, at the stamp of its first row; None where that is not new.
+        """Names and values of the fresh channels of the pose, at the stamp of its first row; None
+        where that is not new.
 
         psi is in -pi..pi. A channel that was not received or is stale is left out.
         """
@@ -438,9 +599,13 @@ class Bridge:
         return names, StampedVector(newest.stamp_ns, np.array(list(values.values())))
 
     def raw_u(self) -> FloatArray:
-        """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower), upper)."""
+        """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower),
+        upper).
+        """
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
-        return np.array([self._raw(name, u_i) for name, u_i in zip(self.inputs, u.tolist(), strict=True)])
+        return np.array(
+            [self._raw(name, u_i) for name, u_i in zip(self.inputs, u.tolist(), strict=True)]
+        )
 
     def _raw(self, name: str, u: float) -> float:
         return to_raw(self.trim(name) + u, self.channel_map.inputs[name].line)
@@ -472,16 +637,21 @@ class Bridge:
         if when == "failsafe":
             return phase is Phase.RELEASE and not (self._keeps_mode or self._is_contradicted())
         releases = [row.release for row in self.channel_map.inputs.values() if row.message == name]
-        return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in releases)
+        return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (
+            phase is Phase.RELEASE and None not in releases
+        )
 
     def _is_contradicted(self) -> bool:
-        """Whether a condition does not hold by its last value: the pilot or the autopilot chose another mode, or has landed.
+        """Whether a condition does not hold by its last value: the pilot or the autopilot chose
+        another mode, or has landed.
 
         One that tells the loss of the transmitter does not count: the pilot cannot take over then.
         """
         rows = self.channel_map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
-        return any(reading is not None and not row.holds(reading.value) for row, reading in readings)
+        return any(
+            reading is not None and not row.holds(reading.value) for row, reading in readings
+        )
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase = phase
@@ -505,9 +675,14 @@ def _staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int)
 
 
 def _sentence(faults: Mapping[str, str]) -> str:
-    """What is wrong with some channels, by name, as a sentence in which channels with the same fault stand together."""
+    """What is wrong with some channels, by name, as a sentence in which channels with the same
+    fault stand together.
+    """
     names: dict[str, list[str]] = {}
     for name, fault in faults.items():
         names.setdefault(fault, []).append(name)
-    verbs = {fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are " for fault, named in names.items()}
+    verbs = {
+        fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are "
+        for fault, named in names.items()
+    }
     return "; ".join(f"{', '.join(named)} {verbs[fault]}{fault}" for fault, named in names.items())

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conversion between a field of a message, given by its path, and a channel of y or u.
 
-It works on any object with the published field names, so it needs no message package. Arrays of a message may be lists,
-array.array or NumPy arrays.
+It works on any object with the published field names, so it needs no message package. Arrays of a
+message may be lists, array.array or NumPy arrays.
 """
 
 import importlib
@@ -24,11 +24,15 @@ from flight_core.vectors import ChannelError
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
 VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
-SEA_LEVEL_DENSITY = 1.225  # kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
+SEA_LEVEL_DENSITY = (
+    1.225  # kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
+)
 
 
 class Line(NamedTuple):
-    """Channel = sign scale raw + offset. The channel is in SI and radians, the raw value in the autopilot's unit."""
+    """Channel = sign scale raw + offset. The channel is in SI and radians, the raw value in the
+    autopilot's unit.
+    """
 
     sign: int  # +1 or -1
     scale: float  # above 0, units of the channel per unit of the raw value
@@ -46,7 +50,9 @@ def to_raw(channel: float, line: Line) -> float:
 
 
 def get_field(message: Any, path: str) -> Any:
-    """Value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field", where there is none."""
+    """Value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field",
+    where there is none.
+    """
     value = message
     for name, place in STEP.findall(path):
         try:
@@ -59,7 +65,8 @@ def get_field(message: Any, path: str) -> Any:
 
 
 def set_field(message: Any, path: str, value: Any) -> None:
-    """Set the value at a path. A number for an integer field is rounded. Raises ChannelError, reason "field" or "range".
+    """Set the value at a path. A number for an integer field is rounded. Raises ChannelError,
+    reason "field" or "range".
 
     An integer field refuses NaN, infinity and values outside the range of its type.
     """
@@ -68,8 +75,13 @@ def set_field(message: Any, path: str, value: Any) -> None:
         if not math.isfinite(value):
             raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
-    if isinstance(current, np.integer) and not np.iinfo(current).min <= value <= np.iinfo(current).max:
-        raise ChannelError("range", f"{path} cannot be {value!r}, which {current.dtype} does not hold")  # NumPy 1.26 wraps it
+    if (
+        isinstance(current, np.integer)
+        and not np.iinfo(current).min <= value <= np.iinfo(current).max
+    ):
+        raise ChannelError(
+            "range", f"{path} cannot be {value!r}, which {current.dtype} does not hold"
+        )  # NumPy 1.26 wraps it
     parents, _, last = path.rpartition(".")
     parent, ((name, place),) = get_field(message, parents), STEP.findall(last)
     try:
@@ -88,12 +100,16 @@ def _norm(vector: Any) -> float:
 
 
 def _airspeed_of_pressure(pressure: Any) -> float:
-    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; 0 for a negative one, which is noise."""
+    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; 0 for a negative
+    one, which is noise.
+    """
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
 
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a quaternion with members w, x, y, z, or with four elements in this order, as PX4 publishes it."""
+    """(w, x, y, z) of a quaternion with members w, x, y, z, or with four elements in this order, as
+    PX4 publishes it.
+    """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
     quaternion = float(w), float(x), float(y), float(z)
     if not 0.0 < math.hypot(*quaternion) < math.inf:
@@ -102,7 +118,9 @@ def _quaternion(field: Any) -> tuple[float, float, float, float]:
 
 
 def _roll(field: Any) -> float:
-    """Roll angle of a quaternion, rad: the last of the rotations about z, y, x from the world to the body."""
+    """Roll angle of a quaternion, rad: the last of the rotations about z, y, x from the world to
+    the body.
+    """
     w, x, y, z = _quaternion(field)
     return math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
 
@@ -131,21 +149,27 @@ DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
 )
 """Functions from a field to the raw value.
 
-The number itself, the length of a vector, the airspeed of a dynamic pressure, the Euler angles (z, y, x) of a quaternion. The
-angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in NED: the row states it by its sign and offset.
+The number itself, the length of a vector, the airspeed of a dynamic pressure, the Euler angles (z,
+y, x) of a quaternion. The angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in
+NED: the row states it by its sign and offset.
 """
 
 QUATERNION = "wxyz"
 COMPONENTS: Mapping[str, str] = MappingProxyType(
-    {name: "xyz" if name == "norm" else QUATERNION if name.endswith("quaternion") else "" for name in DERIVED}
+    {
+        name: "xyz" if name == "norm" else QUATERNION if name.endswith("quaternion") else ""
+        for name in DERIVED
+    }
 )
 """The members that the field of a function has; none for a number."""
 
 
 def _turned(message: Any, path: str, attitude: str) -> float:
-    """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the world.
+    """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the
+    world.
 
-    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q = (w, r).
+    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q
+    = (w, r).
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
@@ -156,20 +180,26 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 
 
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
-    """Raw value of a row. Raises ChannelError: reason "field" where the field is missing, "finite" where it is not finite."""
+    """Raw value of a row. Raises ChannelError: reason "field" where the field is missing, "finite"
+    where it is not finite.
+    """
     value = get_field(message, path)
     try:
         raw = DERIVED[function](value) if turned_by is None else _turned(message, path, turned_by)
     except (AttributeError, TypeError, ValueError):
         what = f"function {function}" if turned_by is None else turned_by
-        raise ChannelError("field", f"{what} cannot convert {path} of {type(message).__name__}") from None
+        raise ChannelError(
+            "field", f"{what} cannot convert {path} of {type(message).__name__}"
+        ) from None
     if not math.isfinite(raw):
         raise ChannelError("finite", f"{path} = {raw} is not finite")
     return raw
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """The class of "package/msg/Type" or "package/srv/Type". Raises ParameterError with the package to install."""
+    """The class of "package/msg/Type" or "package/srv/Type". Raises ParameterError with the package
+    to install.
+    """
     package, section, kind = name.split("/")
     try:
         module = load(f"{package}.{section}")
@@ -177,16 +207,24 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
         raise ParameterError(f"{name}: {missing(package)}") from None
     message_class = getattr(module, kind, None)
     if not isinstance(message_class, type):
-        raise ParameterError(f"{name}: found no {kind} in the installed {package}, expected another version of {package}")
+        raise ParameterError(
+            f"{name}: found no {kind} in the installed {package}, expected another version of "
+            f"{package}"
+        )
     return message_class
 
 
 def versioned_topic(topic: str, version: int) -> str:
     """The topic of PX4 for a version of its definition, /fmu/.../NAME_vVERSION; other topics stay.
 
-    Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
+    Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS
+    2 message translation node.
     """
-    return VERSION.sub("", topic) + (f"_v{version}" if version else "") if topic.startswith("/fmu/") else topic
+    return (
+        VERSION.sub("", topic) + (f"_v{version}" if version else "")
+        if topic.startswith("/fmu/")
+        else topic
+    )
 
 
 def version_fault(topic: str, message_class: Any) -> str:
@@ -197,12 +235,19 @@ def version_fault(topic: str, message_class: Any) -> str:
     expected = versioned_topic(topic, version)
     definition = f"the installed {message_class.__name__} has version {version}"
     return (
-        "" if topic == expected else f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"
+        ""
+        if topic == expected
+        else f"{topic}: {definition}, whose topic is {expected}: change the map, or install the "
+        "release"
     )
 
 
-def version_faults(topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module) -> list[str]:
-    """`version_fault` of topics and types, for the message packages that are installed; the rest is not known."""
+def version_faults(
+    topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
+) -> list[str]:
+    """`version_fault` of topics and types, for the message packages that are installed; the rest is
+    not known.
+    """
     faults = []
     for topic, kind in dict.fromkeys(topics):
         with suppress(ParameterError):

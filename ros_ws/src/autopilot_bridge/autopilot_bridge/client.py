@@ -17,7 +17,9 @@ from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 ENGAGE = "bridge/engage"
 ENGAGE_BLIND = "bridge/engage_blind"
 WITHDRAW_TIMEOUT = 1.0  # s
-U_TIMEOUT = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
+U_TIMEOUT = (
+    30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
+)
 TRIM_SAMPLES = 20  # equal samples of u in a row: u has reached trim
 
 
@@ -33,18 +35,29 @@ class EngagementClient(Client):
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
     def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> str:
-        """Wait for u at trim and engage the bridge, which activates the controller. Returns the reason of a refusal, or "".
+        """Wait for u at trim and engage the bridge, which activates the controller. Returns the
+        reason of a refusal, or "".
 
-        An engaged bridge takes the request at once: the time of `max_engaged` starts again. `blind`: without regard to the loss
-        of the transmitter. `progress` is called with what the bridge waits for, and with what it lacks once it is engaged. An
-        engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode later.
+        An engaged bridge takes the request at once: the time of `max_engaged` starts again.
+        `blind`: without regard to the loss of the transmitter. `progress` is called with what the
+        bridge waits for, and with what it lacks once it is engaged. An engagement that is not
+        waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode
+        later.
         """
-        self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
+        self._spin_until(
+            lambda: bool(self._received_phases()),
+            "bridge/engagement: not received, expected a running bridge",
+        )
         if self._phases[-1][0] != "ENGAGED":
             self._spin_until(
-                lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", U_TIMEOUT
+                lambda: bool(self._received_u()),
+                "u: not received, expected a controller with y and y_m",
+                U_TIMEOUT,
             )
-            self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
+            self._spin_until(
+                self._at_rest,
+                f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim",
+            )
         self._received_phases().clear()
         try:
             if refusal := self._engage_blind() if blind else self._set_engaged(engaged=True):
@@ -62,17 +75,25 @@ class EngagementClient(Client):
         return ""
 
     def _engage_blind(self) -> str:
-        return bounded(self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message)
+        return bounded(
+            self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message
+        )
 
     def disengage(self) -> str:
         """Disengage the bridge. Returns its reason to refuse, or ""."""
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> str:
-        return bounded(self._call(SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge").message)
+        return bounded(
+            self._call(
+                SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge"
+            ).message
+        )
 
     def _withdraw(self) -> None:
-        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is stopped answers later."""
+        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is
+        stopped answers later.
+        """
         client = self._node.create_client(SetBool, ENGAGE)
         if client.wait_for_service(WITHDRAW_TIMEOUT):
             future = client.call_async(SetBool.Request(data=False))
@@ -93,7 +114,9 @@ class EngagementClient(Client):
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:
-        """Whether the bridge has engaged, or has given up after it began to. Reports from before the request do not count."""
+        """Whether the bridge has engaged, or has given up after it began to. Reports from before
+        the request do not count.
+        """
         phases = [phase for phase, _ in self._received_phases()]
         while phases and phases[0] not in {"ENGAGING", "ENGAGED"}:
             del phases[0], self._phases[0]

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which rows of a channel map hold for a release of an autopilot, by its message definitions.
 
-A row holds where the definition has its field, with the components that its function takes, where its topic has the version of
-the definition (PX4), and where a constant that the source of a condition names is one of the values.
+A row holds where the definition has its field, with the components that its function takes, where
+its topic has the version of the definition (PX4), and where a constant that the source of a
+condition names is one of the values.
 """
 
 import re
@@ -24,16 +25,21 @@ from flight_log.message_definitions import definition, read_definition
 from flight_log.named_vectors import typestore
 
 Types = Mapping[str, tuple[Any, Any]]
-"""Constants (name, type, value) and fields (name, type) by the full name of a message, as of rosbags."""
+"""Constants (name, type, value) and fields (name, type) by the full name of a message, as of
+rosbags."""
 
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
-REQUEST = re.compile(r"^---\s*$", re.MULTILINE)  # what ends the request in the definition of a service
+REQUEST = re.compile(
+    r"^---\s*$", re.MULTILINE
+)  # what ends the request in the definition of a service
 VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
 
 
 class CheckedRow(NamedTuple):
-    """A field that a row of a map reads or sets, and why the row does not hold, by release; empty where it holds."""
+    """A field that a row of a map reads or sets, and why the row does not hold, by release; empty
+    where it holds.
+    """
 
     key: str
     topic: str
@@ -42,12 +48,18 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Message types and those that they contain, of the packages below a folder. Raises ParameterError where it has none."""
-    expected = "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
+    """Message types and those that they contain, of the packages below a folder. Raises
+    ParameterError where it has none.
+    """
+    expected = (
+        "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
+    )
     require(folder.is_dir(), "--definitions", f"{folder}, which is no folder", expected)
     packages = {}
     for path in sorted(folder.rglob("package.xml")):
-        if (match := PACKAGE.search(read_file(path, str(path), "a package.xml"))) and (path.parent / "msg").is_dir():
+        if (match := PACKAGE.search(read_file(path, str(path), "a package.xml"))) and (
+            path.parent / "msg"
+        ).is_dir():
             packages[match[1].decode()] = path.parent
     require(bool(packages), "--definitions", f"{folder} without one", expected)
     types: dict[str, tuple[Any, Any]] = {}
@@ -58,13 +70,18 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
         path = packages.get(package, folder) / section / f"{name}.{section}"
         if kind in types or package not in packages or not path.is_file():
             continue
-        types |= _parsed(read_file(path, str(path), "a message definition").decode(errors="replace"), kind)
-        waiting += [_element(field)[1] for _, field in types[kind][1] if _element(field)[0] is Nodetype.NAME]
+        types |= _parsed(
+            read_file(path, str(path), "a message definition").decode(errors="replace"), kind
+        )
+        waiting += [
+            _element(field)[1] for _, field in types[kind][1] if _element(field)[0] is Nodetype.NAME
+        ]
     return types
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is absent.
+    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is
+    absent.
 
     Raises ParameterError for one of MAVLink without pymavlink.
     """
@@ -86,7 +103,9 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 
 
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
-    """Each field that a map uses, against the definitions of some releases. A definition without a version has version 0."""
+    """Each field that a map uses, against the definitions of some releases. A definition without a
+    version has version 0.
+    """
     releases = list(releases)
     rows = []
     for key, topic, kind, path, components in channel_map.used_fields():
@@ -111,7 +130,9 @@ def _parsed(text: str, kind: str) -> Types:
             return {kind: request}
         return get_types_from_msg(text, kind)
     except (TypesysError, ValueError, LookupError) as error:
-        raise ParameterError(f"{kind}: found a definition that cannot be read ({error}), expected one of ROS 2") from None
+        raise ParameterError(
+            f"{kind}: found a definition that cannot be read ({error}), expected one of ROS 2"
+        ) from None
 
 
 def _element(field: Any) -> tuple[Nodetype, Any]:
@@ -140,17 +161,29 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
-    return "" if components is None or _has(known, field, components) else f"{path}: no {', '.join(components) or 'number'}"
+    return (
+        ""
+        if components is None or _has(known, field, components)
+        else f"{path}: no {', '.join(components) or 'number'}"
+    )
 
 
 def _has(known: Types, field: Any, components: str) -> bool:
-    """Whether a field has components, as members or in an array; without components, whether it is a number."""
+    """Whether a field has components, as members or in an array; without components, whether it is
+    a number.
+    """
     node, content = field
     if node is Nodetype.NAME:
-        return bool(components) and content in known and {*components} <= {name for name, _ in known[content][1]}
+        return (
+            bool(components)
+            and content in known
+            and {*components} <= {name for name, _ in known[content][1]}
+        )
     if node is Nodetype.BASE:
         return not components and content[0] != "string"
-    return bool(components) and (node is Nodetype.SEQUENCE or components != QUATERNION or content[1] == len(QUATERNION))
+    return bool(components) and (
+        node is Nodetype.SEQUENCE or components != QUATERNION or content[1] == len(QUATERNION)
+    )
 
 
 def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) -> str:
@@ -160,5 +193,9 @@ def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) 
         return ""
     values = {constant: value for constant, _, value in types[kind][0]}
     named = [constant for constant in CONSTANT.findall(row.source) if constant in values]
-    wrong = [f"{constant} = {values[constant]}" for constant in named if values[constant] not in row.one_of]
+    wrong = [
+        f"{constant} = {values[constant]}"
+        for constant in named
+        if values[constant] not in row.one_of
+    ]
     return ", ".join(wrong)

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A MAVLink link to an autopilot, as a source and a sink of messages of a channel map.
 
-A thread receives, sends a heartbeat each second, requests the rates of messages and reads parameters. All of these it sends as
-a companion computer of the autopilot. The messages of the map alone have the number of the ground station, because ArduPilot
-takes RC overrides of no other. Its failsafe FS_GCS_ENABL counts overrides as heartbeats of the station; those of a companion do
-not count. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as
-pymavlink has them; ArduPilot, GCS_Common.cpp, handle_rc_channels_override and handle_heartbeat; tried with ArduPlane in SITL.
+A thread receives, sends a heartbeat each second, requests the rates of messages and reads
+parameters. All of these it sends as a companion computer of the autopilot. The messages of the map
+alone have the number of the ground station, because ArduPilot takes RC overrides of no other. Its
+failsafe FS_GCS_ENABL counts overrides as heartbeats of the station; those of a companion do not
+count. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL), common.xml
+and ardupilotmega.xml as pymavlink has them; ArduPilot, GCS_Common.cpp, handle_rc_channels_override
+and handle_heartbeat; tried with ArduPlane in SITL.
 """
 
 import hashlib
@@ -31,8 +33,11 @@ from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-COMPANION = 194  # MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground station,
-# such as 0 or 190, ArduPilot would not forward the station's heartbeats any more (MAVLink_routing.cpp, handle_heartbeat)
+# MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground
+# station,
+COMPANION = 194
+# such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
+# (MAVLink_routing.cpp, handle_heartbeat)
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 ACCEPTED = 0  # MAV_RESULT
 SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
@@ -42,12 +47,14 @@ INVALID = 8  # MAV_AUTOPILOT_INVALID
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
 BEAT = 1.0  # s
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
-SILENCE = 3.0  # s without the autopilot, after which all rates are requested again, and another sender may take its place
+# s without the autopilot, after which all rates are requested again, and another sender may take
+# its place
+SILENCE = 3.0
 READ_AGAIN = 5.0  # s, after which a parameter is requested again: a ground station may have set it
 QUEUE = 256  # messages between two ticks
 TAKEN = (
-    "requested again; a ground station on this link requests rates of its own (MAVProxy: set streamrate -1), or the link is too"
-    " slow: give the bridge a port of its own"
+    "requested again; a ground station on this link requests rates of its own (MAVProxy: set "
+    "streamrate -1), or the link is too slow: give the bridge a port of its own"
 )
 RETRIES = 2  # of a connection by TCP, 1 s each
 POLL = 0.1  # s, the longest wait for a packet
@@ -66,13 +73,17 @@ class ReceivedMessage(NamedTuple):
 
 
 def message_type(name: str) -> Any:
-    """A class with the numeric fields of a message, all zero; `fields` has the names. Raises ParameterError for no message."""
+    """A class with the numeric fields of a message, all zero; `fields` has the names. Raises
+    ParameterError for no message.
+    """
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
 
     definition = dialect.mavlink_map.get(getattr(dialect, f"MAVLINK_MSG_ID_{name}", None))
     if definition is None:
-        raise ParameterError(f"{MAVLINK}/msg/{name}: found no message {name}, expected one of the dialect {DIALECT}")
+        raise ParameterError(
+            f"{MAVLINK}/msg/{name}: found no message {name}, expected one of the dialect {DIALECT}"
+        )
     pairs = zip(definition.fieldnames, definition.fieldtypes, definition.array_lengths, strict=True)
     zeros = {field: _zero(kind) for field, kind, length in pairs if length == 0 and kind != "char"}
 
@@ -91,13 +102,15 @@ def _zero(kind: str) -> Any:
 
 
 class Link:
-    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none.
+    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where
+    there is none.
 
-    Messages of the sender in `AutopilotLock` alone are taken, and over UDP no other address gets messages.
-    `parameters` are names of parameters of the autopilot that are read.
+    Messages of the sender in `AutopilotLock` alone are taken, and over UDP no other address gets
+    messages. `parameters` are names of parameters of the autopilot that are read.
 
-    With a passphrase each message is signed, and messages without a valid signature are refused. Source: MAVLink guide, message
-    signing; the key of a passphrase is that of MAVProxy and Mission Planner.
+    With a passphrase each message is signed, and messages without a valid signature are refused.
+    Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy and Mission
+    Planner.
     """
 
     def __init__(self, config: LinkConfig, parameters: Sequence[str] = ()) -> None:
@@ -121,12 +134,18 @@ class Link:
         except (OSError, ValueError) as error:
             expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
             raise ParameterError(
-                f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
+                f"link.url: found {config.url}, which cannot be opened ({error}), expected "
+                f"{expected}"
             ) from None
-        # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the passphrase then.
-        self._connection.mav = dialect.MAVLink(self._connection, srcSystem=config.system, srcComponent=COMPANION)
+        # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the
+        # passphrase then.
+        self._connection.mav = dialect.MAVLink(
+            self._connection, srcSystem=config.system, srcComponent=COMPANION
+        )
         if config.passphrase_file is not None:
-            passphrase = read_file(Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase").strip()
+            passphrase = read_file(
+                Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase"
+            ).strip()
             self._connection.setup_signing(hashlib.sha256(passphrase).digest())
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
@@ -139,21 +158,27 @@ class Link:
         self.parameters: dict[str, float] = {}  # of the autopilot, as it last told
         self._to_read = tuple(parameters)
         self._to_request = dict(config.rates)
-        self._requested: tuple[str, float] | None = None  # the message whose interval was requested, and when
+        self._requested: tuple[str, float] | None = (
+            None  # the message whose interval was requested, and when
+        )
         self._denied: dict[str, str] = {}
         self._beat = 0.0
         self._alive = 0.0
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
-        self._station_heard: float | None = None  # the ground station with the number of the RC overrides
+        self._station_heard: float | None = (
+            None  # the ground station with the number of the RC overrides
+        )
         self._sending = Lock()
         self._closed = Event()
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
 
     @property
     def conflict(self) -> str:
-        """Who else sends as the autopilot or as the bridge, or a setting without which no engagement works."""
+        """Who else sends as the autopilot or as the bridge, or a setting without which no
+        engagement works.
+        """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
         return "; ".join(filter(None, (self._clash, second)))
 
@@ -166,7 +191,9 @@ class Link:
         self._thread.start()
 
     def send(self, message: Any) -> None:
-        """Send a message of `message_type` to the autopilot, with the number of the ground station."""
+        """Send a message of `message_type` to the autopilot, with the number of the ground
+        station.
+        """
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
         values |= {"target_system": self._config.system, "target_component": AUTOPILOT}
@@ -183,37 +210,63 @@ class Link:
         """What is wrong with the link, or with a message of it."""
         now = time.monotonic()
         if now - max(self._alive, self._began) > SILENCE:
-            silence = f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
+            silence = (
+                f"no message of system {self._config.system} over {self._config.url} for "
+                f"{SILENCE:g} s"
+            )
             return "; ".join(filter(None, (silence, self._refused, self.conflict)))
         names = [name] if name else list(self._config.rates)
         slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
-        refusals = {message: sentence for message, sentence in self._denied.items() if message in names}
-        denied = [sentence for message, sentence in refusals.items() if not self._rates.comes(message, now)]
+        refusals = {
+            message: sentence for message, sentence in self._denied.items() if message in names
+        }
+        denied = [
+            sentence
+            for message, sentence in refusals.items()
+            if not self._rates.comes(message, now)
+        ]
         return "; ".join(filter(None, [self.conflict, *slow, *denied, *([TAKEN] if slow else [])]))
 
     def refusal(self) -> str:
         """Why an engagement would not have the rates of the map, as a sentence."""
         unknown = self._rates.unknown(time.monotonic())
-        return self.problem() or (f"the rate of {', '.join(unknown)} is not known yet" if unknown else "")
+        return self.problem() or (
+            f"the rate of {', '.join(unknown)} is not known yet" if unknown else ""
+        )
 
     def lost(self) -> str:
-        """What ends an engagement, as a sentence: a rate that stays slow, or the silence of the ground station."""
+        """What ends an engagement, as a sentence: a rate that stays slow, or the silence of the
+        ground station.
+        """
         now = time.monotonic()
         limit = self._config.station_silence
-        is_silent = limit is not None and self._station_heard is not None and now - self._station_heard > limit
-        station = f"ground station {self._config.source_system} is silent for {limit:g} s" if is_silent else ""
+        is_silent = (
+            limit is not None
+            and self._station_heard is not None
+            and now - self._station_heard > limit
+        )
+        station = (
+            f"ground station {self._config.source_system} is silent for {limit:g} s"
+            if is_silent
+            else ""
+        )
         return "; ".join(filter(None, (self._rates.lasting(now), station)))
 
     def station(self) -> str:
-        """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a sentence."""
+        """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a
+        sentence.
+        """
         system = self._config.source_system
         limit = self._config.station_silence
         counted = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
         if self._station_heard is None:
             return (
-                f"{counted}, and no such station is heard: it acts after each release, FS_LONG_TIMEOUT after the last override"
+                f"{counted}, and no such station is heard: it acts after each release, "
+                "FS_LONG_TIMEOUT after the last override"
             )
-        watched = "is not watched" if limit is None else f"ends the engagement by {limit:g} s of silence"
+        watched = (
+            "is not watched" if limit is None else f"ends the engagement by {limit:g} s of silence"
+        )
         return f"{counted}: station {system}, which is heard, {watched}"
 
     def _send(self, message: Any, system: int) -> None:
@@ -233,7 +286,10 @@ class Link:
             self._lock.overran(max(0, nanoseconds(now - before - POLL)))
             if now - self._beat >= BEAT:
                 self._beat = now
-                self._send(self._connection.mav.heartbeat_encode(ONBOARD, INVALID, 0, 0, 0), self._config.system)
+                self._send(
+                    self._connection.mav.heartbeat_encode(ONBOARD, INVALID, 0, 0, 0),
+                    self._config.system,
+                )
             self._request(now)
             self._request_parameters(now)
             try:
@@ -246,7 +302,9 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """The next bytes, empty after a silence of POLL, and their sender: over TCP and a serial line the URL."""
+        """The next bytes, empty after a silence of POLL, and their sender: over TCP and a serial
+        line the URL.
+        """
         if not self._connection.select(POLL):
             return b"", ()
         if self._is_udp:
@@ -255,10 +313,13 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """The messages of a packet. Messages in several packets are read from the locked sender alone."""
+        """The messages of a packet. Messages in several packets are read from the locked sender
+        alone.
+        """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
-        # A copy: a forged signature with a late time would make each later one of the autopilot count as replayed.
+        # A copy: a forged signature with a late time would make each later one of the autopilot
+        # count as replayed.
         return self._new_parser(deepcopy(self._connection.mav.signing)).parse_buffer(data) or ()
 
     def _new_parser(self, signing: Any) -> Any:
@@ -268,37 +329,59 @@ class Link:
         return parser
 
     def _signature_fault(self, packet: bytes) -> str:
-        """Why the signature of a packet was refused: 6 bytes of a time, 10 us each, and 6 of a hash (MAVLink guide)."""
+        """Why the signature of a packet was refused: 6 bytes of a time, 10 us each, and 6 of a hash
+        (MAVLink guide).
+        """
         signing = self._connection.mav.signing
         if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
-            return "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
+            return (
+                "messages without a valid signature come: the passphrase differs, or the "
+                "autopilot does not sign"
+            )
         behind = 1e-5 * (signing.timestamp - int.from_bytes(packet[-12:-6], "little"))
-        restart = "the autopilot has started again without the time, which a GPS or a ground station gives"
-        return f"messages with the right passphrase come, signed {behind:.0f} s before the last ones: {restart}"
+        restart = (
+            "the autopilot has started again without the time, which a GPS or a ground "
+            "station gives"
+        )
+        return (
+            f"messages with the right passphrase come, signed {behind:.0f} s before the last "
+            f"ones: {restart}"
+        )
 
     def _take(self, message: Any, address: Address, received_ns: int) -> None:
         name = message.get_type()
         now = time.monotonic()
         system = message.get_srcSystem()
         is_station = name == "HEARTBEAT" and message.type == GCS
-        if system == self._config.source_system and (name in STICKS or (name == "HEARTBEAT" and not is_station)):
+        if system == self._config.source_system and (
+            name in STICKS or (name == "HEARTBEAT" and not is_station)
+        ):
             self._clash = (
-                f"another sender on {self._config.url} has system {system} too, and the autopilot takes its RC overrides:"
+                f"another sender on {self._config.url} has system {system} too, and the "
+                "autopilot takes its RC overrides:"
                 " give it another number, or switch the joystick of a ground station off"
             )
         elif (system, message.get_srcComponent()) == (self._config.system, COMPANION):
             self._clash = f"another bridge is on {self._config.url}: end it"
         elif is_station:
             self.stations.add(system)
-            self._station_heard = now if system == self._config.source_system else self._station_heard
+            self._station_heard = (
+                now if system == self._config.source_system else self._station_heard
+            )
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = self._signature_fault(bytes(message.data))
-        if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
+        if (message.get_srcSystem(), message.get_srcComponent()) != (
+            self._config.system,
+            AUTOPILOT,
+        ) or name == "BAD_DATA":
             return
         if not self._admits(message, address, now):
             return
         if message.get_header().incompat_flags & SIGNED and self._config.passphrase_file is None:
-            self._clash = "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+            self._clash = (
+                "the autopilot signs its messages and drops others: set "
+                "link.passphrase_file in the map"
+            )
         self._alive = now
         if name == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL:
             self._answered(message.result)
@@ -309,11 +392,15 @@ class Link:
             queue.append(ReceivedMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message of the autopilot is from the locked sender. Rates are requested from a new sender."""
+        """Whether a message of the autopilot is from the locked sender. Rates are requested from a
+        new sender.
+        """
         sender = _text(address)
         before = self._lock.address
         now_ns = nanoseconds(now)
-        milliseconds = getattr(message, "time_boot_ms", None) if message.get_type() in self._queues else None
+        milliseconds = (
+            getattr(message, "time_boot_ms", None) if message.get_type() in self._queues else None
+        )
         since_boot_ns = None if milliseconds is None else 1_000_000 * milliseconds
         try:
             self._lock.check(sender, since_boot_ns, now_ns)
@@ -325,7 +412,9 @@ class Link:
         if changed:
             self._parser = self._new_parser(self._connection.mav.signing)
             if before is not None:
-                self._second = f"the autopilot at {sender} is new, or has started again; before: {before}"
+                self._second = (
+                    f"the autopilot at {sender} is new, or has started again; before: {before}"
+                )
                 self._second_at = now
         if changed and self._is_udp:
             with self._sending:
@@ -339,15 +428,33 @@ class Link:
         return True
 
     def _request(self, now: float) -> None:
-        """Request one rate after another, and slow ones again: an answer does not say to which message it belongs."""
+        """Request one rate after another, and slow ones again: an answer does not say to which
+        message it belongs.
+        """
         self._to_request |= self._rates.step(now)
-        if not self._to_request or now - self._alive > SILENCE or (self._requested and now - self._requested[1] < ANSWER):
+        if (
+            not self._to_request
+            or now - self._alive > SILENCE
+            or (self._requested and now - self._requested[1] < ANSWER)
+        ):
             return
         name, rate = next(iter(self._to_request.items()))
         identity = message_type(name).packed.id
         self._requested = name, now
         encode = self._connection.mav.command_long_encode
-        interval = encode(self._config.system, AUTOPILOT, SET_MESSAGE_INTERVAL, 0, identity, 1e6 / rate, 0, 0, 0, 0, 0)
+        interval = encode(
+            self._config.system,
+            AUTOPILOT,
+            SET_MESSAGE_INTERVAL,
+            0,
+            identity,
+            1e6 / rate,
+            0,
+            0,
+            0,
+            0,
+            0,
+        )
         self._send(interval, self._config.system)
 
     def _request_parameters(self, now: float) -> None:
@@ -358,7 +465,9 @@ class Link:
         self._read = now
         for name in self._to_read:
             encode = self._connection.mav.param_request_read_encode
-            self._send(encode(self._config.system, AUTOPILOT, name.encode(), -1), self._config.system)
+            self._send(
+                encode(self._config.system, AUTOPILOT, name.encode(), -1), self._config.system
+            )
 
     def _answered(self, result: int) -> None:
         if self._requested is None:
@@ -368,7 +477,8 @@ class Link:
         rate = self._to_request.pop(name, 0.0)
         if result != ACCEPTED:
             self._denied[name] = (
-                f"the autopilot denied {rate:g} Hz of {name} (MAV_RESULT {result}): ArduPilot grants 0.8 SCHED_LOOP_RATE"
+                f"the autopilot denied {rate:g} Hz of {name} (MAV_RESULT {result}): ArduPilot "
+                "grants 0.8 SCHED_LOOP_RATE"
             )
 
 

@@ -1,15 +1,22 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the messages of a link come at their requested rates. It reads no clock: every instant is an argument, in s."""
+"""Whether the messages of a link come at their requested rates. It reads no clock: every instant is
+an argument, in s.
+"""
 
 from collections import deque
 from collections.abc import Mapping
 
-COUNTED = 2.0  # s over which messages are counted: a host that pauses for half a second does not make a rate slow
+# s over which messages are counted: a host that pauses for half a second does not make a rate slow
+COUNTED = 2.0
 MESSAGES = 4  # counted at least, where COUNTED has fewer
 GRANTED = 0.7  # of a requested rate: below, the rate is slow
-SLOW_ENDS = 2.0  # s: an engagement ends after a slow rate of this length. A rate that is requested again comes back sooner
-REMEMBERED = 20.0  # s after a rate was taken, in which an engagement is refused: MAVProxy requests its own rates every 15 s
+# s: an engagement ends after a slow rate of this length. A rate that is requested again comes back
+# sooner
+SLOW_ENDS = 2.0
+# s after a rate was taken, in which an engagement is refused: MAVProxy requests its own rates every
+# 15 s
+REMEMBERED = 20.0
 REPEATED = 1.0  # s between two requests of a slow rate
 JUDGED = 0.1  # s between two judgements
 PAUSE = 0.4  # s without a judgement: the host paused
@@ -47,13 +54,17 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, str]:
-        """Sentences on messages by name: slow now, or slow less than REMEMBERED ago after a granted rate."""
+        """Sentences on messages by name: slow now, or slow less than REMEMBERED ago after a granted
+        rate.
+        """
         sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
         return {name: sentence for name, sentence in sentences.items() if sentence}
 
     def lasting(self, now: float) -> str:
         """A sentence on messages that are slow for SLOW_ENDS or longer."""
-        lasting = [rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)]
+        lasting = [
+            rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)
+        ]
         return "; ".join([*lasting, f"for {SLOW_ENDS:g} s"]) if lasting else ""
 
     def comes(self, name: str, now: float) -> bool:
@@ -122,7 +133,9 @@ class _Rate:
             self._instants.popleft()
 
     def _present(self) -> float:
-        """The mean rate of the newest messages, Hz: the count still has messages from before a fall."""
+        """The mean rate of the newest messages, Hz: the count still has messages from before a
+        fall.
+        """
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window
         return GAPS / max(self._instants[-1] - self._instants[-1 - GAPS], 1e-3)

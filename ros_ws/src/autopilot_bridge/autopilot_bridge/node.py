@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node, in place of the aircraft node: y from an autopilot and setpoints for u to it, by a channel map."""
+"""The bridge node, in place of the aircraft node: y from an autopilot and setpoints for u to it, by
+a channel map.
+"""
 
 import os
 import time
@@ -50,17 +52,26 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import ENGAGEMENT, EXTERNAL, POSE, PUBLISH, WOULD_SEND, Topic, U, Y
 
-LEFT = "no publisher any more. Where the autopilot flies on, its client may not come back by itself: start its agent again"
+LEFT = (
+    "no publisher any more. Where the autopilot flies on, its client may not come back by "
+    "itself: start its agent again"
+)
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
-RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
+RELEASES_AT_SHUTDOWN = (
+    5  # messages with release values at the end of the node; a single one may be lost
+)
 
-ACTIVATION_TIMEOUT_NS = NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
+ACTIVATION_TIMEOUT_NS = (
+    NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
+)
 
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
 class BridgeNode(FlightNode[BridgeConfig]):
-    """At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends the due messages."""
+    """At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends
+    the due messages.
+    """
 
     def __init__(self) -> None:
         super().__init__("bridge", BridgeConfig)
@@ -71,7 +82,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
         self._began_ns = self._boot_ns()
         if self.simulated is not None:
-            key, cause = f"{self.get_name()}.use_sim_time", "false: an autopilot on MAVLink ticks by its own clock"
+            key, cause = (
+                f"{self.get_name()}.use_sim_time",
+                "false: an autopilot on MAVLink ticks by its own clock",
+            )
             require(self._map.link is None, key, "true", cause)
         named: list[NamedRow] = [
             *self._map.outputs.items(),
@@ -84,11 +98,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
         rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
-        self._link = None if self._map.link is None else mavlink_link.Link(self._map.link, tuple(self._map.parameters))
+        self._link = (
+            None
+            if self._map.link is None
+            else mavlink_link.Link(self._map.link, tuple(self._map.parameters))
+        )
         self._known_stations: set[int] = set()  # systems of ground stations that were told
-        self._overrides_sticks = any(message.topic == RC_OVERRIDE for message in self._map.messages.values())
+        self._overrides_sticks = any(
+            message.topic == RC_OVERRIDE for message in self._map.messages.values()
+        )
         self._conflict = ""  # the topics that have two publishers, as a sentence
-        self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}  # what comes over MAVLink, as named vectors
+        self._recorded: dict[
+            str, tuple[Callable[[bytes], None], Encoder]
+        ] = {}  # what comes over MAVLink, as named vectors
         self._readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
             kind = _message_type(rows[0][1].type)
@@ -99,11 +121,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
-        self._u = self.receive(U, decode, self._bridge.take_u, max_age_ns=self._bridge.max_u_age_ns, lock=self._bridge.u_lock)
+        self._u = self.receive(
+            U,
+            decode,
+            self._bridge.take_u,
+            max_age_ns=self._bridge.max_u_age_ns,
+            lock=self._bridge.u_lock,
+        )
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        self._pose_encoders: dict[tuple[str, ...], Encoder] = {}  # by the names of the fresh channels
+        self._pose_encoders: dict[
+            tuple[str, ...], Encoder
+        ] = {}  # by the names of the fresh channels
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
         self.create_service(SetBool, "~/engage", self._engage)
@@ -123,20 +153,31 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._link.start()
         self.get_logger().info(
             f"map {self._map.name}: "
-            + ("dry run, nothing is sent" if dry_run else f"disengaged, waiting for {self.get_name()}/engage")
+            + (
+                "dry run, nothing is sent"
+                if dry_run
+                else f"disengaged, waiting for {self.get_name()}/engage"
+            )
         )
 
     def _reader(self, topic: Topic) -> PolledSubscription | MavlinkReader:
         if self._link is None or not topic.name.startswith(f"{MAVLINK}/"):
             return self.subscribe(topic, _qos(self._map.topics[topic.name]))
         reader = MavlinkReader(self._link, topic)
-        self._recorded[topic.name] = self.advertise(Topic(topic.name, JointState)), self.encoder(reader.fields)
+        self._recorded[topic.name] = (
+            self.advertise(Topic(topic.name, JointState)),
+            self.encoder(reader.fields),
+        )
         return reader
 
     def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
         kind = _message_type(row.type)
         message = kind.Request() if row.is_service else kind()
-        rows = [(number, channel) for number, channel in enumerate(self._map.inputs.values()) if channel.message == name]
+        rows = [
+            (number, channel)
+            for number, channel in enumerate(self._map.inputs.values())
+            if channel.message == name
+        ]
         try:
             for path, value in row.values.items():
                 set_field(message, path, value)
@@ -147,12 +188,18 @@ class BridgeNode(FlightNode[BridgeConfig]):
             if row.stamped:
                 get_field(message, "header.stamp")
         except ChannelError as error:
-            raise ParameterError(f"map {self._map.name}: messages.{name} of type {row.type}: {error}") from None
+            raise ParameterError(
+                f"map {self._map.name}: messages.{name} of type {row.type}: {error}"
+            ) from None
         if self._link is not None and row.topic.startswith(f"{MAVLINK}/"):
             return OutgoingMessage(MavlinkPublisher(self._link, row.topic), message, row, rows)
         if row.is_service:
-            return OutgoingMessage(ServiceCaller(self.create_client(kind, row.topic)), message, row, rows)
-        publisher = self.create_publisher(type(message), row.topic, _qos(self._map.topics[row.topic]))
+            return OutgoingMessage(
+                ServiceCaller(self.create_client(kind, row.topic)), message, row, rows
+            )
+        publisher = self.create_publisher(
+            type(message), row.topic, _qos(self._map.topics[row.topic])
+        )
         return OutgoingMessage(publisher, message, row, rows)
 
     def period_ns(self) -> int:
@@ -164,7 +211,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
         step_ns = self.clock_step_ns()
         for subscription, rows in self._readers:
             for received in subscription.take():
-                self._read(subscription, rows, received.message, self._arrived_ns(received, now_ns), now_ns, step_ns)
+                self._read(
+                    subscription,
+                    rows,
+                    received.message,
+                    self._arrived_ns(received, now_ns),
+                    now_ns,
+                    step_ns,
+                )
         self._watch_link()
         sample = self._bridge.y(now_ns)
         if sample is None:
@@ -184,25 +238,39 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        if self._pause_ns() <= self._longest_pause_ns:  # else the tick was stopped half-way, and its u is old
+        if (
+            self._pause_ns() <= self._longest_pause_ns
+        ):  # else the tick was stopped half-way, and its u is old
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
 
     def _pause_ns(self) -> int:
-        """Time since the tick before began, also that of a suspended host, in which the clock of the ticks stands still."""
+        """Time since the tick before began, also that of a suspended host, in which the clock of
+        the ticks stands still.
+        """
         return self._boot_ns() - self._began_ns
 
     def _boot_ns(self) -> int:
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if self.simulated is None else self.simulated.time_ns()
+        return (
+            time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+            if self.simulated is None
+            else self.simulated.time_ns()
+        )
 
     def _arrived_ns(self, received: Any, now_ns: int) -> int:
         """The instant of a message that has no stamp, on the clock of the stamps."""
         if not received.received_ns:
             return now_ns + self.clock_step_ns()
-        return int(received.received_ns if self.simulated is None else self.simulated.at(received.received_ns))
+        return int(
+            received.received_ns
+            if self.simulated is None
+            else self.simulated.at(received.received_ns)
+        )
 
     def _disengage_after_pause(self, now_ns: int) -> None:
-        """Disengage where the bridge did not run: the autopilot, or its pilot, may fly on its own law since then."""
+        """Disengage where the bridge did not run: the autopilot, or its pilot, may fly on its own
+        law since then.
+        """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
         if pause_ns > self._longest_pause_ns:
@@ -217,12 +285,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
         now_ns: int,
         step_ns: int,
     ) -> None:
-        """Give the fields of a message to the bridge. The system clock, of which its stamps are, is ahead by `step_ns`."""
+        """Give the fields of a message to the bridge. The system clock, of which its stamps are, is
+        ahead by `step_ns`.
+        """
         if isinstance(subscription, MavlinkReader):
             message = raw
             publish, encoder = self._recorded[subscription.topic.name]
             publish(
-                encoder.encode(arrived_ns, np.array([getattr(raw, field) for field in subscription.fields], dtype=np.float64))
+                encoder.encode(
+                    arrived_ns,
+                    np.array(
+                        [getattr(raw, field) for field in subscription.fields], dtype=np.float64
+                    ),
+                )
             )
         else:
             try:
@@ -233,7 +308,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         for name, row in rows:
             try:
                 if isinstance(row, WatchedRow):
-                    take = self._bridge.take_condition if isinstance(row, ConditionRow) else self._bridge.take_override
+                    take = (
+                        self._bridge.take_condition
+                        if isinstance(row, ConditionRow)
+                        else self._bridge.take_override
+                    )
                     take(name, read_raw(message, row.field, "value"), now_ns)
                     continue
                 stamp_ns = arrived_ns
@@ -251,7 +330,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 try:
                     outgoing.send(now_ns, self._bridge.raw().tolist())
                 except ChannelError as error:
-                    self.get_logger().error(f"messages.{name} not sent: {error}", throttle_duration_sec=2.0)
+                    self.get_logger().error(
+                        f"messages.{name} not sent: {error}", throttle_duration_sec=2.0
+                    )
 
     def _engage(self, request: Any, response: Any) -> Any:
         if request.data:
@@ -274,12 +355,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return response
 
     def _activate(self, active: bool) -> None:
-        """Request that the controller is active: only while engaged, so that its integrals do not wind up."""
+        """Request that the controller is active: only while engaged, so that its integrals do not
+        wind up.
+        """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
             return  # not discovered yet, or u of another node, which has no lifecycle
         transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
-        future = self._controller.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        future = self._controller.call_async(
+            ChangeState.Request(transition=Transition(id=transition))
+        )
         self._activation, self._activation_ns = (future, self.now_ns()) if active else (None, 0)
 
     def _check_activation(self, now_ns: int) -> None:
@@ -290,7 +375,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
             success = self._activation.result().success
             self._activation = None
             if not success:
-                self._bridge.disengage("the controller refused to activate, or was active already: see its log", now_ns)
+                self._bridge.disengage(
+                    "the controller refused to activate, or was active already: see its log", now_ns
+                )
         elif now_ns - self._activation_ns > ACTIVATION_TIMEOUT_NS:
             self._activation = None
             self._bridge.disengage("timed out waiting for the controller to activate", now_ns)
@@ -305,16 +392,27 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        restarted = bool(before) and self._u_sender != before  # it can take less time than the loss of the service
-        if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
-            self._controller_state.call_async(GetState.Request()).add_done_callback(self._deactivate_unengaged)
+        restarted = (
+            bool(before) and self._u_sender != before
+        )  # it can take less time than the loss of the service
+        if (
+            ready
+            and (restarted or not self._controller_ready)
+            and bridge.phase is not Phase.ENGAGED
+        ):
+            self._controller_state.call_async(GetState.Request()).add_done_callback(
+                self._deactivate_unengaged
+            )
         self._controller_ready = ready
         if self._awaits_controller and bridge.phase is Phase.ENGAGED:
             self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
         """Deactivate a controller that was found active: with `ros2 run` it starts so."""
-        if state.result().current_state.id == State.PRIMARY_STATE_ACTIVE and self._bridge.phase is not Phase.ENGAGED:
+        if (
+            state.result().current_state.id == State.PRIMARY_STATE_ACTIVE
+            and self._bridge.phase is not Phase.ENGAGED
+        ):
             self._activate(active=False)
 
     def _log_phase(self) -> None:
@@ -348,7 +446,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             for station in sorted(self._link.stations - self._known_stations):
                 self._known_stations.add(station)
                 self.get_logger().info(
-                    f"link: a ground station beside the bridge, system {station}: it may change mode and rates"
+                    f"link: a ground station beside the bridge, system {station}: it may change "
+                    "mode and rates"
                 )
         if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u.subscription)
@@ -369,20 +468,33 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""
         if isinstance(subscription, MavlinkReader):
-            refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
-            return next(filter(None, (subscription.link.problem(subscription.message_name), *refused)), "no such message comes")
+            refused = (
+                what
+                for what in self.refusals.counts
+                if what.startswith(f"{subscription.topic.name}: ")
+            )
+            return next(
+                filter(None, (subscription.link.problem(subscription.message_name), *refused)),
+                "no such message comes",
+            )
         publishers = self.get_publishers_info_by_topic(subscription.name)
         if not publishers and (fault := version_fault(subscription.name, subscription.topic.type)):
             return f"no publisher. {fault}"
         if not publishers:
             profile = os.environ.get(PROFILE_VARIABLE, "")
-            return f"no publisher. The autopilot's agent needs the same DDS profile, {PROFILE_VARIABLE}={profile}"
+            return (
+                "no publisher. The autopilot's agent needs the same DDS profile, "
+                f"{PROFILE_VARIABLE}={profile}"
+            )
         faults = self.endpoints.mismatches(subscription)
-        refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
+        refused = (
+            what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: ")
+        )
         return next(iter((*faults, *refused)), "no sample of its publisher arrives")
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service.
+        """Also report a topic to which the autopilot subscribes with another type or an
+        incompatible quality of service.
 
         A topic with another publisher ends the engagement.
         """
@@ -394,10 +506,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:
-        """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and both would be flown.
+        """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and
+        both would be flown.
 
-        Checked are the topics that the bridge reads, and the topics of setpoints. Several transmitters may override, and any
-        node may request a mode.
+        Checked are the topics that the bridge reads, and the topics of setpoints. Several
+        transmitters may override, and any node may request a mode.
         """
         read = set()
         for subscription, rows in self._readers:
@@ -405,12 +518,17 @@ class BridgeNode(FlightNode[BridgeConfig]):
             if isinstance(subscription, PolledSubscription) and not overrides_alone:
                 read.add(subscription.name)
         publishers = [self._outgoing[row.message].publisher for row in self._map.inputs.values()]
-        setpoints = {publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)}
+        setpoints = {
+            publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)
+        }
         # two messages may share a topic
         sent = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())
-        counts = {topic: self.count_publishers(topic) - sent[topic] for topic in sorted(read | setpoints)}
+        counts = {
+            topic: self.count_publishers(topic) - sent[topic] for topic in sorted(read | setpoints)
+        }
         conflicts = [
-            f"{topic} has {count} publishers{' beside this bridge' if topic in setpoints else ''}, expected "
+            f"{topic} has {count} "
+            f"publishers{' beside this bridge' if topic in setpoints else ''}, expected "
             f"{'none' if topic in setpoints else 'the autopilot alone'}"
             for topic, count in counts.items()
             if count > (topic not in setpoints)
@@ -419,7 +537,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._watch_link()
 
     def _watch_link(self) -> None:
-        """Tell the bridge what is wrong with topics and link, and the parameters of the autopilot."""
+        """Tell the bridge what is wrong with topics and link, and the parameters of the
+        autopilot.
+        """
         bridge = self._bridge
         link = self._link
         bridge.conflict = self._conflict
@@ -434,9 +554,21 @@ class BridgeNode(FlightNode[BridgeConfig]):
         bridge = self._bridge
         now_ns = self.now_ns()
         refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
-        level = DiagnosticStatus.OK if bridge.phase is Phase.ENGAGED and not bridge.reason else DiagnosticStatus.WARN
+        level = (
+            DiagnosticStatus.OK
+            if bridge.phase is Phase.ENGAGED and not bridge.reason
+            else DiagnosticStatus.WARN
+        )
         sentence = ": ".join(filter(None, (bridge.phase.name, bridge.reason)))
-        return level, sentence, {"phase": bridge.phase.name, "map": self._map.name, "would refuse": refusal or "nothing"}
+        return (
+            level,
+            sentence,
+            {
+                "phase": bridge.phase.name,
+                "map": self._map.name,
+                "would refuse": refusal or "nothing",
+            },
+        )
 
     def close(self) -> None:
         if self._bridge.phase is not Phase.DISENGAGED and self._map.silence.release > 0.0:
@@ -465,7 +597,9 @@ class ServiceCaller:
 class OutgoingMessage:
     """A message to the autopilot and its publisher. Its constant fields are set once."""
 
-    def __init__(self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]) -> None:
+    def __init__(
+        self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]
+    ) -> None:
         self.publisher = publisher
         self.row = row
         self._message = message
@@ -503,7 +637,9 @@ def _qos(row: QosRow) -> QoSProfile:
 
 
 def _require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
-    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the first message only."""
+    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the
+    first message only.
+    """
     if "[" in row.field:
         return
     try:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a controller as constants of C: the header rise_di_parameters.h, and the bytes of struct rise_di_parameters."""
+"""Parameters of a controller as constants of C: the header rise_di_parameters.h, and the bytes of
+struct rise_di_parameters.
+"""
 
 import math
 from collections.abc import Callable
@@ -22,19 +24,25 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import Limits
 from rise_di_controller.schedule import ScheduleParams, airspeed_range
 
-SCALARS = frozenset({"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"})
+SCALARS = frozenset(
+    {"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"}
+)
 """Reals that are no list."""
 
 
 class Constant(NamedTuple):
-    """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a matrix row by row."""
+    """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a
+    matrix row by row.
+    """
 
     name: str
     value: int | tuple[int, ...] | FloatArray
 
 
 class Sizes(NamedTuple):
-    """Dimensions of the exported controller; 0 without an allocation, a feedforward or an observer."""
+    """Dimensions of the exported controller; 0 without an allocation, a feedforward or an
+    observer.
+    """
 
     m: int  # channels
     p: int  # effectors of the allocation
@@ -44,17 +52,46 @@ class Sizes(NamedTuple):
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that are learned or off."""
-    require(isinstance(controller, RiseDiConfig), "controller.law", controller.law, "rise_di: C code exists for this law alone")
+    """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that
+    are learned or off.
+    """
+    require(
+        isinstance(controller, RiseDiConfig),
+        "controller.law",
+        controller.law,
+        "rise_di: C code exists for this law alone",
+    )
     assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
-    require(not controller.vanes, "controller.observer.vanes", "a section", "none: the C code has the observer of y alone")
-    require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
+    require(
+        not controller.vanes,
+        "controller.observer.vanes",
+        "a section",
+        "none: the C code has the observer of y alone",
+    )
+    require(
+        controller.learn is None,
+        "controller.learn",
+        "a section",
+        "none: C code replaces no model in flight",
+    )
     at_trim = controller.schedule is None or not controller.schedule.models
-    require(at_trim, "controller.schedule", "models at other speeds", "none: the C code has those of the trim speed")
+    require(
+        at_trim,
+        "controller.schedule",
+        "models at other speeds",
+        "none: the C code has those of the trim speed",
+    )
     flies = controller.observer is None or controller.observer.part > 0.0
-    require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")
+    require(
+        flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer"
+    )
     some = controller.feedforward is not None and controller.feedforward.inputs is not None
-    require(not some, "controller.feedforward.inputs", "a list", "none: the C code has a feedforward of all inputs")
+    require(
+        not some,
+        "controller.feedforward.inputs",
+        "a list",
+        "none: the C code has a feedforward of all inputs",
+    )
     return controller
 
 
@@ -67,7 +104,9 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
-    """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no limit."""
+    """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no
+    limit.
+    """
     guard = controller.guard()
     law = controller.law_params()
     law_params = controller.tuned_law().params
@@ -82,8 +121,15 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
         "deactivation_holds": int(guard.deactivation_holds),
         "sign": int(controller.sampled_sign()[0]),
     }
-    reals: dict[str, ArrayLike] = {"period": period, "dt_least": DT_RANGE[0] * period, "dt_largest": DT_RANGE[1] * period}
-    reals |= {name: getattr(law, name) for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")}
+    reals: dict[str, ArrayLike] = {
+        "period": period,
+        "dt_least": DT_RANGE[0] * period,
+        "dt_largest": DT_RANGE[1] * period,
+    }
+    reals |= {
+        name: getattr(law, name)
+        for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")
+    }
     reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
     if (allocation := guard.allocation) is not None:
@@ -92,7 +138,11 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
         reals |= _limits("stops", allocation.limits)
     if isinstance(law_params, ScheduleParams):
         least, largest = airspeed_range(law_params)
-        reals |= {"speed": law_params.speed, "airspeed": law_params.airspeed, "time": law_params.time}
+        reals |= {
+            "speed": law_params.speed,
+            "airspeed": law_params.airspeed,
+            "time": law_params.time,
+        }
         reals |= {"V_least": least, "V_largest": largest}
     if guard.nominal is not None:
         names = ("A", "B", "C", "gravity", "inverse", "path_A", "path_gravity", "lead")
@@ -101,7 +151,9 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     if isinstance(law_params, ObserverParams):
         reals |= {name: getattr(law_params, name) for name in ("Phi", "Gamma", "H", "L", "F")}
         reals |= _limits("observer_limits", law_params.limits) | {"fade_rate": law_params.fade_rate}
-    arrays = [Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()]
+    arrays = [
+        Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()
+    ]
     return [*(Constant(name, value) for name, value in integers.items()), *arrays]
 
 
@@ -110,10 +162,14 @@ def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
 
 
 def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
-    """The bytes of struct rise_di_parameters: whole numbers of 64 bits, then the reals without a gap, filled to 8 bytes."""
+    """The bytes of struct rise_di_parameters: whole numbers of 64 bits, then the reals without a
+    gap, filled to 8 bytes.
+    """
     real = np.float32 if float32 else np.float64
     content = b"".join(
-        _finite(value, real).astype(real).tobytes() if isinstance(value, np.ndarray) else np.array(value, np.int64).tobytes()
+        _finite(value, real).astype(real).tobytes()
+        if isinstance(value, np.ndarray)
+        else np.array(value, np.int64).tobytes()
         for _, value in constants(controller)
     )
     return content + bytes(-len(content) % 8)
@@ -134,15 +190,34 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
     def numbers(value: FloatArray) -> str:
         return ", ".join(f"{float(real(x)).hex()}{suffix}" for x in _finite(value, real))
 
-    members = [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in constants(controller)]
-    single = {"MAX_ANGLE": MAX_ANGLE, "INVERSE_PI": INVERSE_PI, "PI_HIGH": PI_HIGH, "PI_LOW": PI_LOW}
-    single |= {"RELAXATION": RELAXATION, "EXCHANGE_LEAST": SMALL, "TIMES": samples.TIMES, "MEMORY": samples.MEMORY}
+    members = [
+        f"    /* {name} */ {_initialiser(name, value, numbers)}"
+        for name, value in constants(controller)
+    ]
+    single = {
+        "MAX_ANGLE": MAX_ANGLE,
+        "INVERSE_PI": INVERSE_PI,
+        "PI_HIGH": PI_HIGH,
+        "PI_LOW": PI_LOW,
+    }
+    single |= {
+        "RELAXATION": RELAXATION,
+        "EXCHANGE_LEAST": SMALL,
+        "TIMES": samples.TIMES,
+        "MEMORY": samples.MEMORY,
+    }
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
         " * SPDX-License-Identifier: Apache-2.0",
         " *",
-        f" * Parameters of the controller of {scenario}, written by `rise-di export`. rise_di.h has units and meaning.",
-        f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; {controller.rate:g} Hz.",
+        (
+            f" * Parameters of the controller of {scenario}, written by `rise-di export`. "
+            "rise_di.h has units and meaning."
+        ),
+        (
+            f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; "
+            f"{controller.rate:g} Hz."
+        ),
         " */",
         "#ifndef RISE_DI_PARAMETERS_H",
         "#define RISE_DI_PARAMETERS_H",
@@ -154,11 +229,17 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
         f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
         f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
-        f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic pressure */",
+        (
+            f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic "
+            "pressure */"
+        ),
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
         f"#define RISE_DI_SAMPLES {SAMPLE_BUFFER_SIZE} /* samples kept of y and of y_m */",
         f"#define RISE_DI_AGREEING {samples.AGREEING} /* samples in a row after a jump of y */",
-        f"#define RISE_DI_FIRST_NS {samples.FIRST_NS} /* after the first y, in which it may jump */",
+        (
+            f"#define RISE_DI_FIRST_NS {samples.FIRST_NS} /* after the first y, in which it may "
+            "jump */"
+        ),
         *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
         f"#define RISE_DI_SWEEPS {SWEEPS}",
         f"#define RISE_DI_HALVINGS {HALVINGS}",
@@ -173,8 +254,12 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]) -> str:
-    """A number, a list in braces; the first and the last list of a nested struct open and close the braces of the struct."""
+def _initialiser(
+    name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]
+) -> str:
+    """A number, a list in braces; the first and the last list of a nested struct open and close the
+    braces of the struct.
+    """
     if isinstance(value, int):
         return str(value)
     if isinstance(value, tuple):
@@ -187,7 +272,8 @@ def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: 
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """String literals of C; a character other than a letter, a digit or one of "_. " as the octal escape of each of its bytes.
+    """String literals of C; a character other than a letter, a digit or one of "_. " as the octal
+    escape of each of its bytes.
 
     Of names from a parameter set none has such a character.
     """
@@ -196,7 +282,11 @@ def _strings(names: tuple[str, ...]) -> str:
 
 def _octal(character: str) -> str:
     plain = character.isascii() and (character.isalnum() or character in "_. ")
-    return character if plain else "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
+    return (
+        character
+        if plain
+        else "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
+    )
 
 
 def _comment(names: tuple[str, ...]) -> str:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Drawn inputs for the proof: calls of a controller with any timing, and single steps from any state."""
+"""Drawn inputs for the proof: calls of a controller with any timing, and single steps from any
+state.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,18 +23,24 @@ from rise_di_controller.guard import DT_RANGE
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import saturate
 
-EPOCH_NS = 1_795_000_000_000_000_000  # start of the drawn stamps: float64 does not resolve 1 ns there
+EPOCH_NS = (
+    1_795_000_000_000_000_000  # start of the drawn stamps: float64 does not resolve 1 ns there
+)
 
 
 def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recording:
-    """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new parameters, deactivation."""
+    """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new
+    parameters, deactivation.
+    """
     rng = np.random.default_rng(seed)
     controller = sets[0]
     m = len(controller.outputs)
     period_ns = controller.guard().period_ns
     unit = controller.law_params().eps
     schedule = controller.schedule
-    airspeed = np.array([0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs])
+    airspeed = np.array(
+        [0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs]
+    )
     recorder = Recorder(sets)
     now_ns = EPOCH_NS
     y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
@@ -53,9 +61,13 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
         with suppress(ChannelError):
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
-                for distance in (0.3, 0.02, 0.0)[2 - int(3.0 * draw[5]) :]:  # closer than a slope of y_m takes, too
+                for distance in (0.3, 0.02, 0.0)[
+                    2 - int(3.0 * draw[5]) :
+                ]:  # closer than a slope of y_m takes, too
                     stamp_m_ns = now_ns - round(period_ns * (late + distance))
-                    recorder.take_y_m(StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns)
+                    recorder.take_y_m(
+                        StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
+                    )
         with suppress(ChannelError):
             if draw[7] < 0.95 and not 0 < silence < 30:
                 late = rng.uniform(-0.05, 0.6) if draw[8] < 0.97 else rng.uniform(-300.0, 30.0)
@@ -77,7 +89,9 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so that they are lost."""
+    """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so
+    that they are lost.
+    """
     m = len(unit)
     off = np.zeros_like(unit)
     while True:
@@ -89,13 +103,17 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Single steps of an engaged controller from drawn states, with the parameters of an index, all computed at once.
+    """Single steps of an engaged controller from drawn states, with the parameters of an index, all
+    computed at once.
 
-    Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9 missed samples.
+    Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9
+    missed samples.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[index].guard().period_ns
-    factor = 10.0 ** (rng.choice([0.0, 0.0, 0.3, 1.0, -1.0], steps) + rng.uniform(-0.05, 0.05, steps))
+    factor = 10.0 ** (
+        rng.choice([0.0, 0.0, 0.3, 1.0, -1.0], steps) + rng.uniform(-0.05, 0.05, steps)
+    )
     dt_ns = np.round(period_ns * factor).astype(np.int64)
     before, y, y_m = _drawn_states(sets[index], rng, dt_ns)
     after = _stepped(sets[index], before, y, y_m, dt_ns)
@@ -133,17 +151,26 @@ def _drawn_states(
     steps = len(dt_ns)
     eps = controller.law_params().eps[:, None]
     scale = np.array(controller.input_scale)[:, None]
-    size = eps * 10.0 ** rng.uniform(-3.0, 2.5, (1, steps)) * 10.0 ** rng.uniform(-1.0, 0.0, (m, steps))
+    size = (
+        eps
+        * 10.0 ** rng.uniform(-3.0, 2.5, (1, steps))
+        * 10.0 ** rng.uniform(-1.0, 0.0, (m, steps))
+    )
     u_size = 10.0 * scale * size
     sizes = {
-        "u": u_size, "u_free": u_size, "u_trim": 0.1 * u_size, "y": eps, "y_m": eps, "e_0": size, "e": size, "integral_e": size,
-        "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1], "feedforward.u": u_size,
+        "u": u_size, "u_free": u_size, "u_trim": 0.1 * u_size, "y": eps, "y_m": eps, "e_0": size,
+        "e": size, "integral_e": size,
+        "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1],
+        "feedforward.u": u_size,
         "feedforward.u_0": u_size, "u_ff": 0.3 * u_size * (controller.feedforward is not None),
     }  # fmt: skip
     if controller.allocation is not None:
         stops = controller.effector_limits()
         sizes["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
-    drawn = {name: sizes.get(name, 0.0) * rng.normal(size=(count, steps)) for name, count in real_groups(controller).items()}
+    drawn = {
+        name: sizes.get(name, 0.0) * rng.normal(size=(count, steps))
+        for name, count in real_groups(controller).items()
+    }
     drawn |= {"sigma": rng.random((1, steps)), "scale": rng.uniform(0.3, 3.0, (m, steps))}
     drawn |= {"feedforward.dt": dt_ns[None] / NANOSECONDS * rng.random((1, steps))}
     drawn |= {"feedforward.ticks": rng.integers(0, 5, (1, steps)).astype(np.float64)}
@@ -151,12 +178,18 @@ def _drawn_states(
     y_m = drawn["y_m"] + 0.1 * size * rng.normal(size=(m, steps))
     y = y_m + drawn["e"] + 0.1 * size * rng.normal(size=(m, steps))
     if controller.schedule is not None:
-        y[list(controller.outputs).index("V")] += controller.schedule.speed * rng.uniform(-1.0, 1.0, steps)
+        y[list(controller.outputs).index("V")] += controller.schedule.speed * rng.uniform(
+            -1.0, 1.0, steps
+        )
     return drawn, y, y_m
 
 
 def _stepped(
-    controller: RiseDiConfig, before: Mapping[str, FloatArray], y: FloatArray, y_m: FloatArray, dt_ns: NDArray[np.int64]
+    controller: RiseDiConfig,
+    before: Mapping[str, FloatArray],
+    y: FloatArray,
+    y_m: FloatArray,
+    dt_ns: NDArray[np.int64],
 ) -> dict[str, FloatArray]:
     """States after a step of the guard, by the functions of the guard over all columns."""
     guard = controller.guard()
@@ -168,7 +201,9 @@ def _stepped(
     zero = np.zeros_like(y)
     state = restored(law.control_law, before)
     u_before = before["u"]
-    held = Measurements(before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before)
+    held = Measurements(
+        before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before
+    )
     missed = np.round(dt / period) - 1.0
     for k in range(round(DT_RANGE[1])):
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
@@ -176,17 +211,25 @@ def _stepped(
     u_ff = before["u_ff"]
     model_state = {}
     if guard.nominal is not None:
-        x, u, dt_before, ticks, u_0 = (before[f"feedforward.{name}"] for name in FeedforwardState._fields)
-        now, u_ff = feedforward.step(FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal))
+        x, u, dt_before, ticks, u_0 = (
+            before[f"feedforward.{name}"] for name in FeedforwardState._fields
+        )
+        now, u_ff = feedforward.step(
+            FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal)
+        )
         u_trim = u_trim + u_ff
-        model_state = {f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()}
+        model_state = {
+            f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()
+        }
     measured = Measurements(y, y_m, zero, u_trim, u_before)
     stepped, u_free = law.control_law.step(state, measured, dt, params)
     last = before.get("effectors")
     u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
     limited = (u != u_free).any(axis=0)
     limits = limits if guard.allocation is None else reached(u_free, u)
-    stepped_limited, u_free_limited, u_limited = law.control_law.limited(state, measured, dt, params, limits)
+    stepped_limited, u_free_limited, u_limited = law.control_law.limited(
+        state, measured, dt, params, limits
+    )
     u, effectors = _given(np.where(limited, u_limited, u), last, dt, guard.allocation)
     after = {
         **before,
@@ -197,17 +240,26 @@ def _stepped(
         **fields(_chosen(limited, stepped_limited, stepped)),
         **model_state,
     }
-    output = {"output.y": y, "output.y_m": y_m, "output.y_m_offset": np.zeros((1, len(dt))), "output.dt": dt[None]}
+    output = {
+        "output.y": y,
+        "output.y_m": y_m,
+        "output.y_m_offset": np.zeros((1, len(dt))),
+        "output.dt": dt[None],
+    }
     return after | {"y": y, "y_m": y_m} | output
 
 
 def _given(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u that the effectors give for a u, and the effectors, both by column; u and None without an allocation."""
+    """The u that the effectors give for a u, and the effectors, both by column; u and None without
+    an allocation.
+    """
     if params is None or before is None:
         return u, None
-    pairs = [allocate(v, last, step, params) for v, last, step in zip(u.T, before.T, dt, strict=True)]
+    pairs = [
+        allocate(v, last, step, params) for v, last, step in zip(u.T, before.T, dt, strict=True)
+    ]
     return np.array([v for _, v in pairs]).T, np.array([effectors for effectors, _ in pairs]).T
 
 

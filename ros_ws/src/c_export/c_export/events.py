@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of a controller in order, as events, with the state after each tick: in flights with faults, and of a log."""
+"""Calls of a controller in order, as events, with the state after each tick: in flights with
+faults, and of a log.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -27,7 +29,17 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD = range(8)
 REFUSALS = 1 << 20  # 20 samples since the last tick, a bit a sample
-INTEGERS = ("published", "refused", "mode", "has_law", "y_stamp_ns", "failsafe_start_ns", "hold_ns", "ramp_ns", "stamp_ns")
+INTEGERS = (
+    "published",
+    "refused",
+    "mode",
+    "has_law",
+    "y_stamp_ns",
+    "failsafe_start_ns",
+    "hold_ns",
+    "ramp_ns",
+    "stamp_ns",
+)
 
 
 NOTHING = np.zeros(0)
@@ -62,7 +74,11 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
     groups |= dict.fromkeys(("y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
     groups |= {"scale": m} if schedule else {}
     groups |= {"z": s, "u_o": m, "sigma": 1} if s else {}
-    groups |= {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1} if n else {}
+    groups |= (
+        {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1}
+        if n
+        else {}
+    )
     groups |= {"feedforward.u_0": m} if n else {}
     return groups | {"output.y": m, "output.y_m": m, "output.y_m_offset": 1, "output.dt": 1}
 
@@ -76,13 +92,17 @@ def real_names(controller: RiseDiConfig) -> list[str]:
 
 
 class Recorder(Controller):
-    """A controller that records its calls and its states. `sets` are the parameters that `retune` may take, the first at first.
+    """A controller that records its calls and its states. `sets` are the parameters that `retune`
+    may take, the first at first.
 
-    `before_tick` is called with the recorder and the instant before each tick, and returns whether the controller is active.
+    `before_tick` is called with the recorder and the instant before each tick, and returns whether
+    the controller is active.
     """
 
     def __init__(
-        self, sets: Sequence[RiseDiConfig], before_tick: Callable[["Recorder", int], bool] = lambda recorder, now_ns: True
+        self,
+        sets: Sequence[RiseDiConfig],
+        before_tick: Callable[["Recorder", int], bool] = lambda recorder, now_ns: True,
     ) -> None:
         super().__init__(sets[0])
         self.sets = sets
@@ -97,7 +117,14 @@ class Recorder(Controller):
         self._add(START)
 
     def _add(
-        self, kind: int, now_ns: int = 0, stamp_ns: int = 0, flag: int = 0, offset_ns: int = 0, y: Any = None, y_m: Any = None
+        self,
+        kind: int,
+        now_ns: int = 0,
+        stamp_ns: int = 0,
+        flag: int = 0,
+        offset_ns: int = 0,
+        y: Any = None,
+        y_m: Any = None,
     ) -> None:
         values = (self._none if value is None else value for value in (y, y_m))
         self._events.append((kind, now_ns, stamp_ns, flag, offset_ns, *values))
@@ -122,7 +149,9 @@ class Recorder(Controller):
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
         return self._note_refusal(super().take_y_m, sample, now_ns)
 
-    def _note_refusal(self, take: Callable[[StampedVector, int], str], sample: StampedVector, now_ns: int) -> str:
+    def _note_refusal(
+        self, take: Callable[[StampedVector, int], str], sample: StampedVector, now_ns: int
+    ) -> str:
         self._refused = 2 * self._refused % REFUSALS
         try:
             lost = take(sample, now_ns)
@@ -150,8 +179,12 @@ class Recorder(Controller):
         self._note_state(None if output is None else output.inputs)
         return output
 
-    def guard_tick(self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool) -> None:
-        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns; None without samples."""
+    def guard_tick(
+        self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
+    ) -> None:
+        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns; None
+        without samples.
+        """
         y = None
         y_m = []
         if sample is None:
@@ -163,14 +196,22 @@ class Recorder(Controller):
             y_m = [StampedVector(stamp_ns, y_m_value)]
             if offset_ns > 0:
                 y_m.append(StampedVector(stamp_ns + offset_ns, y_m_value))
-        self._state, inputs = guard.tick(self._state, now_ns, y, y_m, self._guard, self._law, active)
+        self._state, inputs = guard.tick(
+            self._state, now_ns, y, y_m, self._guard, self._law, active
+        )
         self._note_state(inputs)
 
     def _note_state(self, inputs: TickInputs | None) -> None:
         state = self.state
         y_stamp_ns = 0 if state.y is None else state.y.stamp_ns
         stamp_ns = 0 if inputs is None else inputs.stamp_ns
-        integers = (inputs is not None, self._refused, state.mode, state.law is not None, y_stamp_ns)
+        integers = (
+            inputs is not None,
+            self._refused,
+            state.mode,
+            state.law is not None,
+            y_stamp_ns,
+        )
         times = (state.failsafe_start_ns, state.hold_ns, state.ramp_ns, stamp_ns)
         self._integers.append((*map(int, integers), *times))
         self._refused = 0
@@ -198,10 +239,16 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule, observer, stops."""
+    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule,
+    observer, stops.
+    """
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
-    tight = {"lower": tuple(-value for value in bound), "upper": tuple(bound), "slew": tuple(4.0 * value for value in bound)}
+    tight = {
+        "lower": tuple(-value for value in bound),
+        "upper": tuple(bound),
+        "slew": tuple(4.0 * value for value in bound),
+    }
     changes: list[Mapping[str, Any]] = [
         {"k_g": 0.8 * controller.k_g, "Lambda": tuple(0.9 * value for value in controller.Lambda)},
         {"beta": tuple(0.7 * value for value in controller.beta)},
@@ -233,7 +280,8 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
 def flight_recordings(scenario: Scenario, sets: Sequence[RiseDiConfig]) -> Iterator[Recording]:
     """Flights in one process: as the scenario says, with a tenth of y lost, and with faults.
 
-    Faults: new parameters, y or y_m lost within hold, within ramp and beyond, deactivation, engagement, tight limits.
+    Faults: new parameters, y or y_m lost within hold, within ramp and beyond, deactivation,
+    engagement, tight limits.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
     yield _flown("the flight", scenario, Recorder(sets))
@@ -252,13 +300,22 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
     within_hold = controller.max_age + 0.5 * controller.hold
     in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
     past_ramp = controller.max_age + controller.hold + controller.ramp + 0.2
-    lost = {0.25: ({"y"}, within_hold), 0.35: ({"y_m"}, in_ramp), 0.5: ({"y"}, past_ramp), 0.7: ({"y", "y_m"}, in_ramp)}
+    lost = {
+        0.25: ({"y"}, within_hold),
+        0.35: ({"y_m"}, in_ramp),
+        0.5: ({"y"}, past_ramp),
+        0.7: ({"y", "y_m"}, in_ramp),
+    }
     retuned = {0.05 + 0.9 * k / len(sets): k for k in range(1, len(sets))}
     applied: set[float] = set()
 
     def before(recorder: Recorder, now_ns: int) -> bool:
         t = now_ns / NANOSECONDS
-        silent = [names for part, (names, length) in lost.items() if part * duration <= t < part * duration + length]
+        silent = [
+            names
+            for part, (names, length) in lost.items()
+            if part * duration <= t < part * duration + length
+        ]
         recorder.silent = frozenset().union(*silent)
         for part, index in retuned.items():
             if t >= part * duration and part not in applied:
@@ -273,7 +330,8 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """The parameters of a log and their changes in flight, the ticks of the log, and the number of ticks with the u of the log.
+    """The parameters of a log and their changes in flight, the ticks of the log, and the number of
+    ticks with the u of the log.
 
     Raises ParameterError for parameters in force that the changes of the log do not lead to.
     """
@@ -290,7 +348,9 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             recorder.begin()
         in_force = int(log["parameters"][k])
         while recorder.digest != in_force:
-            unexplained = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
+            unexplained = (
+                f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
+            )
             require(bool(changes), "run", unexplained, "a log with all changes of the parameters")
             sets.append(exportable(vary(recorder.parameters, changes.pop(0))))
             recorder.retune_to(len(sets) - 1)

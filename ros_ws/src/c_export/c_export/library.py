@@ -23,7 +23,9 @@ _POINTER = ctypes.c_void_p
 
 
 class CController:
-    """A controller in C, with the calls of `rise_di_controller.controller.Controller`; p values of u."""
+    """A controller in C, with the calls of `rise_di_controller.controller.Controller`; p values of
+    u.
+    """
 
     def __init__(self, library: Path, p: int) -> None:
         self._p = p
@@ -33,7 +35,8 @@ class CController:
         self._u = np.zeros(p)
         if not self._library.library_start(self._memory):
             raise ParameterError(
-                "the exported code: its compiler does not compute what is written, expected one with its flags"
+                "the exported code: its compiler does not compute what is written, expected one "
+                "with its flags"
             )
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
@@ -47,7 +50,9 @@ class CController:
     def _take(self, is_y: int, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
         sample = np.ascontiguousarray(value, dtype=np.float64)
         integers = (ctypes.c_int64(number) for number in (is_y, stamp_ns, now_ns))
-        return int(self._library.library_take(self._memory, *integers, _POINTER(sample.ctypes.data)))
+        return int(
+            self._library.library_take(self._memory, *integers, _POINTER(sample.ctypes.data))
+        )
 
     def tick(self, now_ns: int, *, active: bool = True) -> tuple[FloatArray, int]:
         """A tick: u, and the mode, -1 where no u is to be sent."""
@@ -62,7 +67,10 @@ class CController:
         before = np.zeros(len(events), dtype=np.int64)  # what the event before a tick is
         before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
         flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
-        integers = [np.ascontiguousarray(values) for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])]
+        integers = [
+            np.ascontiguousarray(values)
+            for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])
+        ]
         reals = [np.ascontiguousarray(ticks[name]) for name in ("y", "y_m")]
         u = np.zeros((len(ticks), self._p))
         addresses = (_POINTER(values.ctypes.data) for values in (*integers, *reals, u))
@@ -71,7 +79,9 @@ class CController:
 
 
 def build_library(code: Path, compiler: Sequence[str], path: Path) -> Path:
-    """Compile exported code of float64 to a shared library for CController. Raises ParameterError."""
+    """Compile exported code of float64 to a shared library for CController. Raises
+    ParameterError.
+    """
     return _shared(code, compiler, "library.c", path)
 
 
@@ -84,34 +94,57 @@ def _shared(code: Path, compiler: Sequence[str], program: str, path: Path) -> Pa
     return path
 
 
-VALUE_REFERENCES = {"y": 0, "y_m": 100, "u": 200, "active": 300, "y_new": 301, "y_m_new": 302, "mode": 400}
+VALUE_REFERENCES = {
+    "y": 0,
+    "y_m": 100,
+    "u": 200,
+    "active": 300,
+    "y_new": 301,
+    "y_m_new": 302,
+    "mode": 400,
+}
 """Value references of the first channel of each group, those of fmu.c."""
 
 
 def model_description(controller: RiseDiConfig, scenario: str) -> str:
-    """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode; a step is a tick."""
+    """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode;
+    a step is a tick.
+    """
     groups = {"y": controller.outputs, "y_m": controller.outputs, "u": controller.effectors}
     variables = []
     for group, names in groups.items():
         for i, name in enumerate(names):
-            attributes = f'name={quoteattr(printable(f"{group}.{name}"))} valueReference="{VALUE_REFERENCES[group] + i}"'
+            attributes = (
+                f"name={quoteattr(printable(f'{group}.{name}'))} "
+                f'valueReference="{VALUE_REFERENCES[group] + i}"'
+            )
             if group == "u":
                 variables.append(
-                    f'<ScalarVariable {attributes} causality="output" variability="discrete"><Real/></ScalarVariable>'
+                    f'<ScalarVariable {attributes} causality="output" '
+                    'variability="discrete"><Real/></ScalarVariable>'
                 )
             else:
                 kind = 'causality="input" variability="discrete"'
-                variables.append(f'<ScalarVariable {attributes} {kind}><Real start="0"/></ScalarVariable>')
+                variables.append(
+                    f'<ScalarVariable {attributes} {kind}><Real start="0"/></ScalarVariable>'
+                )
     for name in ("active", "y_new", "y_m_new"):
-        attributes = f'name="{name}" valueReference="{VALUE_REFERENCES[name]}" causality="input" variability="discrete"'
+        attributes = (
+            f'name="{name}" valueReference="{VALUE_REFERENCES[name]}" '
+            'causality="input" variability="discrete"'
+        )
         variables.append(f'<ScalarVariable {attributes}><Boolean start="true"/></ScalarVariable>')
-    attributes = f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" variability="discrete"'
+    attributes = (
+        f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" '
+        'variability="discrete"'
+    )
     variables.append(f"<ScalarVariable {attributes}><Integer/></ScalarVariable>")
     begin = 2 * len(controller.outputs) + 1
     outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
     model_attributes = (
-        f'modelName={quoteattr(printable(f"RISE-DI {scenario}"))} guid="{controller.digest():012x}" '
+        f"modelName={quoteattr(printable(f'RISE-DI {scenario}'))} "
+        f'guid="{controller.digest():012x}" '
         'generationTool="rise-di export" variableNamingConvention="structured"'
     )
     lines = [
@@ -128,13 +161,22 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def build_fmu(code: Path, compiler: Sequence[str], controller: RiseDiConfig, scenario: str, path: Path) -> Path:
-    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64). Raises ParameterError."""
+def build_fmu(
+    code: Path, compiler: Sequence[str], controller: RiseDiConfig, scenario: str, path: Path
+) -> Path:
+    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64). Raises
+    ParameterError.
+    """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("modelDescription.xml", model_description(controller, scenario))
             archive.write(library, "binaries/linux64/rise_di.so")
-            for part in (code / "rise_di.h", code / "rise_di.c", code / PARAMETERS, SOURCE / "fmu.c"):
+            for part in (
+                code / "rise_di.h",
+                code / "rise_di.c",
+                code / PARAMETERS,
+                SOURCE / "fmu.c",
+            ):
                 archive.write(part, f"sources/{part.name}")
     return path

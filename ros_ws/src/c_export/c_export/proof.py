@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The exported C code, compiled and compared with the Python controller: every u and every state, bit by bit."""
+"""The exported C code, compiled and compared with the Python controller: every u and every state,
+bit by bit.
+"""
 
 import json
 import shlex
@@ -57,12 +59,20 @@ class Comparison(NamedTuple):
     modes_equal: bool  # whether modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
-        """Whether every bit is equal; in float32 whether every mode is equal, and u within FLOAT32_BOUND."""
-        return self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
+        """Whether every bit is equal; in float32 whether every mode is equal, and u within
+        FLOAT32_BOUND.
+        """
+        return (
+            self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
+        )
 
 
-def write_code(controller: RiseDiConfig, scenario: str, folder: Path, *, float32: bool) -> list[Path]:
-    """Write the C code of a controller to a folder, and remove report and unit of the code before. Raises ParameterError."""
+def write_code(
+    controller: RiseDiConfig, scenario: str, folder: Path, *, float32: bool
+) -> list[Path]:
+    """Write the C code of a controller to a folder, and remove report and unit of the code before.
+    Raises ParameterError.
+    """
     with writing("c", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (REPORT, FMU):
@@ -74,18 +84,24 @@ def write_code(controller: RiseDiConfig, scenario: str, folder: Path, *, float32
 
 
 def compilers(named: Sequence[str] = ()) -> list[list[str]]:
-    """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises ParameterError for none."""
-    commands = [_words(command) for command in named] or [[name] for name in COMPILERS if shutil.which(name)]
+    """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises
+    ParameterError for none.
+    """
+    commands = [_words(command) for command in named] or [
+        [name] for name in COMPILERS if shutil.which(name)
+    ]
     if not commands:
         raise ParameterError(
-            f"compiler: found none of {', '.join(COMPILERS)} on the PATH, expected one for the proof; "
-            "--no-proof writes the code without a proof"
+            f"compiler: found none of {', '.join(COMPILERS)} on the PATH, expected one for the "
+            "proof; --no-proof writes the code without a proof"
         )
     return commands
 
 
 def _words(command: str) -> list[str]:
-    """The words of the command of a compiler, as a shell reads them. Raises ParameterError for what is no program."""
+    """The words of the command of a compiler, as a shell reads them. Raises ParameterError for what
+    is no program.
+    """
     expected = "expected the command of a C compiler"
     try:
         words = shlex.split(command)
@@ -100,14 +116,23 @@ class Program:
     """proof.c beside the exported code, compiled in a folder of its own."""
 
     def __init__(
-        self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *, float32: bool = False,
+        self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *,
+        float32: bool = False,
         flags: Sequence[str] = FLAGS, source: str | None = None,
     ) -> None:  # fmt: skip
-        """Compile; `source` replaces the text of rise_di.c. Raises ParameterError with the words of the compiler."""
+        """Compile; `source` replaces the text of rise_di.c. Raises ParameterError with the words of
+        the compiler.
+        """
         self._folder = folder
         self._float32 = float32
         folder.mkdir(parents=True, exist_ok=True)
-        for path in (code / "rise_di.h", code / "rise_di.c", code / PARAMETERS, SOURCE / "proof.c", SOURCE / "counting.h"):
+        for path in (
+            code / "rise_di.h",
+            code / "rise_di.c",
+            code / PARAMETERS,
+            SOURCE / "proof.c",
+            SOURCE / "counting.h",
+        ):
             shutil.copyfile(path, folder / path.name)
         if source is not None:
             (folder / "rise_di.c").write_text(source, encoding="utf-8")
@@ -126,12 +151,18 @@ class Program:
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
         command = ["./proof", "sets", "events", "loaded", "states"]
         try:
-            process = subprocess.run(command, cwd=self._folder, capture_output=True, text=True, check=False)  # noqa: S603 - built here
+            process = subprocess.run(  # noqa: S603 - built here
+                command, cwd=self._folder, capture_output=True, text=True, check=False
+            )
         except OSError as error:
             failure = f"found a program that does not start here ({error.strerror})"
-            raise ParameterError(f"compiler: {failure}, expected a compiler for this machine") from None
+            raise ParameterError(
+                f"compiler: {failure}, expected a compiler for this machine"
+            ) from None
         if process.returncode:
-            raise ParameterError(f"the exported code: {(process.stderr or 'the program failed').strip()[-2000:]}")
+            raise ParameterError(
+                f"the exported code: {(process.stderr or 'the program failed').strip()[-2000:]}"
+            )
         integers = len(INTEGERS)
         reals = len(real_names(self._sets[0]))
         words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, integers + reals)
@@ -143,20 +174,38 @@ class Program:
         names = real_names(self._sets[0])
         m = len(self._sets[0].outputs)
         if len(integers) != recording.ticks:
-            raise ParameterError(f"the exported code: found {len(integers)} ticks of {recording.ticks}, expected each")
-        same = np.hstack([integers == recording.integers, reals.view(np.int64) == recording.reals.view(np.int64)])
+            raise ParameterError(
+                f"the exported code: found {len(integers)} ticks of {recording.ticks}, expected "
+                "each"
+            )
+        same = np.hstack(
+            [integers == recording.integers, reals.view(np.int64) == recording.reals.view(np.int64)]
+        )
         first = None
         if not same.all():
             tick = int(np.flatnonzero(~same.all(axis=1))[0])
             column = int(np.flatnonzero(~same[tick])[0])
-            both = (np.hstack([recording.integers[tick], recording.reals[tick]]), np.hstack([integers[tick], reals[tick]]))
-            first = Difference(tick, (*INTEGERS, *names)[column], float(both[0][column]), float(both[1][column]))
+            both = (
+                np.hstack([recording.integers[tick], recording.reals[tick]]),
+                np.hstack([integers[tick], reals[tick]]),
+            )
+            first = Difference(
+                tick, (*INTEGERS, *names)[column], float(both[0][column]), float(both[1][column])
+            )
         u = recording.reals[:, :m]
         with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
-            parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(np.ptp(u, axis=0), np.finfo(float).tiny)
+            parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(
+                np.ptp(u, axis=0), np.finfo(float).tiny
+            )
         modes_equal = bool((integers == recording.integers).all())
         return Comparison(
-            recording.name, recording.ticks, same.size, int((~same).sum()), first, float(parts.max()), modes_equal
+            recording.name,
+            recording.ticks,
+            same.size,
+            int((~same).sum()),
+            first,
+            float(parts.max()),
+            modes_equal,
         )
 
 
@@ -182,14 +231,18 @@ def prove(
     *,
     float32: bool,
 ) -> Proof:
-    """Compile the code in a folder with each compiler, and compare the states of C with the recordings.
+    """Compile the code in a folder with each compiler, and compare the states of C with the
+    recordings.
 
     With g++ a program whose reals count gives the largest number of operations of a call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
         folder = Path(name)
-        programs = [Program(code, command, sets, folder / str(k), float32=float32) for k, command in enumerate(commands)]
+        programs = [
+            Program(code, command, sets, folder / str(k), float32=float32)
+            for k, command in enumerate(commands)
+        ]
         figures = footprint(code, commands[0], folder)
         counting = None
         if shutil.which("g++") is not None and not float32:
@@ -198,7 +251,9 @@ def prove(
             comparisons += [program.compare(recording) for program in programs]
             printed = (counting or programs[0]).run(recording)[2]
             figures |= {key: max(value, figures.get(key, 0)) for key, value in printed.items()}
-    return Proof(tuple(version(command) for command in commands), tuple(comparisons), figures, float32)
+    return Proof(
+        tuple(version(command) for command in commands), tuple(comparisons), figures, float32
+    )
 
 
 FIGURES = {
@@ -217,22 +272,40 @@ FIGURES = {
 def report(proof: Proof, scenario: str) -> str:
     """The proof as text."""
     precision = "float32" if proof.float32 else "float64"
-    lines = [f"C code of the controller of {scenario}, {precision}, beside the Python controller of rise-di", ""]
+    lines = [
+        (
+            f"C code of the controller of {scenario}, {precision}, beside the Python controller of "
+            "rise-di"
+        ),
+        "",
+    ]
     lines += [f"compiler: {name}, {shlex.join(FLAGS)}" for name in proof.compilers]
     lines.append("")
     several = len(proof.compilers) > 1
     for k, comparison in enumerate(proof.comparisons):
         compiler = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
-        counts = f"{comparison.name}{compiler}: {comparison.ticks} ticks, {comparison.values} values"
+        counts = (
+            f"{comparison.name}{compiler}: {comparison.ticks} ticks, {comparison.values} values"
+        )
         if proof.float32:
-            lines.append(f"{counts}; u within {comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}")
+            lines.append(
+                f"{counts}; u within {comparison.deviation:.2g} of its range, bound "
+                f"{FLOAT32_BOUND:.2g}"
+            )
         else:
             lines.append(f"{counts}, {comparison.differing} differ")
         if comparison.first is not None and not comparison.holds(float32=proof.float32):
             tick, channel, python, c = comparison.first
             lines.append(f"    first in tick {tick}: {channel} is {python!r} in Python, {c!r} in C")
-    lines += ["", *(f"{FIGURES[name]}: {value}" for name, value in sorted(proof.figures.items(), key=_place))]
-    result = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range" if proof.float32 else "every bit is equal"
+    lines += [
+        "",
+        *(f"{FIGURES[name]}: {value}" for name, value in sorted(proof.figures.items(), key=_place)),
+    ]
+    result = (
+        f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range"
+        if proof.float32
+        else "every bit is equal"
+    )
     lines += ["", f"PROVED: {result}" if proof.holds else "NOT PROVED"]
     return "\n".join(lines) + "\n"
 
@@ -245,7 +318,9 @@ def build(command: Sequence[str], folder: Path) -> None:
     """Run a compiler in a folder. Raises ParameterError with what it says."""
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
     if process.returncode:
-        said = (process.stderr or process.stdout).strip()[-2000:] or f"exit status {process.returncode}"
+        said = (process.stderr or process.stdout).strip()[
+            -2000:
+        ] or f"exit status {process.returncode}"
         raise ParameterError(f"{shlex.join(command)}: {said}")
 
 
@@ -256,7 +331,8 @@ def version(compiler: Sequence[str]) -> str:
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Bytes of machine code and constants, and of the stack: the sum of all frames. What is unknown is left out.
+    """Bytes of machine code and constants, and of the stack: the sum of all frames. What is unknown
+    is left out.
 
     No function calls itself, so no chain of calls needs more stack than the sum.
     """
@@ -272,7 +348,9 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         lines = [line.split("\t") for line in usage.read_text(encoding="utf-8").splitlines()]
         known["stack_bytes"] = sum(int(line[1]) for line in lines)
     if (size := shutil.which("size")) is not None:
-        process = subprocess.run([size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - of binutils
+        process = subprocess.run(  # noqa: S603 - of binutils
+            [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True
+        )
         text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
         known |= {"code_bytes": text, "data_bytes": data + bss}
     return known

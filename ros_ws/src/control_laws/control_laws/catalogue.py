@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Catalogue of the compared laws: their measurements, model data, tuned gains, and the initial gains of a search."""
+"""Catalogue of the compared laws: their measurements, model data, tuned gains, and the initial
+gains of a search.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,7 +10,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di_law, self_tuner, super_twisting
+from control_laws import (
+    indi,
+    inversion,
+    l1,
+    lqg,
+    lqi,
+    mackunis,
+    mrac,
+    observed,
+    pi,
+    rise_di_law,
+    self_tuner,
+    super_twisting,
+)
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from rise_di_controller import law as rise
@@ -19,7 +34,8 @@ from rise_di_controller.observer import ObserverParams, with_observer
 Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) for all channels; positive
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
-"""rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the crossover."""
+"""rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the
+crossover."""
 
 INITIAL_CHANNEL_GAINS = {
     "beta": 5.0,
@@ -34,7 +50,8 @@ INITIAL_CHANNEL_GAINS = {
     "rate_drift": 0.5,
     "decay": 5.0,
 }
-"""Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
+"""Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the
+lag of the loop."""
 
 INITIAL_COMMON_GAINS = {
     "softening": 3.0,
@@ -51,8 +68,9 @@ INITIAL_COMMON_GAINS = {
 """Initial gains common to all channels."""
 
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
-"""Noise of the wind, m/s per root s, and the time constant, s, the same for every axis. Dryden's L / V0 at 100 m and 25 m/s is
-4 s vertically and 10 s along the flight; a design gust of 15 m peaks after 0.6 s."""
+"""Noise of the wind, m/s per root s, and the time constant, s, the same for every axis. Dryden's L
+/ V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the flight; a design gust of 15 m peaks
+after 0.6 s."""
 
 
 NONE = "none"
@@ -71,7 +89,9 @@ class Law(NamedTuple):
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    initial: Gains | None = None  # of a search; None: by the lag of the loop and the constants above
+    initial: Gains | None = (
+        None  # of a search; None: by the lag of the loop and the constants above
+    )
     linear: bool = True  # near e = 0
 
 
@@ -83,12 +103,16 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
     gains = {"K": K, "Lambda": K / 4.0}
     gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}
     gains |= {name: np.full((1, 1), value) for name, value in INITIAL_COMMON_GAINS.items()}
-    gains |= {name: np.full((model.wind.shape[1], 1), value) for name, value in INITIAL_WIND_GAINS.items()}
+    gains |= {
+        name: np.full((model.wind.shape[1], 1), value) for name, value in INITIAL_WIND_GAINS.items()
+    }
     return {name: gains[name] for name in law.tuned}
 
 
 def _full_state_laws() -> dict[str, Law]:
-    """Each law of FULL_STATE with the measured state, and with the state relative to the air, from vanes."""
+    """Each law of FULL_STATE with the measured state, and with the state relative to the air, from
+    vanes.
+    """
     entries: dict[str, Law] = {}
     for name, (title, control_law, params, tuned) in FULL_STATE.items():
         measured = partial(control_law, vanes=False)
@@ -101,14 +125,18 @@ def _full_state_laws() -> dict[str, Law]:
 def _over(
     law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
-    """Parameters of an observer with the aircraft's model over a law, from the function for the law's own parameters."""
+    """Parameters of an observer with the aircraft's model over a law, from the function for the
+    law's own parameters.
+    """
     return lambda gains, model: observed.observer_params(
         observed.aircraft_design(gains, model), law_params(gains, model), model, part
     )
 
 
 def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
-    return observed.observer_params(observed.extended_state_design(gains, model), pi.params_of(gains, model), model)
+    return observed.observer_params(
+        observed.extended_state_design(gains, model), pi.params_of(gains, model), model
+    )
 
 
 def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
@@ -124,16 +152,27 @@ _l1, _l1_ff = (_fixed(l1.CONTROL_LAWS[feedforward]) for feedforward in (False, T
 _model = "A, B, f"
 _wind = "A, B, f, wind, lags, noise"
 
-FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]]] = {
+FULL_STATE: dict[
+    str,
+    tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]],
+] = {
     "di": ("dynamic inversion", inversion.control_law, inversion.inversion_params, ("K",)),
-    "di_pi": ("dynamic inversion + PI", inversion.control_law, inversion.inversion_params, ("K", "Lambda")),
+    "di_pi": (
+        "dynamic inversion + PI",
+        inversion.control_law,
+        inversion.inversion_params,
+        ("K", "Lambda"),
+    ),
     "mrac": ("MRAC", mrac.control_law, mrac.mrac_params, ("K", "adaptation", "bias", "leak")),
     "lqi": ("LQI", lqi.control_law, lqi.lqi_params, ("integral", "effort", "fade")),
 }
-"""Title, law, parameters and tuned gains of the laws of the full state; these laws also fly with vanes, relative to the air."""
+"""Title, law, parameters and tuned gains of the laws of the full state; these laws also fly with
+vanes, relative to the air."""
 
 LAWS: dict[str, Law] = {
-    "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di_law.params_of, _rise_gains),
+    "rise": Law(
+        "RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di_law.params_of, _rise_gains
+    ),
     "rise_implicit": Law(
         "RISE-DI, implicit sign",
         "y",
@@ -143,7 +182,9 @@ LAWS: dict[str, Law] = {
         ("K", "Lambda", "beta", "omega"),
         linear=False,
     ),
-    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di_law.params_of, _rise_gains, AIRCRAFT),
+    "rise_ff": Law(
+        "RISE-DI + feedforward", "y", _model, _soft, rise_di_law.params_of, _rise_gains, AIRCRAFT
+    ),
     "rise_observer": Law(
         "RISE-DI + feedforward + observer",
         "y",
@@ -181,9 +222,19 @@ LAWS: dict[str, Law] = {
         INTEGRATORS,
     ),
     "pi": Law("PI", "y", "Omega_ii", _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda")),
-    "pi_ff": Law("PI + feedforward", "y", _model, _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda"), AIRCRAFT),
+    "pi_ff": Law(
+        "PI + feedforward",
+        "y",
+        _model,
+        _fixed(pi.CONTROL_LAW),
+        pi.params_of,
+        ("K", "Lambda"),
+        AIRCRAFT,
+    ),
     "l1": Law("L1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
-    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT),
+    "l1_ff": Law(
+        "L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT
+    ),
     "twisting": Law(
         "super-twisting",
         "y",
@@ -194,9 +245,21 @@ LAWS: dict[str, Law] = {
         linear=False,
     ),
     "mackunis": Law(
-        "MacKunis RISE, filtered difference", "y", "Omega", _filtered, mackunis.mackunis_params, (*_rise_gains, "filter")
+        "MacKunis RISE, filtered difference",
+        "y",
+        "Omega",
+        _filtered,
+        mackunis.mackunis_params,
+        (*_rise_gains, "filter"),
     ),
-    "mackunis_ideal": Law("MacKunis RISE, perfect y_dot", "y, y_dot", "Omega", _ideal, mackunis.mackunis_params, _rise_gains),
+    "mackunis_ideal": Law(
+        "MacKunis RISE, perfect y_dot",
+        "y, y_dot",
+        "Omega",
+        _ideal,
+        mackunis.mackunis_params,
+        _rise_gains,
+    ),
     "self_tuner": Law(
         "indirect self-tuner",
         "y",
@@ -206,5 +269,12 @@ LAWS: dict[str, Law] = {
         ("K", "Lambda", "filter", "memory", "prior_A", "prior_Omega", "prior_bias"),
         linear=False,
     ),
-    "indi": Law("INDI", "y, actuators", "Omega", indi.control_law, indi.indi_params, ("K", "bandwidth", "share")),
+    "indi": Law(
+        "INDI",
+        "y, actuators",
+        "Omega",
+        indi.control_law,
+        indi.indi_params,
+        ("K", "bandwidth", "share"),
+    ),
 } | _full_state_laws()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation of the inputs in turn, open loop and without control: doublets and a multisine, for an identification."""
+"""Excitation of the inputs in turn, open loop and without control: doublets and a multisine, for an
+identification.
+"""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -41,10 +43,12 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 
     With tau = elapsed - begin in widths w of an input:
 
-        +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)                              two opposite doublets
-        sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)       a multisine
+        +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)  two opposite doublets
+        sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
+            a multisine
 
-    A doublet and the multisine have the mean 0: a rate in proportion to u leaves no attitude behind.
+    A doublet and the multisine have the mean 0: a rate in proportion to u leaves no attitude
+    behind.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin
@@ -58,12 +62,18 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
     return xp.where((turns >= 0.0) & (turns < 1.0), waves, doublets)
 
 
-def multisine(period: float, lowest: float, highest: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1; shapes (h,).
+def multisine(
+    period: float, lowest: float, highest: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1;
+    shapes (h,).
 
-    phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
+    phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE Trans. Information
+    Theory 16(1), 1970.
     """
-    harmonic = np.arange(max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64)
+    harmonic = np.arange(
+        max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64
+    )
     k = np.arange(1, len(harmonic) + 1)
     phase = -np.pi * k * (k - 1) / len(k)
     turns = np.linspace(0.0, 1.0, 64 * int(harmonic[-1]), endpoint=False)
@@ -77,7 +87,11 @@ def _engage(measured: Measurements, params: ExcitationParams) -> ExcitationState
 
 
 def _limited(
-    state: ExcitationState, measured: Measurements, dt: Array, params: ExcitationParams, limits: Limits
+    state: ExcitationState,
+    measured: Measurements,
+    dt: Array,
+    params: ExcitationParams,
+    limits: Limits,
 ) -> tuple[ExcitationState, Array, Array]:
     elapsed = state.elapsed + dt
     u = measured.u_trim + params.amplitude * signal(elapsed, params)
@@ -85,7 +99,9 @@ def _limited(
     return after, u, saturate(u, measured.u_before, dt, limits)
 
 
-def _retune(state: ExcitationState, old: ExcitationParams, new: ExcitationParams) -> ExcitationState:
+def _retune(
+    state: ExcitationState, old: ExcitationParams, new: ExcitationParams
+) -> ExcitationState:
     return state
 
 
@@ -100,7 +116,9 @@ class ExcitationConfig(ControllerConfig):
     period: Positives = Field(description="period of the multisine of each input, s")
     lowest: Positives = Field(description="lowest frequency of each multisine, Hz")
     highest: Positives = Field(description="highest frequency of each multisine, Hz")
-    pause: NonNegative = Field(description="time before each input's excitation, and after the last one, s")
+    pause: NonNegative = Field(
+        description="time before each input's excitation, and after the last one, s"
+    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
@@ -113,13 +131,30 @@ class ExcitationConfig(ControllerConfig):
             require_length(key, getattr(self, key), self.inputs)
         nyquist = self.rate / 2.0
         for i, name in enumerate(self.inputs):
-            low, high = ((limit or (np.inf,) * len(self.inputs))[i] for limit in (self.lower, self.upper))
+            low, high = (
+                (limit or (np.inf,) * len(self.inputs))[i] for limit in (self.lower, self.upper)
+            )
             room = min(abs(low), abs(high))
             slowest = self.lowest[i]
             fastest = self.highest[i]
-            require(self.amplitude[i] <= room, f"amplitude[{i}]", self.amplitude[i], f"at most {room:g}, the limits of {name}")
-            require(slowest <= fastest, f"lowest[{i}]", slowest, f"at most highest[{i}] = {fastest:g} Hz")
-            require(fastest < nyquist, f"highest[{i}]", fastest, f"below half the rate of the law, {nyquist:g} Hz")
+            require(
+                self.amplitude[i] <= room,
+                f"amplitude[{i}]",
+                self.amplitude[i],
+                f"at most {room:g}, the limits of {name}",
+            )
+            require(
+                slowest <= fastest,
+                f"lowest[{i}]",
+                slowest,
+                f"at most highest[{i}] = {fastest:g} Hz",
+            )
+            require(
+                fastest < nyquist,
+                f"highest[{i}]",
+                fastest,
+                f"below half the rate of the law, {nyquist:g} Hz",
+            )
 
     @property
     def duration(self) -> float:
@@ -129,7 +164,10 @@ class ExcitationConfig(ControllerConfig):
     @cached_property
     def _each(self) -> list[float]:
         """Times of the inputs, pause included, s."""
-        return [DOUBLETS * width + period + self.pause for width, period in zip(self.width, self.period, strict=True)]
+        return [
+            DOUBLETS * width + period + self.pause
+            for width, period in zip(self.width, self.period, strict=True)
+        ]
 
     def control_law(self) -> ControlLaw:
         """The excitation."""
@@ -137,9 +175,13 @@ class ExcitationConfig(ControllerConfig):
 
     def law_params(self) -> Any:
         """The arrays of the excitation."""
-        waves = [multisine(*band) for band in zip(self.period, self.lowest, self.highest, strict=True)]
+        waves = [
+            multisine(*band) for band in zip(self.period, self.lowest, self.highest, strict=True)
+        ]
         table = np.zeros((3, max(len(harmonic) for harmonic, _, _ in waves), len(waves)))
         for i, wave in enumerate(waves):
             table[:, : len(wave[0]), i] = wave
         begin = self.pause + np.cumsum([0.0, *self._each[:-1]])
-        return ExcitationParams(np.array(self.amplitude), np.array(self.width), begin, np.array(self.period), *table)
+        return ExcitationParams(
+            np.array(self.amplitude), np.array(self.width), begin, np.array(self.period), *table
+        )

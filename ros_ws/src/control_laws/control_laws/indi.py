@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Incremental nonlinear dynamic inversion (INDI) from y, y_m, the measured actuator positions and the nominal Omega."""
+"""Incremental nonlinear dynamic inversion (INDI) from y, y_m, the measured actuator positions and
+the nominal Omega.
+"""
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, campaign_law, filter_gain, params_of_gains, saturate
+from control_laws.nominal_model import (
+    NominalModel,
+    campaign_law,
+    filter_gain,
+    params_of_gains,
+    saturate,
+)
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.params import ControllerConfig
@@ -30,17 +38,20 @@ class IndiState(NamedTuple):
 def control_law(model: NominalModel) -> ControlLaw:
     """A tick inverts the increment of y_dot only; the measured y_dot contains the model error.
 
-        y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),  a = 1 - exp(-bandwidth dt)
+        y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),
+            a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    The two filters are the same, so y_dot_f and position_f belong to the same instant. There is no integral, so no windup.
-    Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon,
-    JGCD 39(3), 2016, for the filters.
+    The two filters are the same, so y_dot_f and position_f belong to the same instant. There is no
+    integral, so no windup. Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J.
+    J. Smeur, Q. P. Chu, G. C. H. E. de Croon, JGCD 39(3), 2016, for the filters.
     """
     inverse = model.inverse
 
     def engage(measured: Measurements, params: IndiParams) -> IndiState:
-        return IndiState(measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position)
+        return IndiState(
+            measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position
+        )
 
     def limited(
         state: IndiState, measured: Measurements, dt: Array, params: IndiParams, limits: Limits

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dynamic inversion from the full state x (or x_air): cancels the nominal model and places the poles of the error."""
+"""Dynamic inversion from the full state x (or x_air): cancels the nominal model and places the
+poles of the error.
+"""
 
 from typing import NamedTuple
 
@@ -30,9 +32,10 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
 
         u = Omega^-1 (y_m_dot - C (A x + f(x)) - K (e + Lambda integral of e))
 
-    Without actuators e_dot = -K (e + Lambda integral of e) + C (f of the aircraft - f of the model), for the nominal A and B.
-    The integral is a trapezoid with conditional integration (anti-windup). Source: B. L. Stevens, F. L. Lewis, E. N. Johnson,
-    "Aircraft Control and Simulation", 5.8.
+    Without actuators e_dot = -K (e + Lambda integral of e) + C (f of the aircraft - f of the
+    model), for the nominal A and B. The integral is a trapezoid with conditional integration
+    (anti-windup). Source: B. L. Stevens, F. L. Lewis, E. N. Johnson, "Aircraft Control and
+    Simulation", 5.8.
     """
     drift = model.C @ model.A
     gravity = model.C @ model.gravity
@@ -40,7 +43,11 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     inverse = model.inverse
 
     def limited(
-        state: ErrorIntegral, measured: Measurements, dt: Array, params: InversionParams, limits: Limits
+        state: ErrorIntegral,
+        measured: Measurements,
+        dt: Array,
+        params: InversionParams,
+        limits: Limits,
     ) -> tuple[ErrorIntegral, Array, Array]:
         x = state_of(measured, vanes=vanes)
         e = measured.y - measured.y_m
@@ -51,7 +58,13 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         u_free = measured.u_trim + inverse @ nu
         u, excess = saturate(u_free, measured, dt, limits)
         effect = -params.K * params.Lambda * increment
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ excess)), u_free, u
+        return (
+            ErrorIntegral(
+                e, conditional_integration(state.integral_e, integral_e, effect, Omega @ excess)
+            ),
+            u_free,
+            u,
+        )
 
     return campaign_law(ErrorIntegral, start_integral, limited)
 

@@ -16,7 +16,8 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 ADAPTATION_POLE = 1.0
-"""1/s, of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K corrects the rest."""
+"""1/s, of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K
+corrects the rest."""
 
 
 class L1Params(NamedTuple):
@@ -41,16 +42,17 @@ class L1State(NamedTuple):
 def _control_law(*, feedforward: bool) -> ControlLaw:
     """L1 with piecewise-constant adaptation.
 
-        y_hat     = y_p + dt Omega u_p                                       u_p, y_p of the previous tick
-        sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
+        y_hat     = y_p + dt Omega u_p  u_p, y_p of the previous tick
+        sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a  a = ADAPTATION_POLE
         sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
         u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
 
-    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels the rest of y_hat - y in
-    a tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with `feedforward` u_r = u_trim, where u_trim holds the reference
-    input. sigma_r is the part of sigma already cancelled by u_r. At engagement sigma_f = -K e, so that u = u_r (bumpless
-    transfer); retuning at y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after saturation. Source: N.
-    Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels
+    the rest of y_hat - y in a tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with
+    `feedforward` u_r = u_trim, where u_trim holds the reference input. sigma_r is the part of sigma
+    already cancelled by u_r. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer);
+    retuning at y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after
+    saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measured: Measurements, params: L1Params) -> L1State:
@@ -66,9 +68,13 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         error = state.y_before + dt * state.y_dot_u - measured.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
         sigma_hat = -a * xp.exp(-a * dt) / filter_gain(a, dt) * error
-        u_r = measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot
+        u_r = (
+            measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot
+        )
         sigma_r = measured.y_m_dot - params.Omega @ u_r
-        sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
+        sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (
+            sigma_hat - sigma_r - state.sigma_f
+        )
         u_free = u_r - params.inverse @ (params.K * e + sigma_f)
         u, _ = saturate(u_free, measured, dt, limits)
         return L1State(e, measured.y, params.Omega @ u, sigma_hat, sigma_f), u_free, u
@@ -94,7 +100,9 @@ class L1Config(ControllerConfig):
     """The controller under L1 adaptive output control."""
 
     K: Positives = Field(description="proportional gain, 1/s")
-    bandwidth: Positives = Field(description="bandwidths of the low-pass filter of the estimate, rad/s")
+    bandwidth: Positives = Field(
+        description="bandwidths of the low-pass filter of the estimate, rad/s"
+    )
     Omega: Numbers = Field(description="nominal Omega = C B, a row an output")
 
     def check_law(self) -> None:
@@ -102,12 +110,24 @@ class L1Config(ControllerConfig):
         for key in ("K", "bandwidth"):
             require_length(key, getattr(self, key), self.outputs)
         m = len(self.outputs)
-        require(len(self.Omega) == m * m, "Omega", f"{len(self.Omega)} values", f"{m * m}: {m} rows of {m}")
+        require(
+            len(self.Omega) == m * m,
+            "Omega",
+            f"{len(self.Omega)} values",
+            f"{m * m}: {m} rows of {m}",
+        )
         try:
             D = [int(sign) for sign in signs(np.reshape(self.Omega, (m, m)))]
         except DecompositionError as error:
-            raise ParameterError(f"Omega: found a matrix without a D ({error}), expected D = {list(self.D)}") from None
-        require(list(self.D) == D, "Omega", f"a matrix with D = {D}", f"D = {list(self.D)}, the controller's D")
+            raise ParameterError(
+                f"Omega: found a matrix without a D ({error}), expected D = {list(self.D)}"
+            ) from None
+        require(
+            list(self.D) == D,
+            "Omega",
+            f"a matrix with D = {D}",
+            f"D = {list(self.D)}, the controller's D",
+        )
 
     def control_law(self) -> ControlLaw:
         """L1, with the feedforward if any."""

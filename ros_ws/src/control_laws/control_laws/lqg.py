@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic Gaussian control (LQG): the trim corrected by the observer, and no further feedback."""
+"""Linear-quadratic Gaussian control (LQG): the trim corrected by the observer, and no further
+feedback.
+"""
 
 from typing import NamedTuple
 
@@ -47,7 +49,12 @@ class LqgConfig(ControllerConfig):
 
     def check_law(self) -> None:
         """The observer is the law."""
-        require(self.observer is not None, "observer", "none", "a section: the observer is the feedback of lqg")
+        require(
+            self.observer is not None,
+            "observer",
+            "none",
+            "a section: the observer is the feedback of lqg",
+        )
 
     def control_law(self) -> ControlLaw:
         """The law extended by the observer."""

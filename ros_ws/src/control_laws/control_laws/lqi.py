@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LQI: model following by linear-quadratic design with integral action, from the full state x (or x_air) and y_m."""
+"""LQI: model following by linear-quadratic design with integral action, from the full state x (or
+x_air) and y_m.
+"""
 
 from typing import NamedTuple
 
@@ -23,7 +25,8 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 LEAK = 0.01
-"""1/s, decay of the angles and of y_m in the design model: modes out of reach of inputs and cost have to be stable."""
+"""1/s, decay of the angles and of y_m in the design model: modes out of reach of inputs and cost
+have to be stable."""
 
 
 class LqiParams(NamedTuple):
@@ -33,10 +36,11 @@ class LqiParams(NamedTuple):
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
-    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x relative to the air.
+    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x
+    relative to the air.
 
-    The integral is a trapezoid with conditional integration (anti-windup): integration of channel i stops while u_i is
-    saturated and the increment has the sign of the excess.
+    The integral is a trapezoid with conditional integration (anti-windup): integration of channel i
+    stops while u_i is saturated and the increment has the sign of the excess.
     """
 
     def limited(
@@ -47,13 +51,26 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         none = xp.zeros_like(e)
-        z = xp.concat([state_of(measured, vanes=vanes), measured.y_m + none, measured.y_m_dot + none, integral_e])
+        z = xp.concat(
+            [
+                state_of(measured, vanes=vanes),
+                measured.y_m + none,
+                measured.y_m_dot + none,
+                integral_e,
+            ]
+        )
         u_free = measured.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
         u, excess = saturate(u_free, measured, dt, limits)
         m = e.shape[0]
-        integral_gain = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
+        integral_gain = xp.stack(
+            [params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)]
+        )
         effect = -integral_gain * increment
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, excess)), u_free, u
+        return (
+            ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, excess)),
+            u_free,
+            u,
+        )
 
     return campaign_law(ErrorIntegral, start_integral, limited)
 
@@ -65,14 +82,17 @@ class LqiConfig(ControllerConfig):
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The nominal aircraft with the reference and the integral of e, sampled with u held over a period: F, G and E.
+    """The nominal aircraft with the reference and the integral of e, sampled with u held over a
+    period: F, G and E.
 
-    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes (n + 3 m, n + 3 m), (n + 3 m, m) and (2 m, n + 3 m).
+    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes (n + 3 m, n + 3 m), (n + 3
+    m, m) and (2 m, n + 3 m).
 
         x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
-    Angles integrate the controlled rates: with the true rows the integral of e would not be controllable.
+    Angles integrate the controlled rates: with the true rows the integral of e would not be
+    controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]
@@ -94,19 +114,23 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """The gain for the least sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
+    """The gain for the least sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of
+    weights: (m, n + 3 m, N).
 
-        Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
+        Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
+            q the integral of e
 
     Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) at the cost of an input of unit
-    response, `fade` (1, N), 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for model following;
-    B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
+    response, `fade` (1, N), 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for
+    model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
     """
     size = (model.C @ model.size)[:, None]
     solved = []
     for k, fade in enumerate(gains["fade"][0]):
         F, G, E = design(model, float(fade))
-        weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
+        weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(
+            size[:, 0] ** 2, 2
+        )
         R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
         solved.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
     return LqiParams(np.stack(solved, axis=-1))

@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and optionally a perfect y_dot."""
+"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and
+optionally a perfect y_dot.
+"""
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, campaign_law, conditional_integration, filter_gain, saturate
+from control_laws.nominal_model import (
+    NominalModel,
+    campaign_law,
+    conditional_integration,
+    filter_gain,
+    saturate,
+)
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits
@@ -34,13 +42,14 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     """The law with e_dot in the sign term.
 
         r          = e_dot + Lambda e
-        Pi        += dt beta clip(r / eps, -1, 1)              the sign, softened: measured r is noisy
+        Pi        += dt beta clip(r / eps, -1, 1)  the sign, softened: measured r is noisy
         integral_e += dt (e + e_p) / 2
         u          = -Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
 
-    Then u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect derivative of C x; else
-    a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
-    Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, with the matrices of this module.
+    Then u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect
+    derivative of C x; else a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt
+    - e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010,
+      with the matrices of this module.
     """
     Omega = model.Omega
     inverse = model.inverse
@@ -51,7 +60,11 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         return MacKunisState(e, e, zero, zero, zero)
 
     def limited(
-        state: MacKunisState, measured: Measurements, dt: Array, params: MacKunisParams, limits: Limits
+        state: MacKunisState,
+        measured: Measurements,
+        dt: Array,
+        params: MacKunisParams,
+        limits: Limits,
     ) -> tuple[MacKunisState, Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
@@ -74,7 +87,8 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
-    """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N), rad/s.
+    """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot,
+    filter (1, N), rad/s.
 
     eps = beta / K softening: inside eps the sign adds K / softening to K.
     """

@@ -4,7 +4,13 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, campaign_law, params_of_gains, saturate, state_of
+from control_laws.nominal_model import (
+    NominalModel,
+    campaign_law,
+    params_of_gains,
+    saturate,
+    state_of,
+)
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits
@@ -26,16 +32,19 @@ class MracState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
-    """Model-reference adaptive inversion (MRAC) from measured x, with `vanes` relative to the air, and the nominal model.
+    """Model-reference adaptive inversion (MRAC) from measured x, with `vanes` relative to the air,
+    and the nominal model.
 
         phi = [x / size, 1],  W (m, n + 1) per aircraft, W(0) = 0
         u   = Omega^-1 (y_m_dot - C (A x + f(x)) - K e - W phi)
-        W  += dt (gamma e phi' - leak W),  gamma = adaptation in the columns of x, bias in the column of 1
+        W  += dt (gamma e phi' - leak W),
+            gamma = adaptation in the columns of x, bias in the column of 1
 
-    the inversion of the nominal model, with weights adapted to the model error. V = e'e / 2 + sum W~^2 / (2 gamma) falls
-    with e'K e if the model error is linear in phi and leak is 0. The leak (sigma modification) bounds W under noise.
-    Anti-windup: a saturated channel does not adapt. Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control",
-    ch. 9 to 11; P. A. Ioannou, P. V. Kokotovic, Automatica 20(5), 1984, for the leak.
+    the inversion of the nominal model, with weights adapted to the model error. V = e'e / 2 + sum
+    W~^2 / (2 gamma) falls with e'K e if the model error is linear in phi and leak is 0. The leak
+    (sigma modification) bounds W under noise. Anti-windup: a saturated channel does not adapt.
+    Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control", ch. 9 to 11; P. A. Ioannou, P.
+    V. Kokotovic, Automatica 20(5), 1984, for the leak.
     """
     drift = model.C @ model.A
     gravity = model.C @ model.gravity
@@ -54,7 +63,13 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         x = state_of(measured, vanes=vanes)
         e = measured.y - measured.y_m
         phi = xp.concat([x / size, xp.ones_like(x[:1])])
-        nu = measured.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state.W * phi[None, :, :], axis=1)
+        nu = (
+            measured.y_m_dot
+            - drift @ x
+            - gravity @ xp.sin(x)
+            - params.K * e
+            - xp.sum(state.W * phi[None, :, :], axis=1)
+        )
         u_free = measured.u_trim + inverse @ nu
         u, excess = saturate(u_free, measured, dt, limits)
         free = xp.where(excess == 0.0, xp.ones_like(e), xp.zeros_like(e))

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and the common parts of laws: saturation of u, anti-windup of integrals.
+"""The nominal model of a model-based law, and the common parts of laws: saturation of u,
+anti-windup of integrals.
 
 Channels are in the law's order, states in the airframe's.
 """
@@ -17,14 +18,17 @@ from rise_di_controller.saturation import Limits
 
 
 class NominalModel(NamedTuple):
-    """The nominal aircraft, SI, and the loop around the aircraft. The docstring of a law names the fields in use."""
+    """The nominal aircraft, SI, and the loop around the aircraft. The docstring of a law names the
+    fields in use.
+    """
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
     wind: FloatArray  # (n, G), contribution of 1 m/s of wind along an axis to x_dot
-    noise: FloatArray  # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score without noise
+    # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score without noise
+    noise: FloatArray
     kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, e.g. theta, else 0
     size: FloatArray  # (n,) unit of a state in adaptation and weights: 1 m/s or 0.1 rad (/s)
     input_scale: FloatArray  # (m,) u per scaled input
@@ -49,10 +53,14 @@ class NominalModel(NamedTuple):
     @property
     def limits(self) -> Limits:
         """The limits as arguments of a law, shape (m, 1); the rate of u has none."""
-        return Limits(self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf))
+        return Limits(
+            self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf)
+        )
 
 
-def params_of_gains(kind: Callable[..., Any]) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
+def params_of_gains(
+    kind: Callable[..., Any],
+) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
     """Parameters of a law with the gains as fields, shapes (m, N) or (1, N)."""
     return lambda gains, model: kind(**gains)
 
@@ -62,7 +70,9 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """A control law flown by campaigns only, for lack of topics with the measurements. No retuning in flight."""
+    """A control law flown by campaigns only, for lack of topics with the measurements. No retuning
+    in flight.
+    """
 
     def retune(state: Any, old: Any, new: Any) -> Any:
         raise NotImplementedError("a law that only campaigns fly has no retuning")
@@ -84,7 +94,9 @@ def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
 
 
 def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
-    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where x is not measured."""
+    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where x is
+    not measured.
+    """
     x = measured.x_air if vanes else measured.x
     if x is None:
         raise ValueError("measurements: found no state, expected the full state")
@@ -92,7 +104,9 @@ def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
 
 
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """Saturation: the commanded u inside its limits, and the excess of the requested u, shapes (m,)."""
+    """Saturation: the commanded u inside its limits, and the excess of the requested u, shapes
+    (m,).
+    """
     commanded = saturation.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
 
@@ -100,12 +114,15 @@ def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tup
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
     """Anti-windup by conditional integration: `before` where effect * excess > 0, else `after`.
 
-    Arguments: `effect`, change of u (or of the scaled input) by the increment; `excess`, u over the limit, in the
-    same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5.
+    Arguments: `effect`, change of u (or of the scaled input) by the increment; `excess`, u over the
+    limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Control", 3.5.
     """
     return array_namespace(before).where(effect * excess > 0.0, before, after)
 
 
 def filter_gain(rate: Array, dt: Array) -> Array:
-    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick, exact for a held input."""
+    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick, exact for a
+    held input.
+    """
     return -array_namespace(rate).expm1(-rate * dt)

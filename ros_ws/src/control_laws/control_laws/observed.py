@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observers over any law, for many sets of weights at once: parameters from the gains of a search."""
+"""Observers over any law, for many sets of weights at once: parameters from the gains of a
+search.
+"""
 
 from typing import Any
 
@@ -22,12 +24,16 @@ from rise_di_controller.saturation import Limits
 PART = 0.6
 WITHIN = 0.1
 FADE = 1.0
-"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time of the fade-in, s: the defaults of
-`ObserverConfig`."""
+"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time of the fade-in,
+s: the defaults of `ObserverConfig`."""
 
 
-def observer_params(design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART) -> ObserverParams:
-    """Parameters of an observer over the law of `law_params`, from N designs; u_o within `part` of the limits."""
+def observer_params(
+    design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART
+) -> ObserverParams:
+    """Parameters of an observer over the law of `law_params`, from N designs; u_o within `part` of
+    the limits.
+    """
 
     def aircraft_last(matrices: FloatArray) -> FloatArray:
         return np.moveaxis(matrices, 0, -1) if matrices.ndim > 2 else matrices
@@ -35,17 +41,25 @@ def observer_params(design: ObserverDesign, law_params: Any, model: NominalModel
     lower = part * model.lower[:, None]
     upper = part * model.upper[:, None]
     limits = Limits(lower, upper, (upper - lower) / 2.0 / WITHIN)
-    Phi, Gamma, H, L, F = (aircraft_last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F))
+    Phi, Gamma, H, L, F = (
+        aircraft_last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F)
+    )
     return ObserverParams(law_params, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
 
 
-def aircraft_design(gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None) -> ObserverDesign:
-    """Designs with the aircraft's model from effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N)."""
+def aircraft_design(
+    gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
+) -> ObserverDesign:
+    """Designs with the aircraft's model from effort, drift (m, N), gust, wind_time (G, N) and loose
+    (1, N) or (n, N).
+    """
     weights = Weights(*(gains[name].T for name in Weights._fields))
     return aircraft_observer(model, names or unnamed(model), weights)
 
 
-def extended_state_design(gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None) -> ObserverDesign:
+def extended_state_design(
+    gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
+) -> ObserverDesign:
     """Designs from Omega and lags alone: effort, drift, rate_drift and decay, shapes (m, N)."""
     weights = ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
     return extended_state_observer(model, names or unnamed(model), weights)

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer: model in discrete time and two linear-quadratic gains, for many models and weights at once.
+"""Design of the observer: model in discrete time and two linear-quadratic gains, for many models
+and weights at once.
 
-Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe, `extended_state_observer` Omega and lags alone.
-A, B, wind and the weights may have leading axes, broadcast together: N aircraft, or N sets of weights, are N designs. Phi,
-Gamma, H, L, F are the matrices of the observer of `rise_di_controller.observer`.
+Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
+`extended_state_observer` Omega and lags alone. A, B, wind and the weights may have leading axes,
+broadcast together: N aircraft, or N sets of weights, are N designs. Phi, Gamma, H, L, F are the
+matrices of the observer of `rise_di_controller.observer`.
 """
 
 from collections.abc import Callable
@@ -21,7 +23,8 @@ from rise_di_controller.linear_loop import zero_order_hold
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """`riccati.correction_of`, or another function for the same gain."""
 
-LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: every mode is then observable or stable
+# 1/s, decay of angles and disturbances in the model: every mode is then observable or stable
+LEAK = 0.01
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
 ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
 
@@ -36,13 +39,17 @@ class Names(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Weights of the design with the aircraft's model. The units of the states are `NominalModel.size`, "sizes" below."""
+    """Weights of the design with the aircraft's model. The units of the states are
+    `NominalModel.size`, "sizes" below.
+    """
 
     effort: FloatArray  # (.., m) error at the cost of an input of unit response, s
     drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
     gust: FloatArray  # (.., G) noise of the wind, m/s per root s
     wind_time: FloatArray  # (.., G) time constants of the wind, s
-    loose: FloatArray  # (.., n), or (.., 1) for every state: noise of the states, for the model error, sizes per root s
+    # (.., n), or (.., 1) for every state: noise of the states, for the model error, sizes per root
+    # s
+    loose: FloatArray
 
 
 class ExtendedStateWeights(NamedTuple):
@@ -55,16 +62,22 @@ class ExtendedStateWeights(NamedTuple):
 
 
 class ObserverModel(NamedTuple):
-    """A model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_ff), e = H z."""
+    """A model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
+    u_ff), e = H z.
+    """
 
-    states: tuple[str, ...]  # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
+    states: tuple[
+        str, ...
+    ]  # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
     Phi: FloatArray  # (.., s, s)
     Gamma: FloatArray  # (.., s, m)
     H: FloatArray  # (m, s)
 
 
 class ObserverDesign(NamedTuple):
-    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u - u_ff)."""
+    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u -
+    u_ff).
+    """
 
     states: tuple[str, ...]
     Phi: FloatArray  # (.., s, s)
@@ -75,17 +88,25 @@ class ObserverDesign(NamedTuple):
 
 
 def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
-    """The aircraft around the reference, actuators, wind and a disturbance per output: z = [x, position, w, d].
+    """The aircraft around the reference, actuators, wind and a disturbance per output: z = [x,
+    position, w, d].
 
         x_dot        = (A + gravity) x + B position + wind w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
 
-    Angles decay with LEAK too. u_ff produces the motion along the reference: the model holds for small deviations from this
-    motion. s = n + m + G + m. A, B and wind of the model and `wind_time`, (.., G), may have leading axes.
+    Angles decay with LEAK too. u_ff produces the motion along the reference: the model holds for
+    small deviations from this motion. s = n + m + G + m. A, B and wind of the model and
+    `wind_time`, (.., G), may have leading axes.
     """
-    A, (n, m), G = model.A + model.gravity - LEAK * np.diag(model.kinematic), model.B.shape[-2:], model.wind.shape[-1]
+    A, (n, m), G = (
+        model.A + model.gravity - LEAK * np.diag(model.kinematic),
+        model.B.shape[-2:],
+        model.wind.shape[-1],
+    )
     x, p, w, d = np.split(np.arange(n + m + G + m), [n, n + m, n + m + G])
-    batch = np.broadcast_shapes(A.shape[:-2], model.B.shape[:-2], model.wind.shape[:-2], wind_time.shape[:-1])
+    batch = np.broadcast_shapes(
+        A.shape[:-2], model.B.shape[:-2], model.wind.shape[:-2], wind_time.shape[:-1]
+    )
     motion = np.zeros((*batch, n + m + G + m, n + m + G + m))
     motion[..., x[:, None], x] = A
     motion[..., x[:, None], p] = model.B
@@ -93,35 +114,55 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
     motion[..., x[:, None], d] = model.C.T
     motion[..., w, w] = -1.0 / wind_time
     motion[..., d, d] = -LEAK
-    groups = {"x": names.states, "position": names.inputs, "wind": names.winds, "disturbance": names.outputs}
+    groups = {
+        "x": names.states,
+        "position": names.inputs,
+        "wind": names.winds,
+        "disturbance": names.outputs,
+    }
     return _sampled(groups, motion, p, model.C, model)
 
 
 def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
-    """Outputs as integrals of Omega times the actuators and a disturbance of second order: z = [x, position, d, d_dot].
+    """Outputs as integrals of Omega times the actuators and a disturbance of second order: z = [x,
+    position, d, d_dot].
 
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
 
-    x are the outputs. s = 4 m. Of the model the function uses Omega, the lags and the period. `decay` (.., m), 1/s. Source: J.
-    Han, "From PID to Active Disturbance Rejection Control", IEEE Trans. Industrial Electronics 56(3), 2009.
+    x are the outputs. s = 4 m. Of the model the function uses Omega, the lags and the period.
+    `decay` (.., m), 1/s. Source: J. Han, "From PID to Active Disturbance Rejection Control", IEEE
+    Trans. Industrial Electronics 56(3), 2009.
     """
     m = len(model.C)
     x, p, d, rate = np.split(np.arange(4 * m), 4)
-    motion = np.zeros((*np.broadcast_shapes(model.Omega.shape[:-2], decay.shape[:-1]), 4 * m, 4 * m))
+    motion = np.zeros(
+        (*np.broadcast_shapes(model.Omega.shape[:-2], decay.shape[:-1]), 4 * m, 4 * m)
+    )
     motion[..., x[:, None], p] = model.Omega
     motion[..., x, d] = 1.0
     motion[..., d, rate] = 1.0
     motion[..., d, d] = -LEAK
     motion[..., rate, rate] = -decay
-    groups = {"x": names.outputs, "position": names.inputs, "disturbance": names.outputs, "disturbance_rate": names.outputs}
+    groups = {
+        "x": names.outputs,
+        "position": names.inputs,
+        "disturbance": names.outputs,
+        "disturbance_rate": names.outputs,
+    }
     return _sampled(groups, motion, p, np.eye(m), model)
 
 
 def _sampled(
-    groups: dict[str, tuple[str, ...]], motion: FloatArray, p: NDArray[np.int64], C: FloatArray, model: NominalModel
+    groups: dict[str, tuple[str, ...]],
+    motion: FloatArray,
+    p: NDArray[np.int64],
+    C: FloatArray,
+    model: NominalModel,
 ) -> ObserverModel:
-    """A model in discrete time; the actuators' positions are the states p, the first states have the outputs C."""
+    """A model in discrete time; the actuators' positions are the states p, the first states have
+    the outputs C.
+    """
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
     drive = np.zeros((motion.shape[-1], m))
     H = np.zeros((m, motion.shape[-1]))
@@ -137,42 +178,69 @@ def _sampled(
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
     """The observer over `aircraft_model`, with the gains of two Riccati equations.
 
-    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L the variance of the estimate: white
-    noise of `gust` drives the wind, of `drift` the disturbances, of `loose` the states, and e has the noise of the model.
-    Source: H. Kwakernaak, R. Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
+    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L the
+    variance of the estimate: white noise of `gust` drives the wind, of `drift` the disturbances, of
+    `loose` the states, and e has the noise of the model. Source: H. Kwakernaak, R. Sivan, "Linear
+    Optimal Control Systems", ch. 5 and 6.
     """
     sampled = aircraft_model(model, names, weights.wind_time)
-    return ObserverDesign(*sampled, aircraft_correction(sampled, model, weights), feedback_gain(sampled, model, weights.effort))
+    return ObserverDesign(
+        *sampled,
+        aircraft_correction(sampled, model, weights),
+        feedback_gain(sampled, model, weights.effort),
+    )
 
 
 def aircraft_correction(
-    sampled: ObserverModel, model: NominalModel, weights: Weights, correction: Correction = correction_of
+    sampled: ObserverModel,
+    model: NominalModel,
+    weights: Weights,
+    correction: Correction = correction_of,
 ) -> FloatArray:
     """L of `aircraft_observer`, shape (.., s, m)."""
     positions = np.full(len(model.lag), ACTUATOR_NOISE)
-    intensities = [weights.loose * model.size, positions, weights.gust, weights.drift * (model.C @ model.size)]
+    intensities = [
+        weights.loose * model.size,
+        positions,
+        weights.gust,
+        weights.drift * (model.C @ model.size),
+    ]
     return _correction(sampled, model, intensities, correction)
 
 
 def vane_correction(
-    sampled: ObserverModel, model: NominalModel, weights: tuple[Weights, Weights], row: FloatArray, noise: float
+    sampled: ObserverModel,
+    model: NominalModel,
+    weights: tuple[Weights, Weights],
+    row: FloatArray,
+    noise: float,
 ) -> FloatArray:
-    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1): the filter of y and the vane less the filter of y.
+    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1): the filter of y and the vane
+    less the filter of y.
 
-    The last column acts on the vane: a reading beyond the reference motion is `row` z, (s,), with white `noise`, rms.
-    `weights` without and with the vane.
+    The last column acts on the vane: a reading beyond the reference motion is `row` z, (s,), with
+    white `noise`, rms. `weights` without and with the vane.
     """
     alone = aircraft_correction(sampled, model, weights[0])
     with_vane = sampled._replace(H=np.vstack([sampled.H, row]))
-    both = aircraft_correction(with_vane, model._replace(noise=np.append(model.noise, noise)), weights[1])
+    both = aircraft_correction(
+        with_vane, model._replace(noise=np.append(model.noise, noise)), weights[1]
+    )
     return np.asarray(both - np.column_stack([alone, np.zeros(len(alone))]))
 
 
-def extended_state_observer(model: NominalModel, names: Names, weights: ExtendedStateWeights) -> ObserverDesign:
+def extended_state_observer(
+    model: NominalModel, names: Names, weights: ExtendedStateWeights
+) -> ObserverDesign:
     """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
     sampled = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size
-    intensities = [0.0 * size, np.full(len(size), ACTUATOR_NOISE), weights.drift * size, weights.rate_drift * size]
+    intensities = [
+        0.0 * size,
+        np.full(len(size), ACTUATOR_NOISE),
+        weights.drift * size,
+        weights.rate_drift * size,
+    ]
     L = _correction(sampled, model, intensities)
     return ObserverDesign(*sampled, L, feedback_gain(sampled, model, weights.effort))
 
@@ -181,13 +249,25 @@ def feedback_gain(sampled: ObserverModel, model: NominalModel, effort: FloatArra
     """F of `aircraft_observer`, shape (.., m, s), for `effort` (.., m), s."""
     size = model.C @ model.size
     Q = transpose(sampled.H) @ np.diag(1.0 / size**2) @ sampled.H
-    return gain_of(sampled.Phi, sampled.Gamma, Q, diagonal((effort / model.input_scale / size) ** 2))
+    return gain_of(
+        sampled.Phi, sampled.Gamma, Q, diagonal((effort / model.input_scale / size) ** 2)
+    )
 
 
 def _correction(
-    sampled: ObserverModel, model: NominalModel, intensities: list[FloatArray], correction: Correction = correction_of
+    sampled: ObserverModel,
+    model: NominalModel,
+    intensities: list[FloatArray],
+    correction: Correction = correction_of,
 ) -> FloatArray:
-    """L for white noise of these intensities, shapes (.., k), on the states in order, SI per root s."""
+    """L for white noise of these intensities, shapes (.., k), on the states in order, SI per root
+    s.
+    """
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
-    process = np.concatenate([np.broadcast_to(intensity, (*batch, intensity.shape[-1])) for intensity in intensities], axis=-1)
-    return correction(sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2))
+    process = np.concatenate(
+        [np.broadcast_to(intensity, (*batch, intensity.shape[-1])) for intensity in intensities],
+        axis=-1,
+    )
+    return correction(
+        sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2)
+    )

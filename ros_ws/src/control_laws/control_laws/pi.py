@@ -34,7 +34,12 @@ class PiState(NamedTuple):
 
 def _u(state: PiState, params: PiParams) -> Array:
     """U from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e)."""
-    return -params.input_scale * params.D * params.K * (state.e - state.e_0 + params.Lambda * state.integral_e)
+    return (
+        -params.input_scale
+        * params.D
+        * params.K
+        * (state.e - state.e_0 + params.Lambda * state.integral_e)
+    )
 
 
 def _engage(measured: Measurements, params: PiParams) -> PiState:
@@ -45,19 +50,31 @@ def _engage(measured: Measurements, params: PiParams) -> PiState:
 def _limited(
     state: PiState, measured: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
-    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with anti-windup (`limited_integral`)."""
+    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with anti-windup
+    (`limited_integral`).
+    """
     e = measured.y - measured.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
     _, excess = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
-    change = -params.input_scale * params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
-    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, excess))
+    change = (
+        -params.input_scale
+        * params.D
+        * params.K
+        * params.Lambda
+        * (after.integral_e - state.integral_e)
+    )
+    after = after._replace(
+        integral_e=limited_integral(state.integral_e, after.integral_e, change, excess)
+    )
     u_free = measured.u_trim + _u(after, params)
     u, _ = saturate(u_free, measured, dt, limits)
     return after, u_free, u
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
-    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so Lambda may be 0."""
+    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so Lambda may
+    be 0.
+    """
     asked = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)
 
@@ -87,4 +104,9 @@ class PiConfig(ControllerConfig):
 
     def law_params(self) -> PiParams:
         """The arrays of the law."""
-        return PiParams(np.array(self.K), np.array(self.Lambda), np.array(self.D, dtype=float), np.array(self.input_scale))
+        return PiParams(
+            np.array(self.K),
+            np.array(self.Lambda),
+            np.array(self.D, dtype=float),
+            np.array(self.input_scale),
+        )

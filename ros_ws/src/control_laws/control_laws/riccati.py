@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic design for many models and sets of weights at once: the discrete Riccati equation.
+"""Linear-quadratic design for many models and sets of weights at once: the discrete Riccati
+equation.
 
 Leading axes of the arguments of a function are broadcast together.
 """
@@ -19,8 +20,9 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
 
         P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
 
-    scipy.linalg.solve_discrete_are solves a single equation at a time and is eight times slower. Shapes: F, Q (.., s, s), G
-    (.., s, m), R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77(8), 2004.
+    scipy.linalg.solve_discrete_are solves a single equation at a time and is eight times slower.
+    Shapes: F, Q (.., s, s), G (.., s, m), R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin,
+    C.-S. Wang, Int. J. Control 77(8), 2004.
     """
     batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
     F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
@@ -50,35 +52,49 @@ def diagonal(values: FloatArray) -> FloatArray:
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The gain (R + G'P G)^-1 G'P F of u = -gain z for the least sum of z'Q z + u'R u, shape (.., m, s)."""
+    """The gain (R + G'P G)^-1 G'P F of u = -gain z for the least sum of z'Q z + u'R u, shape (..,
+    m, s).
+    """
     P = riccati(F, G, Q, R)
     return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
 
 
-def correction_of(F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray) -> FloatArray:
-    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter z + gain (y - H z), shape (.., s, m).
+def correction_of(
+    F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter z + gain (y - H z), shape
+    (.., s, m).
 
-    S is the covariance of the predicted state. Arguments: covariances `process` of the state in a step, (.., s, s), and `noise`
-    of y, (.., m, m); H (.., m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
+    S is the covariance of the predicted state. Arguments: covariances `process` of the state in a
+    step, (.., s, s), and `noise` of y, (.., m, m); H (.., m, s). Source: B. D. O. Anderson, J. B.
+    Moore, "Optimal Filtering", 4.4.
     """
     S = riccati(transpose(F), transpose(H), process, noise)
     return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
 
 
-def corrections_near(F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray) -> FloatArray:
-    """Gains of `correction_of` for models that differ little from the first one, exact to first order in the difference.
+def corrections_near(
+    F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """Gains of `correction_of` for models that differ little from the first one, exact to first
+    order in the difference.
 
-    With the gain K of the first model and A = F (I - K H), the covariance of a model with F_i is S + dS,
+    With the gain K of the first model and A = F (I - K H), the covariance of a model with F_i is S
+    + dS,
 
         dS = A dS A' + F_i (I - K H) S (I - K H)'F_i' + F_i K noise K'F_i' + process_i - S
 
-    because S is the least one over the gains: a change of the gain is of second order. The first axis of F and process is that
-    of the models. Source: D. L. Kleinman, IEEE TAC 13(1), 1968.
+    because S is the least one over the gains: a change of the gain is of second order. The first
+    axis of F and process is that of the models. Source: D. L. Kleinman, IEEE TAC 13(1), 1968.
     """
     S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)
     K = transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
     uncorrected = np.eye(F.shape[-1]) - K @ H
-    change = F @ (uncorrected @ S @ transpose(uncorrected) + K @ noise @ transpose(K)) @ transpose(F) + process - S
+    change = (
+        F @ (uncorrected @ S @ transpose(uncorrected) + K @ noise @ transpose(K)) @ transpose(F)
+        + process
+        - S
+    )
     A = F[:1] @ uncorrected
     for _ in range(MAX_DOUBLINGS):
         more = A @ change @ transpose(A)

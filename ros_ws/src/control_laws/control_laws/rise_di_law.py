@@ -10,12 +10,26 @@ from rise_di_controller.law import LawParams
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
-    """Parameters from gains K, Lambda, beta (m, N) and softening, (m, N) or (1, N), or omega (1, N), in scaled inputs.
+    """Parameters from gains K, Lambda, beta (m, N) and softening, (m, N) or (1, N), or omega (1,
+    N), in scaled inputs.
 
     eps = beta / K softening total_lag.
     """
     K = gains["K"]
     beta = gains["beta"]
-    eps = beta / K * gains["softening"] * model.total_lag[:, None] if "softening" in gains else np.ones_like(K)
+    eps = (
+        beta / K * gains["softening"] * model.total_lag[:, None]
+        if "softening" in gains
+        else np.ones_like(K)
+    )
     omega = gains.get("omega", 1.0) + 0.0 * K
-    return LawParams(K, gains["Lambda"], beta, model.D[:, None], model.input_scale[:, None], omega, eps, sign=None)
+    return LawParams(
+        K,
+        gains["Lambda"],
+        beta,
+        model.D[:, None],
+        model.input_scale[:, None],
+        omega,
+        eps,
+        sign=None,
+    )

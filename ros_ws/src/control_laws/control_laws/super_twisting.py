@@ -4,7 +4,13 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, campaign_law, conditional_integration, params_of_gains, saturate
+from control_laws.nominal_model import (
+    NominalModel,
+    campaign_law,
+    conditional_integration,
+    params_of_gains,
+    saturate,
+)
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits
@@ -29,9 +35,10 @@ def control_law(model: NominalModel) -> ControlLaw:
         z += -dt beta sgn(e)
         u  = Omega^-1 (y_m_dot - root sgn(e) sqrt(abs(e)) + z)
 
-    Without actuators e_dot = -root sgn(e) sqrt(abs(e)) + z + d. For abs(d_dot) <= L, e reaches 0 in finite time if
-    beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J. Control 58(6), 1993; J. A. Moreno,
-    M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding Mode Control and Observation", 4.3.
+    Without actuators e_dot = -root sgn(e) sqrt(abs(e)) + z + d. For abs(d_dot) <= L, e reaches 0 in
+    finite time if beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J.
+    Control 58(6), 1993; J. A. Moreno, M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding
+    Mode Control and Observation", 4.3.
     """
     Omega = model.Omega
     inverse = model.inverse
@@ -40,7 +47,11 @@ def control_law(model: NominalModel) -> ControlLaw:
         return TwistingState(array_namespace(measured.y).zeros_like(measured.y))
 
     def limited(
-        state: TwistingState, measured: Measurements, dt: Array, params: TwistingParams, limits: Limits
+        state: TwistingState,
+        measured: Measurements,
+        dt: Array,
+        params: TwistingParams,
+        limits: Limits,
     ) -> tuple[TwistingState, Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
@@ -49,7 +60,11 @@ def control_law(model: NominalModel) -> ControlLaw:
         nu = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
         u_free = measured.u_trim + inverse @ nu
         u, excess = saturate(u_free, measured, dt, limits)
-        return TwistingState(conditional_integration(state.z, z, increment, Omega @ excess)), u_free, u
+        return (
+            TwistingState(conditional_integration(state.z, z, increment, Omega @ excess)),
+            u_free,
+            u,
+        )
 
     return campaign_law(TwistingState, engage, limited)
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight as pure functions of the tape: error, noise floor, ultimate bound, settling, saturation, ticks."""
+"""Metrics of a flight as pure functions of the tape: error, noise floor, ultimate bound, settling,
+saturation, ticks.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,43 +24,54 @@ from rise_di_controller.internals import Saturation
 Windows = Mapping[str, tuple[float, float]]
 
 SETTLING_DWELL = 1.0
-"""s. A transient lasts this long beyond its end. An error has settled once it stays in the band for this long."""
+"""s. A transient lasts this long beyond its end. An error has settled once it stays in the band for
+this long."""
 
 SETTLING_BAND = 0.01  # half-width of the settling band as a fraction of the largest abs(y_m)
 
 MIN_BAND_NOISE_FLOORS = 4.0
-"""Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal noise stay within 4 with a
-probability of 97 %."""
+"""Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal
+noise stay within 4 with a probability of 97 %."""
 
-MAX_DEVIATION = 0.15  # of the value of an entry that the flight shows: half of the deviation before it
+MAX_DEVIATION = (
+    0.15  # of the value of an entry that the flight shows: half of the deviation before it
+)
 
 LONGEST_INTERVAL = 1.0
-"""s. A sample stands for no longer time: a longer interval is a gap of the log, over which no figure is taken."""
+"""s. A sample stands for no longer time: a longer interval is a gap of the log, over which no
+figure is taken."""
 
 # names that `best_error` returns
 TRUE_ERROR = "true error"
 MEASURED_ERROR = "measured error"
 
 PARTS_LEGEND = (
-    f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the entry of a gust to"
-    f" {SETTLING_DWELL:g} s after its end; undisturbed: all other times, except {SETTLING_DWELL:g} s after engagement"
+    f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the "
+    f"entry of a gust to {SETTLING_DWELL:g} s after its end; undisturbed: all other times, except "
+    f"{SETTLING_DWELL:g} s after engagement"
 )
-"""Legend of the tables: the parts of a flight. Their keys are "whole", "calm" (undisturbed), "command" and "gust"."""
+"""Legend of the tables: the parts of a flight. Their keys are "whole", "calm" (undisturbed),
+"command" and "gust"."""
 
 TURN_BANK = math.radians(5.0)  # rad: a turn commands more bank
 CAPTURE_ANGLE = math.radians(1.0)  # rad: a capture commands a steeper flight path
 CAPTURE_TIME = 0.5  # s: a capture is farther beside its path than the aircraft flies in this time
 
 GUIDED_LEGEND = (
-    f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of turns, a commanded path steeper"
-    f" than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving command of V, or a cross-track error above {CAPTURE_TIME:g} s of"
-    f" flight, each to {SETTLING_DWELL:g} s after its end; undisturbed: steady flight, all other times outside gusts"
+    f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of "
+    "turns, a commanded path steeper"
+    f" than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving command of V, or a cross-track "
+    f"error above {CAPTURE_TIME:g} s of"
+    f" flight, each to {SETTLING_DWELL:g} s after its end; undisturbed: steady flight, all "
+    "other times outside gusts"
 )
 """Legend of the tables of a guided flight: the keys "turn" and "capture" replace "command"."""
 
 
 class Transient(NamedTuple):
-    """An engagement, a command, a gust, a turn or a capture, from the first to the last instant in s of flight time."""
+    """An engagement, a command, a gust, a turn or a capture, from the first to the last instant in
+    s of flight time.
+    """
 
     kind: str  # "engagement", "command", "gust", "turn" or "capture"
     name: str  # of the commanded channel, or of the gust
@@ -66,7 +79,9 @@ class Transient(NamedTuple):
     stop: float
 
     def excites(self, channel: str) -> bool:
-        """Whether a channel is excited: a command excites a channel, any further transient every channel."""
+        """Whether a channel is excited: a command excites a channel, any further transient every
+        channel.
+        """
         return self.kind != "command" or self.name == channel
 
 
@@ -98,7 +113,9 @@ class TickMetrics(NamedTuple):
     """Timing of the controller's ticks; times in s."""
 
     ticks: int
-    without_new_y: int  # periods without a step of the controller: no new y arrived, or the tick was missed
+    without_new_y: (
+        int  # periods without a step of the controller: no new y arrived, or the tick was missed
+    )
     period_mean: float
     period_p99: float
     period_max: float
@@ -124,26 +141,37 @@ class LatencyMetrics(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of y that y_m has.
+    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of
+    y that y_m has.
 
     y_m is interpolated linearly. The law sees this error with the sensors' noise.
     """
     names = _controlled(tape)
-    return _minus_reference(Signal(tape["y"].stamp_ns, names, _columns(tape["y"], names)), tape["y_m"])
+    return _minus_reference(
+        Signal(tape["y"].stamp_ns, names, _columns(tape["y"], names)), tape["y_m"]
+    )
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """The channels of y that y_m has: y may have more. Raises ParameterError where they share none."""
+    """The channels of y that y_m has: y may have more. Raises ParameterError where they share
+    none.
+    """
     names = tuple(name for name in tape["y"].names if name in tape["y_m"].names)
-    require(bool(names), "the log", f"y of {', '.join(tape['y'].names)}", f"a channel of y_m: {', '.join(tape['y_m'].names)}")
+    require(
+        bool(names),
+        "the log",
+        f"y of {', '.join(tape['y'].names)}",
+        f"a channel of y_m: {', '.join(tape['y_m'].names)}",
+    )
     return names
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m), channels as above.
+    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m),
+    channels as above.
 
-    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output" for every channel, as in a
-    simulation.
+    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output"
+    for every channel, as in a simulation.
     """
     if "truth" not in tape:
         return None
@@ -184,9 +212,10 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 def noise_floor(tape: Tape) -> dict[str, float]:
     """Noise floor of y by channel, SI: a smaller error cannot be distinguished from noise.
 
-    The floor is the rms of "noise.channel" of `truth` on the tape, else the estimate of white noise from second
-    differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the
-    noise, and half of a normal distribution lies within 0.6745 rms. The floor is at least the rounding of the largest y.
+    The floor is the rms of "noise.channel" of `truth` on the tape, else the estimate of white noise
+    from second differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745
+    sqrt(6)). d has 6 times the variance of the noise, and half of a normal distribution lies within
+    0.6745 rms. The floor is at least the rounding of the largest y.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}
@@ -195,7 +224,11 @@ def noise_floor(tape: Tape) -> dict[str, float]:
         if noise is not None and name in noise.names:
             rms = float(np.sqrt(np.mean(noise[name] ** 2)))
         else:
-            rms = float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5) if len(y) > 2 else math.nan
+            rms = (
+                float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5)
+                if len(y) > 2
+                else math.nan
+            )
         largest = np.max(np.abs(y), initial=0.0)
         floor[name] = max(rms, float(np.spacing(largest)) if largest > 0.0 else 0.0)
     return floor
@@ -211,23 +244,32 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Changes of a live command, from `u_m`. Changes of a channel less than SETTLING_DWELL apart are a single transient."""
+    """Changes of a live command, from `u_m`. Changes of a channel less than SETTLING_DWELL apart
+    are a single transient.
+    """
     if "u_m" not in tape:
         return []
     t = tape.time("u_m")
     u_m = tape["u_m"]
     commands: list[Transient] = []
-    attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)  # the attitude, which never rests
+    attitude = (
+        () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)
+    )  # the attitude, which never rests
     for name in [name for name in u_m.names if name not in attitude]:
         moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
         instants = t[moved]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
-        commands += [Transient("command", name, float(group[0]), float(group[-1])) for group in groups if len(group)]
+        commands += [
+            Transient("command", name, float(group[0]), float(group[-1]))
+            for group in groups
+            if len(group)
+        ]
     return sorted(commands, key=lambda command: command.start)
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` never rests.
+    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` never
+    rests.
 
     Transients of a kind less than SETTLING_DWELL apart are a single transient.
     """
@@ -240,14 +282,20 @@ def guided_transients(tape: Tape) -> list[Transient]:
     captures = np.abs(commands["climb_c"]) > speed * math.sin(CAPTURE_ANGLE)
     captures |= np.abs(commands["xtrack"]) > CAPTURE_TIME * speed
     captures |= np.diff(speed, prepend=speed[:1]) != 0.0
-    spans = {"turn": mask_spans(t, turns, SETTLING_DWELL), "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL)}
+    spans = {
+        "turn": mask_spans(t, turns, SETTLING_DWELL),
+        "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL),
+    }
     transients = [Transient("turn", "", *span) for span in spans["turn"]]
     transients += [Transient("capture", "", *span) for span in spans["capture"]]
     return sorted(transients, key=lambda transient: transient.start)
 
 
-def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) -> list[tuple[float, float]]:
-    """Start and stop of the runs of True in a mask of shape (N,), s; a run stops at the next False sample.
+def mask_spans(
+    t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0
+) -> list[tuple[float, float]]:
+    """Start and stop of the runs of True in a mask of shape (N,), s; a run stops at the next False
+    sample.
 
     Spans less than `min_length` apart are merged, and shorter spans are lengthened to `min_length`.
     """
@@ -262,47 +310,65 @@ def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) 
     return spans
 
 
-def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0) -> NDArray[np.bool_]:
-    """Mask of the ascending instants t inside a span or up to `settle` seconds later, shape (N,)."""
+def in_spans(
+    t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0
+) -> NDArray[np.bool_]:
+    """Mask of the ascending instants t inside a span or up to `settle` seconds later, shape
+    (N,).
+    """
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
     return inside
 
 
-def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL) -> dict[str, NDArray[np.bool_]]:
-    """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command", "gust".
+def part_masks(
+    t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+) -> dict[str, NDArray[np.bool_]]:
+    """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command",
+    "gust".
 
-    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last matching part in this order.
-    "calm" is undisturbed: no transient of any kind.
+    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last
+    matching part in this order. "calm" is undisturbed: no transient of any kind.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
     parts = {}
     free = np.ones(len(t), dtype=bool)
     for kind in ("gust", *reversed(commands), "engagement"):
-        spans = [(transient.start, transient.stop) for transient in transients if transient.kind == kind]
+        spans = [
+            (transient.start, transient.stop) for transient in transients if transient.kind == kind
+        ]
         parts[kind] = in_spans(t, spans, settle) & free
         free &= ~parts[kind]
-    return {"whole": np.ones(len(t), dtype=bool), "calm": free, **{kind: parts[kind] for kind in (*commands, "gust")}}
+    return {
+        "whole": np.ones(len(t), dtype=bool),
+        "calm": free,
+        **{kind: parts[kind] for kind in (*commands, "gust")},
+    }
 
 
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Time that a sample stands for, s, shape (N,): half of the intervals to both neighbours, each at most LONGEST_INTERVAL.
+    """Time that a sample stands for, s, shape (N,): half of the intervals to both neighbours, each
+    at most LONGEST_INTERVAL.
 
-    The first and the last sample stand for a whole interval, so that equal intervals give equal times.
+    The first and the last sample stand for a whole interval, so that equal intervals give equal
+    times.
     """
     if len(stamp_ns) < 2:
         return np.ones(len(stamp_ns))
     intervals = np.minimum(np.diff(stamp_ns) / 1e9, LONGEST_INTERVAL)
-    times: FloatArray = (np.concatenate([intervals[:1], intervals]) + np.concatenate([intervals, intervals[-1:]])) / 2.0
+    times: FloatArray = (
+        np.concatenate([intervals[:1], intervals]) + np.concatenate([intervals, intervals[-1:]])
+    ) / 2.0
     return times
 
 
 def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMetrics:
     """Root mean square and max abs(e) of samples of shape (N,); NaN where N = 0.
 
-    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,), of equal times sqrt(mean e^2). Raises ParameterError.
+    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,), of equal times sqrt(mean
+    e^2). Raises ParameterError.
     """
     e = as_array(errors, "errors", expected := "samples of one channel, (N,)")
     require(e.ndim == 1, "errors", f"an array of shape {e.shape}", expected)
@@ -314,7 +380,8 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Rms of `best_error` before the first model of a learner and under each model; empty for a tape without a learner.
+    """Rms of `best_error` before the first model of a learner and under each model; empty for a
+    tape without a learner.
 
     The time in which the law is not engaged does not count.
     """
@@ -326,9 +393,14 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     flown = tape["internals"]["parameters"]
     changes = np.flatnonzero(np.diff(flown, prepend=np.nan) != 0.0)
     digests = list(dict.fromkeys(flown[changes].tolist()))
-    engaged = tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)] == Mode.ENGAGED
+    engaged = (
+        tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)]
+        == Mode.ENGAGED
+    )
     spans = []
-    for digest, (start, stop) in zip(flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True):
+    for digest, (start, stop) in zip(
+        flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True
+    ):
         in_span = (t >= start) & (t < stop) & engaged
         rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
         if in_span.any():
@@ -337,10 +409,16 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
 
 
 def known_entries(learned: Signal) -> list[str]:
-    """Entries of A and B in samples of `learned` whose least deviation is below MAX_DEVIATION of the value."""
+    """Entries of A and B in samples of `learned` whose least deviation is below MAX_DEVIATION of
+    the value.
+    """
     values = learned.group("value")
     deviations = learned.group("deviation")
-    return [name for name in values.names if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))]
+    return [
+        name
+        for name in values.names
+        if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))
+    ]
 
 
 def errors_by_part(
@@ -348,21 +426,26 @@ def errors_by_part(
 ) -> dict[str, dict[str, ErrorMetrics]]:
     """Metrics of `best_error` by channel and part of the flight.
 
-    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of every transient.
+    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of
+    every transient.
     """
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
     times = sample_times(error.stamp_ns)
     by_channel = {}
     for name in error.names:
-        by_channel[name] = {part: error_metrics(error[name][mask], times[mask]) for part, mask in masks.items()}
+        by_channel[name] = {
+            part: error_metrics(error[name][mask], times[mask]) for part, mask in masks.items()
+        }
     return by_channel
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
-    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m), or max abs(e) where y_m is zero.
+    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m), or max abs(e)
+    where y_m is zero.
 
-    The band of a measured error is at least MIN_BAND_NOISE_FLOORS noise floors wide, else noise alone leaves it.
+    The band of a measured error is at least MIN_BAND_NOISE_FLOORS noise floors wide, else noise
+    alone leaves it.
     """
     kind, error = best_error(tape)
     floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
@@ -379,11 +462,14 @@ def settling_bands(tape: Tape) -> dict[str, float]:
     }
 
 
-def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL) -> float | None:
-    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s. Shapes (N,).
+def settling_time(
+    t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL
+) -> float | None:
+    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s. Shapes
+    (N,).
 
-    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a different cause. None where abs(e) does
-    not return to the band, or there is no sample.
+    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a different
+    cause. None where abs(e) does not return to the band, or there is no sample.
     """
     if len(t) == 0:
         return None
@@ -406,24 +492,32 @@ class Settling(NamedTuple):
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Settling time of `best_error` into `settling_bands` from the start of the transients, by excited channel.
+    """Settling time of `best_error` into `settling_bands` from the start of the transients, by
+    excited channel.
 
-    The time counts up to the next transient of the channel. Transients after the end of the flight are left out, and
-    turns and captures, whose commands move to the end.
+    The time counts up to the next transient of the channel. Transients after the end of the flight
+    are left out, and turns and captures, whose commands move to the end.
     """
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
     bands = settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
     results = []
-    judged = [transient for transient in transients if transient.start <= end and transient.kind not in {"turn", "capture"}]
+    judged = [
+        transient
+        for transient in transients
+        if transient.start <= end and transient.kind not in {"turn", "capture"}
+    ]
     for transient in sorted(judged, key=attrgetter("start")):
         start = transient.start
         leaves = transient.stop + SETTLING_DWELL - transient.start
         until = {}
         times = {}
         for name in filter(transient.excites, error.names):
-            until[name] = min([later.start for later in transients if later.excites(name) and later.start > start] + [end])
+            until[name] = min(
+                [later.start for later in transients if later.excites(name) and later.start > start]
+                + [end]
+            )
             inside = (t >= start) & ((t < until[name]) | (until[name] == end))
             times[name] = settling_time(t[inside], error[name][inside], bands[name], leaves)
         results.append(Settling(transient, until, times))
@@ -433,9 +527,11 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
 def inputs_by_part(
     tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL, topic: str = "u"
 ) -> dict[str, dict[str, InputMetrics]]:
-    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot); of y with `topic`.
+    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot); of y
+    with `topic`.
 
-    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps with an end in the part; NaN without a step.
+    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps with an end in the
+    part; NaN without a step.
     """
     if topic not in tape:
         return {}
@@ -457,7 +553,9 @@ def inputs_by_part(
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Fraction of the ticks with a saturated input, by input and by kind of saturation: "magnitude", "rate"."""
+    """Fraction of the ticks with a saturated input, by input and by kind of saturation:
+    "magnitude", "rate".
+    """
     limited = tape["internals"].group("limited") if "internals" in tape else None
     if limited is None or len(limited.stamp_ns) == 0:
         return {}
@@ -471,8 +569,8 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
 def sign_switches(tape: Tape) -> dict[str, float]:
     """Switching rate of the sign term by output, 1/s.
 
-    The count is of changes of sign between successive nonzero increments of Pi, per time of the ticks. On a tape without
-    `internals` the count is of changes of sign of the measured error.
+    The count is of changes of sign between successive nonzero increments of Pi, per time of the
+    ticks. On a tape without `internals` the count is of changes of sign of the measured error.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")
@@ -483,16 +581,20 @@ def sign_switches(tape: Tape) -> dict[str, float]:
     time = seconds(int(np.ptp(signal.stamp_ns))) if len(signal.stamp_ns) else 0.0
     if time == 0.0:
         return {}
-    signs = {name: np.sign(column[column != 0.0]) for name, column in zip(signal.names, moves.T, strict=True)}
+    signs = {
+        name: np.sign(column[column != 0.0])
+        for name, column in zip(signal.names, moves.T, strict=True)
+    }
     return {name: float(np.count_nonzero(np.diff(sign))) / time for name, sign in signs.items()}
 
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values in unit / sqrt(Hz).
+    """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values
+    in unit / sqrt(Hz).
 
-    The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample repeats the last
-    sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length. The square of the density, integrated over the
-    frequencies, is the variance. Source: Welch 1967.
+    The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample
+    repeats the last sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length.
+    The square of the density, integrated over the frequencies, is the variance. Source: Welch 1967.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
@@ -505,15 +607,20 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 
 
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
-    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m), as of `scipy.signal.welch`.
+    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m), as of
+    `scipy.signal.welch`.
 
     scipy.signal takes half a second to load, a tenth of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
-    parts = sliding_window_view(values, window, axis=0)[:: window - window // 2]  # (parts, m, window)
+    parts = sliding_window_view(values, window, axis=0)[
+        :: window - window // 2
+    ]  # (parts, m, window)
     spectra = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
     power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T / (rate * np.sum(hann**2))
-    power[1 : (window + 1) // 2] *= 2.0  # each frequency but 0 and the highest of an even window stands for two
+    power[1 : (window + 1) // 2] *= (
+        2.0  # each frequency but 0 and the highest of an even window stands for two
+    )
     return np.fft.rfftfreq(window, 1.0 / rate).astype(np.float64), power
 
 
@@ -529,7 +636,8 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
     """Metrics of the controller's ticks from `internals`; None for fewer than two ticks.
 
-    `internals` holds only ticks with a new y. A period without a tick therefore counts for a missing y and for a missing tick.
+    `internals` holds only ticks with a new y. A period without a tick therefore counts for a
+    missing y and for a missing tick.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:
@@ -555,7 +663,9 @@ def latency_metrics(tape: Tape) -> LatencyMetrics | None:
     if "latency" not in tape or len(tape["latency"].stamp_ns) == 0:
         return None
     latency = tape["latency"].values[:, 0]
-    return LatencyMetrics(float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max()))
+    return LatencyMetrics(
+        float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max())
+    )
 
 
 def age_metrics(tape: Tape) -> AgeMetrics | None:

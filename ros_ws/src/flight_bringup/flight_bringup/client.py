@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clients of a flight: the check of the network between hosts, with its profile, and the pose for FlightGear."""
+"""Clients of a flight: the check of the network between hosts, with its profile, and the pose for
+FlightGear.
+"""
 
 import os
 import socket
@@ -27,20 +29,29 @@ from flight_ros.transport import DISCOVERY_VARIABLE
 
 POSE_TIMEOUT = 5.0  # s
 EXCHANGE_PERIOD = 0.1  # s
-SETTLE_TIME = 1.0  # s, of exchanges after every host has been received: the least delay of many counts
+SETTLE_TIME = (
+    1.0  # s, of exchanges after every host has been received: the least delay of many counts
+)
 
 
 def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
     """Write the profile of this host to a file. Raises ParameterError.
 
-    Returns the address of this host, those of all hosts, and the environment that selects the profile.
+    Returns the address of this host, those of all hosts, and the environment that selects the
+    profile.
     """
     hosts = addresses(peers)
     local = {entry.address for entry in chain.from_iterable(psutil.net_if_addrs().values())}
-    own_host = own_address(hosts, {address for address in local if address.count(".") == 3 and address != "127.0.0.1"})
+    own_host = own_address(
+        hosts, {address for address in local if address.count(".") == 3 and address != "127.0.0.1"}
+    )
     with writing("--write", file, "the path of a file"):
         write_file(file, network_profile(own_host, hosts))
-    return own_host, hosts, {PROFILE_VARIABLE: str(file.absolute()), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
+    return (
+        own_host,
+        hosts,
+        {PROFILE_VARIABLE: str(file.absolute()), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"},
+    )
 
 
 class FlightGearClient(Client):
@@ -54,16 +65,23 @@ class FlightGearClient(Client):
 
     def wait(self) -> None:
         """Wait for a pose. Raises ParameterError without one."""
-        self._spin_until(lambda: bool(self._take()), f"{self._pose.name}: not received, expected a flight in this domain")
+        self._spin_until(
+            lambda: bool(self._take()),
+            f"{self._pose.name}: not received, expected a flight in this domain",
+        )
 
     def send(self, address: tuple[str, int], origin: Origin, ground: float, rate: float) -> None:
-        """Send the newest pose at a rate, Hz, until no pose has come for POSE_TIMEOUT. `ground`: altitude of the origin, m."""
+        """Send the newest pose at a rate, Hz, until no pose has come for POSE_TIMEOUT. `ground`:
+        altitude of the origin, m.
+        """
         heard = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             while (now := time.monotonic()) - heard < POSE_TIMEOUT:
                 if self._take():
                     heard = now
-                with suppress(OSError):  # FlightGear is not started yet, or the network is down for a while
+                with suppress(
+                    OSError
+                ):  # FlightGear is not started yet, or the network is down for a while
                     sender.sendto(packet(self._newest, origin, ground, int(time.time())), address)
                 time.sleep(1.0 / rate)
 
@@ -101,7 +119,9 @@ class NetworkClient(Client):
         end = time.monotonic() + timeout
         while (now := time.monotonic()) < end:
             self._clocks.exchange(0)
-            received |= {self._instances[name] for name in self._clocks.received() if name in self._instances}
+            received |= {
+                self._instances[name] for name in self._clocks.received() if name in self._instances
+            }
             known = self._clocks.clocks().items()
             new = {self._instances[name]: clock for name, clock in known if name in self._instances}
             if len(clocks) < len(new) == len(self._instances):

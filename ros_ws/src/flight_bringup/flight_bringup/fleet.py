@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet: several aircraft at once over topics, with a namespace, nodes, a log and a report for every aircraft."""
+"""A fleet: several aircraft at once over topics, with a namespace, nodes, a log and a report for
+every aircraft.
+"""
 
 import signal
 import threading
@@ -36,7 +38,9 @@ Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Whether the path names the file of a fleet, with aircraft by name; a scenario has sections of nodes."""
+    """Whether the path names the file of a fleet, with aircraft by name; a scenario has sections of
+    nodes.
+    """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
         return isinstance(content, Mapping) and "aircraft" in content
@@ -46,30 +50,53 @@ def is_fleet(name: FilePath) -> bool:
 class AircraftOfFleet(Config):
     """An aircraft of a fleet."""
 
-    scenario: str | None = Field(default=None, description="name or path of a scenario; by default that of the fleet")
-    set: Overrides = Field(default={}, description="parameters in place of those of the scenario, by section")
-    start: dict[str, Number] = Field(default={}, description="where it is at its t = 0: north, east, m, and heading, rad")
+    scenario: str | None = Field(
+        default=None, description="name or path of a scenario; by default that of the fleet"
+    )
+    set: Overrides = Field(
+        default={}, description="parameters in place of those of the scenario, by section"
+    )
+    start: dict[str, Number] = Field(
+        default={}, description="where it is at its t = 0: north, east, m, and heading, rad"
+    )
     delay: NonNegative = Field(default=0.0, description="its t = 0 after that of the fleet, s")
-    route: str | None = Field(default=None, description="path of a route file, flown from the start")
+    route: str | None = Field(
+        default=None, description="path of a route file, flown from the start"
+    )
 
 
 class FleetConfig(Config):
     """A fleet as in the file. Paths are relative to the folder of the file."""
 
-    scenario: str = Field(default="osprey_route", description="scenario of the aircraft that name none")
-    duration: Positive | None = Field(default=None, description="flight time of each aircraft, s; by default its scenario's")
-    lockstep: bool = Field(default=False, description="fly as fast as the machine allows, in lockstep, each by itself")
-    composed: bool = Field(default=False, description="all nodes of an aircraft in one process")
-    set: Overrides = Field(default={}, description="parameters of all aircraft, by section: a shared wind, for instance")
-    origin: Annotated[tuple[Degrees, ...], Field(min_length=2, max_length=2)] | None = Field(
-        default=None, description="latitude and longitude of north = east = 0, degrees; by default the home of each route"
+    scenario: str = Field(
+        default="osprey_route", description="scenario of the aircraft that name none"
     )
-    aircraft: Annotated[dict[str, AircraftOfFleet | None], Field(min_length=1)] = Field(description="the aircraft by name")
+    duration: Positive | None = Field(
+        default=None, description="flight time of each aircraft, s; by default its scenario's"
+    )
+    lockstep: bool = Field(
+        default=False, description="fly as fast as the machine allows, in lockstep, each by itself"
+    )
+    composed: bool = Field(default=False, description="all nodes of an aircraft in one process")
+    set: Overrides = Field(
+        default={},
+        description="parameters of all aircraft, by section: a shared wind, for instance",
+    )
+    origin: Annotated[tuple[Degrees, ...], Field(min_length=2, max_length=2)] | None = Field(
+        default=None,
+        description="latitude and longitude of north = east = 0, degrees; by default the home "
+        "of each route",
+    )
+    aircraft: Annotated[dict[str, AircraftOfFleet | None], Field(min_length=1)] = Field(
+        description="the aircraft by name"
+    )
 
 
 @dataclass(frozen=True)
 class Member:
-    """An aircraft of a fleet: name and namespace, scenario, and t = 0 after t = 0 of the fleet, s."""
+    """An aircraft of a fleet: name and namespace, scenario, and t = 0 after t = 0 of the fleet,
+    s.
+    """
 
     name: str
     scenario: Scenario
@@ -89,12 +116,16 @@ class Fleet:
         """The DDS participants of a flight: the command, and the processes."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            return 1 + sum(1 + scenario.learns() for scenario in scenarios)  # a learner has a process of its own
+            return 1 + sum(
+                1 + scenario.learns() for scenario in scenarios
+            )  # a learner has a process of its own
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
 
 def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
-    """Read the file of a fleet; `duration` in s replaces the duration of the file. Raises ParameterError."""
+    """Read the file of a fleet; `duration` in s replaces the duration of the file. Raises
+    ParameterError.
+    """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
     require(isinstance(content, Mapping), str(path), "no mapping", A_FLEET)
@@ -105,24 +136,38 @@ def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
         try:
             namespace = absolute_namespace(name)
             require(namespace.count("/") == 1, "name", repr(name), "one word")
-            members.append(Member(name, _scenario(config, aircraft, path.parent, duration), aircraft.delay))
+            members.append(
+                Member(name, _scenario(config, aircraft, path.parent, duration), aircraft.delay)
+            )
         except ParameterError as error:
             raise ParameterError(f"{path.stem}.aircraft.{name}: {error}") from None
         late = config.lockstep and aircraft.delay > 0.0
         require(
-            not late, f"{path.stem}.aircraft.{name}.delay", f"{aircraft.delay:g} s", "0 in lockstep, which has no common time"
+            not late,
+            f"{path.stem}.aircraft.{name}.delay",
+            f"{aircraft.delay:g} s",
+            "0 in lockstep, which has no common time",
         )
     fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed)
     cheaper = "" if config.composed else "; composed: true takes one an aircraft"
     participants = f"{fleet.participants()} participants of the middleware"
-    require(fleet.participants() <= MAX_PARTICIPANTS, path.stem, participants, f"at most {MAX_PARTICIPANTS}{cheaper}")
+    require(
+        fleet.participants() <= MAX_PARTICIPANTS,
+        path.stem,
+        participants,
+        f"at most {MAX_PARTICIPANTS}{cheaper}",
+    )
     return fleet
 
 
-def _scenario(config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, duration: float | None) -> Scenario:
+def _scenario(
+    config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, duration: float | None
+) -> Scenario:
     """The scenario of an aircraft. Raises ParameterError."""
     name = aircraft.scenario or config.scenario
-    scenario = find_scenario(folder / name if name.endswith(".yaml") else name, with_route=aircraft.route is None)
+    scenario = find_scenario(
+        folder / name if name.endswith(".yaml") else name, with_route=aircraft.route is None
+    )
     for changes in (config.set, aircraft.set):
         scenario = scenario.vary(**_nested(scenario, changes))
     if aircraft.start:
@@ -136,7 +181,9 @@ def _scenario(config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, dura
     return scenario
 
 
-def _nested(scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def _nested(
+    scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
     """Changes by section in which a mapping changes some keys of a group, and keeps the others."""
 
     def merged(old: Any, new: Any) -> Any:
@@ -148,7 +195,9 @@ def _nested(scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]) -> dic
     nested = {}
     for name, section in changes.items():
         config = getattr(scenario, name, None)
-        nested[name] = {key: merged(getattr(config, key, None), value) for key, value in section.items()}
+        nested[name] = {
+            key: merged(getattr(config, key, None), value) for key, value in section.items()
+        }
     return nested
 
 
@@ -166,7 +215,9 @@ class _Flight:
     stopping: threading.Thread | None = None
 
     def start(self, fleet: Fleet) -> None:
-        """Start the processes. In real time wait until they are ready: a host does not start many at once."""
+        """Start the processes. In real time wait until they are ready: a host does not start many
+        at once.
+        """
         self.progress(0.0, "starting")
         try:
             self.processes = FlightProcesses(
@@ -186,13 +237,23 @@ class _Flight:
                 self.begin(fleet, (0.0, 0.0))
 
     def begin(self, fleet: Fleet, start: tuple[float, float]) -> None:
-        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s; in lockstep it has begun."""
+        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s; in
+        lockstep it has begun.
+        """
         if self.processes is None or self.stopping is not None:
             return
-        if reason := self.processes.begin((start[0] + self.member.delay, start[1] + self.member.delay)):
+        if reason := self.processes.begin(
+            (start[0] + self.member.delay, start[1] + self.member.delay)
+        ):
             self.end(reason)
         else:
-            self.steps = follow(self.member.scenario, self.processes, self.monitor, self.progress, lockstep=fleet.lockstep)
+            self.steps = follow(
+                self.member.scenario,
+                self.processes,
+                self.monitor,
+                self.progress,
+                lockstep=fleet.lockstep,
+            )
 
     def step(self) -> bool:
         """Look at the flight once. Returns whether the flight goes on."""
@@ -204,10 +265,14 @@ class _Flight:
         return self.steps is not None
 
     def end(self, outcome: str) -> None:
-        """Stop the processes, in another thread: a recorder takes a while to close a log, and the fleet flies on."""
+        """Stop the processes, in another thread: a recorder takes a while to close a log, and the
+        fleet flies on.
+        """
         self.outcome = outcome
         self.steps = None
-        self.progress(self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome)
+        self.progress(
+            self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome
+        )
         if self.processes is not None and self.stopping is None:
             self.processes.outcome = outcome
             self.stopping = threading.Thread(target=self.processes.stop)
@@ -233,13 +298,16 @@ def new_runs(fleet: Fleet, runs: Path) -> list[Path]:
     return [new_run(member.scenario, runs, f"{member.name}-") for member in fleet.members]
 
 
-def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float, str], None]) -> list[Flown]:
+def fly_fleet(
+    fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float, str], None]
+) -> list[Flown]:
     """Fly a fleet over topics, with a run for each aircraft.
 
     `progress` is called with the name of an aircraft, flight time, s, and a text.
 
-    In real time the aircraft share t = 0, set once every node is ready; an aircraft may begin later by a delay. An aircraft
-    that ends early, or never begins, leaves the others untouched. Ctrl-C ends all. Raises ParameterError where none can begin.
+    In real time the aircraft share t = 0, set once every node is ready; an aircraft may begin later
+    by a delay. An aircraft that ends early, or never begins, leaves the others untouched. Ctrl-C
+    ends all. Raises ParameterError where none can begin.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -250,7 +318,9 @@ def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float
             for member, run in zip(fleet.members, runs, strict=True):
                 outputs = member.scenario.controller.outputs
                 namespace = absolute_namespace(member.name)
-                monitor = stack.enter_context(FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace))
+                monitor = stack.enter_context(
+                    FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace)
+                )
                 flights.append(_Flight(member, run, monitor, partial(progress, member.name)))
             for flight in flights:
                 flight.start(fleet)
@@ -263,7 +333,9 @@ def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float
         except KeyboardInterrupt:
             pass
         finally:
-            with handle_signals(signal.SIG_IGN):  # as of FlightProcesses.stop, which runs in other threads
+            with handle_signals(
+                signal.SIG_IGN
+            ):  # as of FlightProcesses.stop, which runs in other threads
                 for flight in flights:
                     flight.end(flight.outcome)
                 for flight in flights:

@@ -16,8 +16,8 @@ VERSION = 24
 PACKET = struct.Struct(
     ">II3d"  # version, padding; longitude, latitude, rad, altitude above sea level, m
     "f3f2f3f"  # height above ground, m; phi, theta, psi; alpha, beta; their rates, rad and rad/s
-    "2f3f"  # calibrated airspeed, knots, climb, ft/s; velocity to the north, to the east and down, ft/s
-    "3f3f2f"  # velocity and acceleration in body axes, ft/s and ft/s^2; stall warning, slip
+    # calibrated airspeed, knots, climb, ft/s; velocity to the north, to the east and down, ft/s
+    "2f3f3f3f2f"  # velocity and acceleration in body axes, ft/s and ft/s^2; stall warning, slip
     "I4I36f"  # engines: number, states, nine figures of four engines
     "I4fI3I9f"  # tanks; wheels
     "Iif10f"  # time, its warp, s; visibility, m; control surfaces, normalised
@@ -30,7 +30,9 @@ WHEELS = 3
 
 
 def packet(pose: Mapping[str, float], origin: Origin, ground: float, seconds: int) -> bytes:
-    """The packet of a pose, `channels.POSE` as far as known. `ground`: altitude of the origin, m; `seconds`: system time."""
+    """The packet of a pose, `channels.POSE` as far as known. `ground`: altitude of the origin, m;
+    `seconds`: system time.
+    """
 
     def value(name: str) -> float:
         return pose.get(name, 0.0)
@@ -39,8 +41,24 @@ def packet(pose: Mapping[str, float], origin: Origin, ground: float, seconds: in
     speed = math.hypot(value("v_north"), value("v_east"), value("climb"))
     return PACKET.pack(
         *(VERSION, 0, longitude, latitude, ground + value("altitude")),
-        *(value("altitude"), value("phi"), value("theta"), value("psi"), 0.0, value("beta"), 0.0, 0.0, 0.0),
-        *(speed / KNOT, value("climb") / FOOT, value("v_north") / FOOT, value("v_east") / FOOT, -value("climb") / FOOT),
+        *(
+            value("altitude"),
+            value("phi"),
+            value("theta"),
+            value("psi"),
+            0.0,
+            value("beta"),
+            0.0,
+            0.0,
+            0.0,
+        ),
+        *(
+            speed / KNOT,
+            value("climb") / FOOT,
+            value("v_north") / FOOT,
+            value("v_east") / FOOT,
+            -value("climb") / FOOT,
+        ),
         *(speed / FOOT, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         *(ENGINES, RUNNING, 0, 0, 0, *[0.0] * 36),
         *(0, *[0.0] * 4, WHEELS, 0, 0, 0, *[0.0] * 9),

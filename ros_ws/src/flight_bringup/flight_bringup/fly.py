@@ -21,7 +21,14 @@ from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
-from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, SEARCH_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
+from flight_bringup.processes import (
+    FIRST_U,
+    LOG_TIMEOUT,
+    SEARCH_TIMEOUT,
+    FlightProcesses,
+    NotReadyError,
+    handle_signals,
+)
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
 from flight_core.files import writing
@@ -42,7 +49,8 @@ NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s ol
 STAMP_ERROR = 1e-5  # s, of a time of day as a float
 
 STALL_TIMEOUT = 40.0
-"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within three seconds."""
+"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within
+three seconds."""
 
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
@@ -52,7 +60,9 @@ Steps = Generator[None, None, str]
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each process."""
+    """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases
+    a lock of each process.
+    """
     handle_shutdown(signal.SIG_IGN)
     if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
         nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -75,12 +85,13 @@ def fly_over_topics(
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
-    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process.
-    `autopilot` flies in the aircraft's place, in real time only. All nodes are in the `namespace`, as "/uav1". `announce` gets
-    a line for each change of engagement and of reason, but not for a changed number, and for what becomes of a proposal of a
-    learner. With `engaged_for`, s, the flight ends so long after its first engagement, or with it, or without one when too
-    little time is left.
-    Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
+    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one
+    process. `autopilot` flies in the aircraft's place, in real time only. All nodes are in the
+    `namespace`, as "/uav1". `announce` gets a line for each change of engagement and of reason, but
+    not for a changed number, and for what becomes of a proposal of a learner. With `engaged_for`,
+    s, the flight ends so long after its first engagement, or with it, or without one when too
+    little time is left. Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a
+    sentence that names the process that ended early.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -89,7 +100,10 @@ def fly_over_topics(
         with (
             handle_signals(interrupt),
             FlightMonitor(
-                scenario.controller.outputs, lockstep=lockstep, learns=scenario.learns(), namespace=namespace
+                scenario.controller.outputs,
+                lockstep=lockstep,
+                learns=scenario.learns(),
+                namespace=namespace,
             ) as monitor,
             FlightProcesses(
                 scenario,
@@ -105,7 +119,13 @@ def fly_over_topics(
                 processes.outcome = reason
             else:
                 steps = follow(
-                    scenario, processes, monitor, progress, lockstep=lockstep, announce=announce, engaged_for=engaged_for
+                    scenario,
+                    processes,
+                    monitor,
+                    progress,
+                    lockstep=lockstep,
+                    announce=announce,
+                    engaged_for=engaged_for,
                 )
                 processes.outcome = last(steps)
             return processes.outcome
@@ -138,18 +158,31 @@ def follow(
     """Follow a flight that has begun, a step every POLL_PERIOD; as `fly_over_topics`."""
     if lockstep:
         return _follow_lockstep(scenario, processes, monitor, progress, announce)
-    begins = processes.autopilot is None and scenario.controller.autostart and scenario.controller.start_active
+    begins = (
+        processes.autopilot is None
+        and scenario.controller.autostart
+        and scenario.controller.start_active
+    )
     span = _Span(scenario, processes, monitor, begins=begins)
     return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
 
 
 class _Span:
-    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u to the end.
+    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u
+    to the end.
 
-    A flight with an autopilot, or with a controller that a user activates, may fly without u: `begins` is False.
+    A flight with an autopilot, or with a controller that a user activates, may fly without u:
+    `begins` is False.
     """
 
-    def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", *, begins: bool) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        processes: FlightProcesses,
+        monitor: "FlightMonitor",
+        *,
+        begins: bool,
+    ) -> None:
         self._duration = scenario.flight.duration
         self._processes = processes
         self._monitor = monitor
@@ -161,7 +194,9 @@ class _Span:
 
     def outcome(self, t: float) -> str:
         """The outcome once the log holds the flight, or is not going to; empty before."""
-        if (stamp := self._monitor.recorded()) is not None and stamp - self._processes.start_time > self._until:
+        if (
+            stamp := self._monitor.recorded()
+        ) is not None and stamp - self._processes.start_time > self._until:
             self._until = stamp - self._processes.start_time
             self._moved = t
         if t < self._duration:
@@ -215,7 +250,9 @@ def _follow_real_time(
             announced = kind
             if phase == "ENGAGED":
                 engaged_at = min(engaged_at, t)
-        if t > engaged_at + engaged_for or (engaged_for < math.inf and engaged_at < math.inf and phase != "ENGAGED"):
+        if t > engaged_at + engaged_for or (
+            engaged_for < math.inf and engaged_at < math.inf and phase != "ENGAGED"
+        ):
             return COMPLETED
         if engaged_at == math.inf and t > (latest := scenario.flight.duration - engaged_for) > 0.0:
             return f"not engaged within {latest:.3g} s"
@@ -224,14 +261,20 @@ def _follow_real_time(
         elif (status := monitor.newest()) is not None:
             mode, values = status
             span.engaged = True
-            errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
+            errors = (
+                f"{name} {e * units[name].factor:+.2f}"
+                for name, e in zip(outputs, values, strict=True)
+            )
             text = f"{mode}  e: {', '.join(errors)}"
         progress(min(max(t, 0.0), scenario.flight.duration), text)
         yield
 
 
 def _announce_learned(
-    processes: FlightProcesses, monitor: "FlightMonitor", start_time: float, announce: Callable[[str], None]
+    processes: FlightProcesses,
+    monitor: "FlightMonitor",
+    start_time: float,
+    announce: Callable[[str], None],
 ) -> None:
     """Announce what became of proposals since the last call, and the end of the learner."""
     for instant, sentence in monitor.learned():
@@ -247,8 +290,12 @@ def _follow_lockstep(
     progress: Progress,
     announce: Callable[[str], None],
 ) -> Steps:
-    """The real-time factor counts from the first instant in the log. The flight ends with the last u, and a complete log."""
-    end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
+    """The real-time factor counts from the first instant in the log. The flight ends with the last
+    u, and a complete log.
+    """
+    end = (
+        scenario.flight.duration - 1.0 / scenario.aircraft.rate
+    )  # the last instant is the aircraft's last whole period
     t = 0.0
     last_change = time.monotonic()
     text = "lockstep, starting"
@@ -281,9 +328,11 @@ def fly_in_process(
     learn: Learn | None = None,
     announce: Callable[[str], None] = lambda line: None,
 ) -> str:
-    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome.
+    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`.
+    Returns the outcome.
 
-    `learn` makes the learner of a scenario that learns. What it does goes to `announce` and to log/learner.log, a line each.
+    `learn` makes the learner of a scenario that learns. What it does goes to `announce` and to
+    log/learner.log, a line each.
     """
     interrupt = _DeferredInterrupt()
 
@@ -294,7 +343,9 @@ def fly_in_process(
     def learned(event: Event) -> None:
         line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.sentence}"
         with interrupt.deferred():
-            writer.write_learning(event.stamp_ns, event.kind, event.sentence, warns=not event.change)
+            writer.write_learning(
+                event.stamp_ns, event.kind, event.sentence, warns=not event.change
+            )
             if event.change:
                 writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)
             (run / "log").mkdir(exist_ok=True)
@@ -302,8 +353,14 @@ def fly_in_process(
                 log.write(f"{line}\n")
         announce(line)
 
-    with writing("", run, EXPECTED), TapeWriter(run, attachments_for(scenario, run)) as writer, handle_signals(interrupt):
-        outcome = fly(scenario, record, lambda t: progress(t, "in one process"), learn=learn, announce=learned)
+    with (
+        writing("", run, EXPECTED),
+        TapeWriter(run, attachments_for(scenario, run)) as writer,
+        handle_signals(interrupt),
+    ):
+        outcome = fly(
+            scenario, record, lambda t: progress(t, "in one process"), learn=learn, announce=learned
+        )
         with interrupt.deferred():
             writer.add_outcome(outcome)
     return outcome
@@ -315,17 +372,26 @@ def fly_and_report(
     progress: Callable[[float], None] | None = None,
     learn: Learn | None = None,
 ) -> FlightResult:
-    """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly --in-process` does.
+    """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly
+    --in-process` does.
 
-    `progress` is called with the flight time once per simulated second, `learn` is as for `simulate`. A scenario that differs
-    from its file is written beside the log. The log holds the outcome of a flight that ended early. Raises ParameterError where
-    nothing can be written, and for a flight that ended before its first sample.
+    `progress` is called with the flight time once per simulated second, `learn` is as for
+    `simulate`. A scenario that differs from its file is written beside the log. The log holds the
+    outcome of a flight that ended early. Raises ParameterError where nothing can be written, and
+    for a flight that ended before its first sample.
     """
-    require(progress is None or callable(progress), "progress", progress, "a function of the flight time in s")
+    require(
+        progress is None or callable(progress),
+        "progress",
+        progress,
+        "a function of the flight time in s",
+    )
     chosen = find_scenario(scenario)
     run = new_run(chosen, as_path(runs, "runs", "the path of a folder"))
     chosen = as_file(chosen, run)
-    outcome = fly_in_process(chosen, run, lambda t, _: None if progress is None else progress(t), learn)
+    outcome = fly_in_process(
+        chosen, run, lambda t, _: None if progress is None else progress(t), learn
+    )
     return write_report(run, outcome)
 
 
@@ -338,12 +404,16 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path) -> Scenario:
-    """The scenario with a file that holds it: its own, or a new one in the folder of the run. Raises ParameterError."""
+    """The scenario with a file that holds it: its own, or a new one in the folder of the run.
+    Raises ParameterError.
+    """
     return scenario if _is_its_file(scenario) else written(scenario, run / f"{scenario.name}.yaml")
 
 
 class _DeferredInterrupt:
-    """A signal handler that interrupts the flight between two writes of the log, not within a write."""
+    """A signal handler that interrupts the flight between two writes of the log, not within a
+    write.
+    """
 
     def __init__(self) -> None:
         self._deferred = False

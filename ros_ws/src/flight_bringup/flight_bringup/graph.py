@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a flight: nodes, start order, parameter overrides. Launch files and process runner share the graph."""
+"""The graph of a flight: nodes, start order, parameter overrides. Launch files and process runner
+share the graph.
+"""
 
 import re
 import time
@@ -39,21 +41,28 @@ BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 # All nodes in one process. Each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
-# The second stage starts once every node of the first is ready: the log then holds the whole flight, and the aircraft always
-# has a controller.
+# The second stage starts once every node of the first is ready: the log then holds the whole
+# flight, and the aircraft always has a controller.
 FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")  # of a namespace: stricter than ROS 2, which permits _ at the ends
+NAME = re.compile(
+    r"[A-Za-z](_?[A-Za-z0-9])*"
+)  # of a namespace: stricter than ROS 2, which permits _ at the ends
 
 
 def absolute_namespace(namespace: str) -> str:
-    """The namespace of an aircraft as "/uav1"; "" is the root. Raises ParameterError for a name that ROS 2 does not permit."""
+    """The namespace of an aircraft as "/uav1"; "" is the root. Raises ParameterError for a name
+    that ROS 2 does not permit.
+    """
     words = [word for word in namespace.split("/") if word]
     for word in words:
         require(
-            bool(NAME.fullmatch(word)), "--namespace", repr(namespace), "letters, digits and single _, as uav1, a letter first"
+            bool(NAME.fullmatch(word)),
+            "--namespace",
+            repr(namespace),
+            "letters, digits and single _, as uav1, a letter first",
         )
     return "".join(f"/{word}" for word in words)
 
@@ -77,11 +86,12 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 
 
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
-    """Raise ParameterError where the controller may command more than the map sends; a dry run sends nothing.
+    """Raise ParameterError where the controller may command more than the map sends; a dry run
+    sends nothing.
 
-    The bridge would clip u, and the anti-windup of the law would not know. The limits of the scenario are not narrowed here:
-    the log holds the parameters that flew. A controller with a held u while inactive is refused, too: the bridge engages
-    only from a u near trim.
+    The bridge would clip u, and the anti-windup of the law would not know. The limits of the
+    scenario are not narrowed here: the log holds the parameters that flew. A controller with a held
+    u while inactive is refused, too: the bridge engages only from a u near trim.
     """
     if autopilot.dry_run:
         return
@@ -89,20 +99,42 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     controller = scenario.controller
     key = f"scenario {scenario.name}: controller"
     found = controller.on_deactivate
-    require(found == "trim", f"{key}.on_deactivate", repr(found), "'trim' with a bridge, which engages only from a u near trim")
+    require(
+        found == "trim",
+        f"{key}.on_deactivate",
+        repr(found),
+        "'trim' with a bridge, which engages only from a u near trim",
+    )
     limits = controller.effector_limits()
-    for name, low, high in zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True):
+    for name, low, high in zip(
+        controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True
+    ):
         if (row := channel_map.inputs.get(name)) is None:
             continue  # another check names the channels that differ
-        of_map = f"of {name} in the map {channel_map.name}: what the bridge clips, the law's anti-windup does not know"
-        require(low >= row.lower, f"{key}.lower", f"{low:g}", f"at least {row.lower:g}, the lower limit {of_map}")
-        require(high <= row.upper, f"{key}.upper", f"{high:g}", f"at most {row.upper:g}, the upper limit {of_map}")
+        of_map = (
+            f"of {name} in the map {channel_map.name}: what the bridge clips, the law's "
+            "anti-windup does not know"
+        )
+        require(
+            low >= row.lower,
+            f"{key}.lower",
+            f"{low:g}",
+            f"at least {row.lower:g}, the lower limit {of_map}",
+        )
+        require(
+            high <= row.upper,
+            f"{key}.upper",
+            f"{high:g}",
+            f"at most {row.upper:g}, the upper limit {of_map}",
+        )
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance and the learner where it has them.
+    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance and the
+    learner where it has them.
 
-    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside a learner.
+    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside
+    a learner.
     """
     if not bridge:
         require_guidable(scenario)
@@ -115,7 +147,11 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
 
 def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
     """The nodes that a scenario may have."""
-    return tuple(node for node, has in ((GUIDANCE, scenario.guidance is not None), (LEARNER, scenario.learns())) if has)
+    return tuple(
+        node
+        for node, has in ((GUIDANCE, scenario.guidance is not None), (LEARNER, scenario.learns()))
+        if has
+    )
 
 
 ON_START = -1.0  # `start_time` of nodes that wait for t = 0 on the topic `start`
@@ -123,38 +159,59 @@ LEAD = 0.5  # s, from the sending of t = 0 on `start` to t = 0: a busy host deli
 
 
 def start_lead(startup: float) -> float:
-    """Time from the start of the second stage to t = 0, s, given the time until the first stage was ready.
+    """Time from the start of the second stage to t = 0, s, given the time until the first stage was
+    ready.
 
-    The second stage gets half as long again as the first stage took. The nodes get half a second for discovery.
+    The second stage gets half as long again as the first stage took. The nodes get half a second
+    for discovery.
     """
     return 0.5 + 1.5 * startup
 
 
 def start_instant(lead: float) -> float:
-    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so nodes with and without `start_time` tick together."""
+    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so nodes with and without
+    `start_time` tick together.
+    """
     return round(time.time() + lead, 2)
 
 
 def parameter_overrides(
-    spec: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
+    spec: NodeSpec,
+    scenario: Scenario,
+    run: Path,
+    start_time: float,
+    *,
+    lockstep: bool,
+    autopilot: Autopilot | None = None,
 ) -> ParameterOverrides:
-    """The parameters of a process beside the section of the scenario file; "node:name" for several nodes.
+    """The parameters of a process beside the section of the scenario file; "node:name" for several
+    nodes.
 
-    Real time: the nodes with a t = 0 get the instant, or ON_START. Lockstep: the aircraft gets the rate of u and the duration,
-    controller and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule, the learner
-    the scenario. The recorder gets the files to attach to the log; this function writes the files into the folder of the run.
-    With an autopilot the bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts
-    inactive.
+    Real time: the nodes with a t = 0 get the instant, or ON_START. Lockstep: the aircraft gets the
+    rate of u and the duration, controller and guidance the rate of y, the reference model the rate
+    of u_m. Guidance gets the numbers by rule, the learner the scenario. The recorder gets the files
+    to attach to the log; this function writes the files into the folder of the run. With an
+    autopilot the bridge gets the channel map, the recorder the topics of the autopilot, and the
+    controller starts inactive.
     """
     if spec is BRIDGE:
-        return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
+        return (
+            {}
+            if autopilot is None
+            else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
+        )
     one_process = spec is ONE_PROCESS
     guidance = scenario.guidance
     further: list[str] = []
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
-    overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
+    overrides: dict[NodeSpec, ParameterOverrides] = {
+        node: {"lockstep": lockstep} for node in stages
+    }
     if guidance is not None:
-        overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}
+        overrides[GUIDANCE] |= {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in guidance.by_rule()
+        }
         further += topics.recorded_with("guidance")
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
@@ -173,13 +230,17 @@ def parameter_overrides(
         overrides[CONTROLLER]["y_rate"] = scenario.aircraft.rate
         if guidance is not None:
             overrides[GUIDANCE]["y_rate"] = scenario.aircraft.rate
-            overrides[GUIDANCE]["authority_rate"] = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
+            overrides[GUIDANCE]["authority_rate"] = (
+                scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
+            )
             overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
     if spec in (RECORDER, ONE_PROCESS):
         if autopilot is not None:
             overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further, *autopilot.topics]
         maps = () if autopilot is None else (autopilot.map_path,)
-        files = attachments_for(scenario, run, {node.executable: values for node, values in overrides.items()}, maps)
+        files = attachments_for(
+            scenario, run, {node.executable: values for node, values in overrides.items()}, maps
+        )
         overrides[RECORDER] |= {
             "scenario_file": str(files.scenario),
             "attach": [str(path) for path in files.files],
@@ -190,20 +251,32 @@ def parameter_overrides(
             overrides.pop(LEARNER, None)  # which has a process of its own
             for node in (*SECOND_STAGE, *(() if guidance is None else (GUIDANCE,))):
                 overrides[node]["start_time"] = start_time
-        return {f"{node.executable}:{name}": value for node, values in overrides.items() for name, value in values.items()}
-    return overrides[spec] | ({"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {})
+        return {
+            f"{node.executable}:{name}": value
+            for node, values in overrides.items()
+            for name, value in values.items()
+        }
+    return overrides[spec] | (
+        {"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {}
+    )
 
 
 def replayed_topics(
-    recorded: Collection[str], nodes: Collection[NodeSpec], namespace: str = "", autopilot: Autopilot | None = None
+    recorded: Collection[str],
+    nodes: Collection[NodeSpec],
+    namespace: str = "",
+    autopilot: Autopilot | None = None,
 ) -> list[str]:
     """The recorded topics without a publisher among the nodes; full names, in order.
 
-    `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its channel map.
+    `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its
+    channel map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    published = {prefix + name for name in names if not name.startswith("/")}  # else others publish the topic, too
+    published = {
+        prefix + name for name in names if not name.startswith("/")
+    }  # else others publish the topic, too
     if BRIDGE in nodes and autopilot is not None:
         sent = (message.topic for message in autopilot.channel_map.messages.values())
         published |= {topic if topic.startswith("/") else prefix + topic for topic in sent}

@@ -34,23 +34,37 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 
 class FlightMonitor(Client):
-    """Monitors a flight: states of its nodes, internals of the controller, in lockstep the progress of the log."""
+    """Monitors a flight: states of its nodes, internals of the controller, in lockstep the progress
+    of the log.
+    """
 
-    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool, learns: bool = False, namespace: str = "") -> None:
+    def __init__(
+        self, outputs: tuple[str, ...], *, lockstep: bool, learns: bool = False, namespace: str = ""
+    ) -> None:
         super().__init__("monitor", namespace)
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
-        self._internals = None if lockstep else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
+        self._internals = (
+            None
+            if lockstep
+            else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
+        )
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process
-        self._publish_start = self._node.create_publisher(START.type, START.name, offered(START)).publish
+        self._publish_start = self._node.create_publisher(
+            START.type, START.name, offered(START)
+        ).publish
         self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
-        self._learning = PolledSubscription(self._node, LEARNING, PUBLISH, raw=True) if learns else None
+        self._learning = (
+            PolledSubscription(self._node, LEARNING, PUBLISH, raw=True) if learns else None
+        )
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def is_ready(self, node: str, pid: int) -> bool:
-        """Whether the loop of a node runs. The process id tells it from a node of that name in another flight."""
+        """Whether the loop of a node runs. The process id tells it from a node of that name in
+        another flight.
+        """
         return self._state(node, pid) in {*NodeState}
 
     def is_matched(self, node: str, pid: int) -> bool:
@@ -89,24 +103,38 @@ class FlightMonitor(Client):
     def engagement(self) -> list[tuple[str, str]]:
         """Phases of a bridge with their reasons, in order, since the last call."""
         messages = () if self._engagement is None else self._engagement.take()
-        return [(bounded(received.message.key), bounded(received.message.value)) for received in messages]
+        return [
+            (bounded(received.message.key), bounded(received.message.value))
+            for received in messages
+        ]
 
     def learned(self) -> list[tuple[float, str]]:
-        """What became of proposals of a learner since the last call: instants by the clock of the stamps, s, and sentences."""
+        """What became of proposals of a learner since the last call: instants by the clock of the
+        stamps, s, and sentences.
+        """
         received = () if self._learning is None else self._learning.take()
         decoded = [reports.decode(message.message) for message in received]
         return [(seconds(report.stamp_ns), bounded(report.sentence)) for report in decoded]
 
     def recorded(self) -> float | None:
-        """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""
+        """The flight time up to which the log of a lockstep flight is complete, s; None without a
+        change.
+        """
         messages = self._recorded.take()
         return seconds(stamp_of(messages[-1].message)) if messages else None
 
     def require_free_domain(self) -> None:
-        """Raise ParameterError where the namespace already has an aircraft or a reference model in this domain."""
+        """Raise ParameterError where the namespace already has an aircraft or a reference model in
+        this domain.
+        """
         for topic in (Y, Y_M):
             count = self._node.count_publishers(topic.name)
             domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            publishers = f"{count} publishers of {self._node.resolve_topic_name(topic.name)} already"
-            expected = "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own: --namespace"
+            publishers = (
+                f"{count} publishers of {self._node.resolve_topic_name(topic.name)} already"
+            )
+            expected = (
+                "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace "
+                "of its own: --namespace"
+            )
             require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, expected)

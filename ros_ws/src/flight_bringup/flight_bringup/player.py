@@ -32,16 +32,21 @@ Outgoing = tuple[int, str, bytes, bool]
 class Player(Client):
     """Publishers on the topics of a log and on `/clock`.
 
-    `shared` are topics that may have other publishers. Raises ParameterError if any other topic has one, or if a message type
-    is not installed.
+    `shared` are topics that may have other publishers. Raises ParameterError if any other topic has
+    one, or if a message type is not installed.
     """
 
     def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
         super().__init__("player", rosout=False)
         try:
-            self._require_no_publishers([topic for topic in (*types, CLOCK_NAME) if topic not in shared])
-            self._publishers = {topic: self._node.create_publisher(kind, topic, LOCKSTEP) for topic, kind in kinds.items()}
+            self._require_no_publishers(
+                [topic for topic in (*types, CLOCK_NAME) if topic not in shared]
+            )
+            self._publishers = {
+                topic: self._node.create_publisher(kind, topic, LOCKSTEP)
+                for topic, kind in kinds.items()
+            }
             self._clock = self._node.create_publisher(CLOCK.type, CLOCK_NAME, LOCKSTEP)
             time.sleep(MATCHING_TIME)
         except BaseException:
@@ -54,17 +59,31 @@ class Player(Client):
         while time.monotonic_ns() < end_ns:
             for topic in topics:
                 count = self._node.count_publishers(topic)
-                expected = "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
-                require(count == 0, f"ROS_DOMAIN_ID {domain}", f"{count} publishers of {topic} already", expected)
+                expected = (
+                    "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
+                )
+                require(
+                    count == 0,
+                    f"ROS_DOMAIN_ID {domain}",
+                    f"{count} publishers of {topic} already",
+                    expected,
+                )
             time.sleep(IDLE_POLL_PERIOD)
 
     def play(
-        self, messages: Iterable[Outgoing], rate: float, *, stamps_now: bool, progress: Callable[[int], None] | None = None
+        self,
+        messages: Iterable[Outgoing],
+        rate: float,
+        *,
+        stamps_now: bool,
+        progress: Callable[[int], None] | None = None,
     ) -> None:
-        """Publish all messages, the first one immediately, each other one at its time since the first one over `rate`.
+        """Publish all messages, the first one immediately, each other one at its time since the
+        first one over `rate`.
 
-        Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the age of a message against the system
-        clock becomes its age in the log over `rate`. `progress` is called with the instant of the log, ns, ten times a second.
+        Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the age of a
+        message against the system clock becomes its age in the log over `rate`. `progress` is
+        called with the instant of the log, ns, ten times a second.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, stamped in messages:
@@ -81,7 +100,9 @@ class Player(Client):
                     progress(due_ns)
             _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
             restamp = stamps_now and stamped
-            self._publishers[topic].publish(_restamped(message, begin_system_ns, first_ns, rate) if restamp else message)
+            self._publishers[topic].publish(
+                _restamped(message, begin_system_ns, first_ns, rate) if restamp else message
+            )
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
 
@@ -100,7 +121,9 @@ def _sleep_until(deadline_ns: int) -> None:
 
 
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
-    """The topics with a message type that is not installed, with the type, or with a name that no topic of ROS may have."""
+    """The topics with a message type that is not installed, with the type, or with a name that no
+    topic of ROS may have.
+    """
     lacking = {}
     for topic, name in types.items():
         try:
@@ -116,4 +139,6 @@ def _message_type(topic: str, name: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError, ValueError):  # the name may hold anything
-        raise ParameterError(f"{topic}: its type {name} is not installed, expected the package {package}") from None
+        raise ParameterError(
+            f"{topic}: its type {name} is not installed, expected the package {package}"
+        ) from None

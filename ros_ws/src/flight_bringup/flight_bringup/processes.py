@@ -45,10 +45,13 @@ if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
-CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
+CLOSE_TIMEOUT = (
+    30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
+)
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
-DISCOVERY_TIME = 0.5  # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
+# s, until the publishers of another flight on this host are known, twice the measured 0.25 s
+DISCOVERY_TIME = 0.5
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
 FIRST_U = 5.0  # s, from t = 0 to the first u that the aircraft takes
 LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
@@ -56,7 +59,9 @@ POLL_PERIOD = 0.005  # s, while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Prefix of a command: SIGTERM when this process dies. Needs setpriv of util-linux, empty without it."""
+    """Prefix of a command: SIGTERM when this process dies. Needs setpriv of util-linux, empty
+    without it.
+    """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
@@ -68,8 +73,12 @@ def start_instants(lead: float) -> tuple[float, float]:
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` in the block; Python permits handlers in the main thread alone."""
-    before = handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
+    """Handle the signals of `handle_shutdown` in the block; Python permits handlers in the main
+    thread alone.
+    """
+    before = (
+        handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
+    )
     try:
         yield
     finally:
@@ -78,7 +87,9 @@ def handle_signals(handler: Any) -> Iterator[None]:
 
 
 def leave_outcome(run: Path, outcome: str) -> None:
-    """Leave the outcome of a flight for the recorder; `Path()` records none. A full disk costs the log the outcome alone."""
+    """Leave the outcome of a flight for the recorder; `Path()` records none. A full disk costs the
+    log the outcome alone.
+    """
     if run.name:
         with suppress(OSError, ParameterError):
             write_file(run / OUTCOME_FILE, outcome)
@@ -92,11 +103,20 @@ class NodeProcess:
     """One node as a process. Its output goes to a file; `lines` holds the last lines."""
 
     def __init__(
-        self, node: NodeSpec, scenario_file: Path, overrides: ParameterOverrides, log: Path, namespace: str = ""
+        self,
+        node: NodeSpec,
+        scenario_file: Path,
+        overrides: ParameterOverrides,
+        log: Path,
+        namespace: str = "",
     ) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
-        module = ["-P", "-m", node.module]  # -P: a package in the working folder must not replace a package of the stack
+        module = [
+            "-P",
+            "-m",
+            node.module,
+        ]  # -P: a package in the working folder must not replace a package of the stack
         command = [*end_with_parent(), sys.executable, *module]
         arguments = ["--ros-args", "--params-file", str(scenario_file)]
         if namespace:
@@ -104,11 +124,22 @@ class NodeProcess:
         if node is ONE_PROCESS:  # `-p node:name` would mean a node without a namespace
             sections = nest({name.replace(":", ".", 1): value for name, value in overrides.items()})
             file = log.with_suffix(".yaml")
-            write_file(file, dump_yaml({f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}))
+            write_file(
+                file,
+                dump_yaml(
+                    {
+                        f"/**/{name}": {"ros__parameters": values}
+                        for name, values in sections.items()
+                    }
+                ),
+            )
             arguments = [*sections, *arguments, "--params-file", str(file)]
             overrides = {}
         for name, value in overrides.items():
-            arguments += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
+            arguments += [
+                "-p",
+                f"{name}:={json.dumps(value)}",
+            ]  # JSON is YAML, and quotes what needs quotes
         self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
             [*command, *arguments],
@@ -116,7 +147,8 @@ class NodeProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            process_group=0,  # Ctrl-C reaches the command alone, which then stops the nodes in order
+            # Ctrl-C reaches the command alone, which then stops the nodes in order
+            process_group=0,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -144,8 +176,9 @@ class NodeProcess:
 class FlightProcesses:
     """All processes of one flight. A context manager: its exit stops them.
 
-    `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the bridge starts in the aircraft's
-    place. A flight in real time with an aircraft has its t = 0 from `begin`, once `match` has seen it ready.
+    `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the
+    bridge starts in the aircraft's place. A flight in real time with an aircraft has its t = 0 from
+    `begin`, once `match` has seen it ready.
     """
 
     def __init__(
@@ -167,15 +200,21 @@ class FlightProcesses:
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()  # a search would delay ticks of its own process
-        self._in_one_process = [spec.executable for spec in (*self._first, *self._second) if spec not in apart]
+        apart = (
+            (LEARNER,) if LEARNER in self._second and not lockstep else ()
+        )  # a search would delay ticks of its own process
+        self._in_one_process = [
+            spec.executable for spec in (*self._first, *self._second) if spec not in apart
+        ]
         if one_process:
             self._first = ()
             self._second = (ONE_PROCESS, *apart)
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # system time of t = 0, s
-        self.started = math.inf  # the same on the monotonic clock, as the nodes count: a step of the system clock is none of t
+        # the same on the monotonic clock, as the nodes count: a step of the system clock is none of
+        # t
+        self.started = math.inf
         self._on_start = not lockstep and autopilot is None
 
     def __enter__(self) -> Self:
@@ -202,7 +241,9 @@ class FlightProcesses:
         self.start_time, self.started = start
 
     def match(self) -> str:
-        """Wait until each node is ready and each input has a publisher. Returns why the flight cannot begin, else ""."""
+        """Wait until each node is ready and each input has a publisher. Returns why the flight
+        cannot begin, else "".
+        """
         deadline = time.monotonic() + READY_TIMEOUT
         while self._on_start and (waiting := self._unmatched()):
             if (reason := self.ended_early()) is not None:
@@ -215,7 +256,8 @@ class FlightProcesses:
     def begin(self, start: tuple[float, float] | None = None) -> str:
         """Set t = 0 after `match`. Returns why the flight cannot begin, else "".
 
-        `start`: system time and monotonic time of t = 0, s, of several flights at once; by default LEAD from now.
+        `start`: system time and monotonic time of t = 0, s, of several flights at once; by default
+        LEAD from now.
         """
         leave_real_time_priority()  # the nodes have it
         if not (reason := self.match()) and self._on_start:
@@ -239,7 +281,10 @@ class FlightProcesses:
         names = self._nodes()
         ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
-        return [f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}" for name in unmatched]
+        return [
+            f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}"
+            for name in unmatched
+        ]
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -249,11 +294,18 @@ class FlightProcesses:
         log.parent.mkdir(parents=True, exist_ok=True)
         start = ON_START if self._on_start else self.start_time
         overrides = parameter_overrides(
-            node, self._scenario, self._run, start, lockstep=self._lockstep, autopilot=self.autopilot
+            node,
+            self._scenario,
+            self._run,
+            start,
+            lockstep=self._lockstep,
+            autopilot=self.autopilot,
         )
         if node is BRIDGE:
             overrides = {**overrides, "first_y": FIRST_Y}
-        self.processes.append(NodeProcess(node, self._scenario.path, overrides, log, self._namespace))
+        self.processes.append(
+            NodeProcess(node, self._scenario.path, overrides, log, self._namespace)
+        )
 
     def _wait_until_ready(self, deadline: float) -> None:
         while waiting := self.waiting():
@@ -261,16 +313,23 @@ class FlightProcesses:
                 statuses = {process.popen.poll() for process in self.processes}
                 raise (ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError)(reason)
             if time.monotonic() > deadline:
-                late = f"timed out waiting for {', '.join(waiting)}: not ready after {READY_TIMEOUT:g} s"
+                late = (
+                    f"timed out waiting for {', '.join(waiting)}: not ready after "
+                    f"{READY_TIMEOUT:g} s"
+                )
                 raise NotReadyError(f"{late}; see the logs in {self._run / 'log'}")
             time.sleep(POLL_PERIOD)
 
     def ended_early(self) -> str | None:
-        """The reason of the first process that has ended, None while all run. In real time the law flies on without a learner.
+        """The reason of the first process that has ended, None while all run. In real time the law
+        flies on without a learner.
 
-        On a busy host several may have ended since the last call. One that lost contact with another is then not the cause.
+        On a busy host several may have ended since the last call. One that lost contact with
+        another is then not the cause.
         """
-        processes = [process for process in self.processes if self._lockstep or process.node is not LEARNER]
+        processes = [
+            process for process in self.processes if self._lockstep or process.node is not LEARNER
+        ]
         reasons = [reason for process in processes if (reason := _end(process)) is not None]
         return min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
 
@@ -288,39 +347,64 @@ class FlightProcesses:
 
     def is_flying(self) -> bool:
         """Whether the aircraft has taken a u."""
-        return any(self._monitor.is_flying(name, pid) for name, pid in self._nodes() if name == AIRCRAFT.executable)
+        return any(
+            self._monitor.is_flying(name, pid)
+            for name, pid in self._nodes()
+            if name == AIRCRAFT.executable
+        )
 
     def is_completed(self) -> bool:
-        """Whether the aircraft has completed a lockstep flight, the u of its last instant included."""
-        return any(self._monitor.is_completed(name, pid) for name, pid in self._nodes() if name == AIRCRAFT.executable)
+        """Whether the aircraft has completed a lockstep flight, the u of its last instant
+        included.
+        """
+        return any(
+            self._monitor.is_completed(name, pid)
+            for name, pid in self._nodes()
+            if name == AIRCRAFT.executable
+        )
 
     def last_words(self, node: NodeSpec) -> str:
-        """The last line of a node on a topic that it waits for, or on a refused sample; empty without one."""
+        """The last line of a node on a topic that it waits for, or on a refused sample; empty
+        without one.
+        """
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):
                 lines += process.lines
-        line = next((line for line in reversed(lines) if "waiting for" in line or "refused" in line), "")
+        line = next(
+            (line for line in reversed(lines) if "waiting for" in line or "refused" in line), ""
+        )
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 
     def stop(self) -> None:
-        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT.
+        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder
+        CLOSE_TIMEOUT.
 
         At the end of a lockstep flight a learner completes its search first.
         """
-        with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it would truncate the log
+        with handle_signals(
+            signal.SIG_IGN
+        ):  # a second Ctrl-C must not interrupt this: it would truncate the log
             if self.processes:
                 leave_outcome(self._run, self.outcome)
             searches = self._lockstep and self.outcome == COMPLETED and self._scenario.learns()
-            last = {RECORDER: CLOSE_TIMEOUT, ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT}
+            last = {
+                RECORDER: CLOSE_TIMEOUT,
+                ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT,
+            }
             first = {LEARNER: SEARCH_TIMEOUT} if searches else {}
-            middle = {process.node: STOP_TIMEOUT for process in self.processes if process.node not in last | first}
+            middle = {
+                process.node: STOP_TIMEOUT
+                for process in self.processes
+                if process.node not in last | first
+            }
             for timeouts in (first, middle, last):
                 deadline = time.monotonic() + max(timeouts.values(), default=0.0)
                 group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
                     if process.popen.poll() is None:
-                        process.popen.terminate()  # not SIGINT, which gives a traceback while Python still imports
+                        # not SIGINT, which gives a traceback while Python still imports
+                        process.popen.terminate()
                 for process in group:
                     try:
                         process.popen.wait(max(deadline - time.monotonic(), 0.2))
@@ -342,6 +426,8 @@ def _end(process: NodeProcess) -> str | None:
     if status == 0:
         return f"{name} was shut down"
     lines = [line for line in process.lines if line.strip()] or ["no output"]
-    cause = next((line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1])
+    cause = next(
+        (line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1]
+    )
     message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
     return f"{name} ended with status {status}: {message}"

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly an autopilot through a channel map on a full ROS 2: ros2 launch flight_bringup bridge.launch.py map:=ardupilot.
+"""Fly an autopilot through a channel map on a full ROS 2: ros2 launch flight_bringup
+bridge.launch.py map:=ardupilot.
 
-The graph of fly.launch.py with the bridge in the aircraft's place. The bridge sends to the autopilot only with dry_run:=false
-and once it is engaged (docs/autopilots.md). Refuses a map whose signs contradict the controller's. Ends with Ctrl-C or after
-`duration`; with exit status 1 when a node ends.
+The graph of fly.launch.py with the bridge in the aircraft's place. The bridge sends to the
+autopilot only with dry_run:=false and once it is engaged (docs/autopilots.md). Refuses a map whose
+signs contradict the controller's. Ends with Ctrl-C or after `duration`; with exit status 1 when a
+node ends.
 """
 
 import math
@@ -52,16 +54,28 @@ def generate_launch_description() -> LaunchDescription:
     """The arguments and the flight."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument("map", description=f"name of a channel map ({', '.join(maps())}), or path of a file (.yaml)"),
+            DeclareLaunchArgument(
+                "map",
+                description=f"name of a channel map ({', '.join(maps())}), or path of a file "
+                "(.yaml)",
+            ),
             scenario_argument("osprey_servo"),
             boolean_argument(
-                "dry_run", True, "true: publish on bridge/would_send, send nothing; false: send once the bridge is engaged"
+                "dry_run",
+                True,
+                "true: publish on bridge/would_send, send nothing; false: send once the bridge "
+                "is engaged",
             ),
             recorder_argument("false"),
-            DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies until Ctrl-C"),
+            DeclareLaunchArgument(
+                "duration", default_value="", description="seconds to fly; empty flies until Ctrl-C"
+            ),
             runs_argument(),
             watch_argument(),
-            namespace_argument("namespace of all nodes, one an aircraft; topics that a map names in full are not in it"),
+            namespace_argument(
+                "namespace of all nodes, one an aircraft; topics that a map names in full are "
+                "not in it"
+            ),
             OpaqueFunction(function=_fly),
         ]
     )
@@ -70,7 +84,9 @@ def generate_launch_description() -> LaunchDescription:
 def _fly(context: LaunchContext) -> list[Action]:
     duration = yaml.safe_load(argument(context, "duration"))
     scenario = find_scenario(argument(context, "scenario"), duration)
-    autopilot = find_autopilot(argument(context, "map"), dry_run=argument(context, "dry_run") == "true")
+    autopilot = find_autopilot(
+        argument(context, "map"), dry_run=argument(context, "dry_run") == "true"
+    )
     require_signs(autopilot.channel_map, scenario)
     require_limits(autopilot, scenario)
     recorder = argument(context, "recorder")
@@ -79,18 +95,28 @@ def _fly(context: LaunchContext) -> list[Action]:
     end_with_launch(context)
 
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
-        overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=False, autopilot=autopilot)
+        overrides = parameter_overrides(
+            spec, scenario, run, start_time, lockstep=False, autopilot=autopilot
+        )
         return flight_node(spec, scenario, overrides, run)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         span = scenario.flight.duration
-        end = end_with_log(context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2") if duration else []
+        end = (
+            end_with_log(
+                context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2"
+            )
+            if duration
+            else []
+        )
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
     page = watch_page(context, run) if recorded else []
     first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
     actions = page + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
     if recorder == "rosbag2":
-        overrides = parameter_overrides(RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot)
+        overrides = parameter_overrides(
+            RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot
+        )
         actions.append(rosbag2(context, scenario, overrides))
     return actions

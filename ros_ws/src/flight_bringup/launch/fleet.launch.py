@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a fleet on a full ROS 2: ros2 launch flight_bringup fleet.launch.py fleet:=fleet.yaml.
 
-It runs `rise-di fly`, which starts, follows and ends every aircraft. The launch ends with it, with exit status 1 where an
-aircraft did not complete its flight.
+It runs `rise-di fly`, which starts, follows and ends every aircraft. The launch ends with it, with
+exit status 1 where an aircraft did not complete its flight.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,9 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("fleet", description="file of a fleet (.yaml): docs/fleets.md"),
             DeclareLaunchArgument(
-                "duration", default_value="", description="flight time of each aircraft, s; empty: that of the file"
+                "duration",
+                default_value="",
+                description="flight time of each aircraft, s; empty: that of the file",
             ),
             watch_argument(),
             runs_argument(),
@@ -46,6 +48,14 @@ def _fly(context: LaunchContext) -> list[Action]:
         return [Shutdown(reason="fleet completed")]
 
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    options = ["--set", f"runs={argument(context, 'runs')}", *(["--duration", duration] if duration else [])]
+    options = [
+        "--set",
+        f"runs={argument(context, 'runs')}",
+        *(["--duration", duration] if duration else []),
+    ]
     options += ["--watch"] if argument(context, "watch") == "true" else []
-    return [ExecuteProcess(cmd=[rise_di, "fly", file, *options], name="fleet", output="screen", on_exit=end)]
+    return [
+        ExecuteProcess(
+            cmd=[rise_di, "fly", file, *options], name="fleet", output="screen", on_exit=end
+        )
+    ]

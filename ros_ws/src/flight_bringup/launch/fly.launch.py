@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
-The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is ready and matched. It ends
-once the log holds the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a
-node ends, is not ready, or when no u reaches the aircraft.
+The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is
+ready and matched. It ends once the log holds the scenario's duration, in lockstep when the aircraft
+completes it. It ends early with exit status 1 when a node ends, is not ready, or when no u reaches
+the aircraft.
 """
 
 from collections.abc import Sequence
@@ -55,12 +56,17 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             scenario_argument("osprey_servo"),
-            DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies the scenario's"),
+            DeclareLaunchArgument(
+                "duration",
+                default_value="",
+                description="seconds to fly; empty flies the scenario's",
+            ),
             DeclareLaunchArgument(
                 "lockstep",
                 default_value="",
                 choices=["", *BOOLEAN],
-                description="true: as fast as the machine allows, repeatable to the byte; empty: the value in the scenario",
+                description="true: as fast as the machine allows, repeatable to the byte; "
+                "empty: the value in the scenario",
             ),
             recorder_argument(),
             runs_argument(),
@@ -72,32 +78,54 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(argument(context, "scenario"), yaml.safe_load(argument(context, "duration")))
-    lockstep = scenario.flight.lockstep if (value := argument(context, "lockstep")) == "" else value == "true"
+    scenario = find_scenario(
+        argument(context, "scenario"), yaml.safe_load(argument(context, "duration"))
+    )
+    lockstep = (
+        scenario.flight.lockstep
+        if (value := argument(context, "lockstep")) == ""
+        else value == "true"
+    )
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
     require(
-        not (by_rosbag2 and lockstep), "recorder", "rosbag2 in lockstep", "true: the aircraft waits for the stack's recorder"
+        not (by_rosbag2 and lockstep),
+        "recorder",
+        "rosbag2 in lockstep",
+        "true: the aircraft waits for the stack's recorder",
     )
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
     def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
-        return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep), run)
+        return flight_node(
+            spec,
+            scenario,
+            parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep),
+            run,
+        )
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         nodes = second_stage(scenario)
         duration = scenario.flight.duration
         begins = not lockstep and scenario.controller.autostart and scenario.controller.start_active
         if lockstep:
-            end: list[Action] = [on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))]
+            end: list[Action] = [
+                on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
+            ]
         elif begins:
-            end = begin_when_matched(context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2)
+            end = begin_when_matched(
+                context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2
+            )
         else:  # a user activates the controller, or no user does
-            end = end_with_log(context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2)
+            end = end_with_log(
+                context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
+            )
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
-    actions = watch_page(context, run) + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
+    actions = watch_page(context, run) + start_in_stages(
+        context, run, {spec: node(spec) for spec in first}, follow
+    )
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
         actions.append(rosbag2(context, scenario, overrides))

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Play a recorded flight on a full ROS 2, with nodes against it: ros2 launch flight_bringup replay.launch.py run:=runs/latest.
+"""Play a recorded flight on a full ROS 2, with nodes against it: ros2 launch flight_bringup
+replay.launch.py run:=runs/latest.
 
-As `rise-di play`: the topics of the log with their timing, and /clock with the time of the log. It plays the topics that none
-of the nodes publishes, so a controller answers the recorded y and y_m with its own u. Playing begins once all nodes are ready
-and ends with the log. It ends early with exit status 1 when a node ends.
+As `rise-di play`: the topics of the log with their timing, and /clock with the time of the log. It
+plays the topics that none of the nodes publishes, so a controller answers the recorded y and y_m
+with its own u. Playing begins once all nodes are ready and ends with the log. It ends early with
+exit status 1 when a node ends.
 """
 
 from collections.abc import Sequence
@@ -47,7 +49,12 @@ from flight_core.parameters import require
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
-OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)  # nodes that run when the argument of their name is true
+OPTIONAL = (
+    RECORDER,
+    CONTROLLER,
+    REFERENCE_MODEL,
+    AIRCRAFT,
+)  # nodes that run when the argument of their name is true
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -55,7 +62,10 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("run", description="folder of a run, or an MCAP file"),
-            *(boolean_argument(spec.executable, spec is CONTROLLER, f"run the {spec.executable}") for spec in OPTIONAL),
+            *(
+                boolean_argument(spec.executable, spec is CONTROLLER, f"run the {spec.executable}")
+                for spec in OPTIONAL
+            ),
             DeclareLaunchArgument(
                 "map",
                 default_value="",
@@ -65,18 +75,27 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "topics",
                 default_value="",
-                description="which topics of the log, as in y,y_m; empty plays all that none of the nodes publishes",
+                description="which topics of the log, as in y,y_m; empty plays all that none of "
+                "the nodes publishes",
             ),
-            DeclareLaunchArgument("rate", default_value="1.0", description="speed, as a multiple of real time"),
-            DeclareLaunchArgument("start", default_value="0.0", description="flight time of the log to begin at, s"),
+            DeclareLaunchArgument(
+                "rate", default_value="1.0", description="speed, as a multiple of real time"
+            ),
+            DeclareLaunchArgument(
+                "start", default_value="0.0", description="flight time of the log to begin at, s"
+            ),
             boolean_argument("loop", False, "start again at the end, until Ctrl-C"),
             boolean_argument(
-                "lockstep", False, "for a lockstep log: keep its stamps; the controller answers each y with the same bytes"
+                "lockstep",
+                False,
+                "for a lockstep log: keep its stamps; the controller answers each y with the "
+                "same bytes",
             ),
             scenario_argument("", "; empty: the one in the log"),
             runs_argument(),
             namespace_argument(
-                "namespace of all nodes; it must be that of the flight in the log, whose topics keep their full names"
+                "namespace of all nodes; it must be that of the flight in the log, whose topics "
+                "keep their full names"
             ),
             OpaqueFunction(function=_play),
         ]
@@ -87,26 +106,52 @@ def _play(context: LaunchContext) -> list[Action]:
     log = Path(argument(context, "run"))
     namespace = argument(context, "namespace")
     lockstep = argument(context, "lockstep") == "true"
-    autopilot = find_autopilot(argument(context, "map"), dry_run=True) if argument(context, "map") else None
-    nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"] + [BRIDGE] * (autopilot is not None)
+    autopilot = (
+        find_autopilot(argument(context, "map"), dry_run=True) if argument(context, "map") else None
+    )
+    nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"] + [
+        BRIDGE
+    ] * (autopilot is not None)
     others = [spec.executable for spec in nodes if spec not in (RECORDER, CONTROLLER)]
-    require(not (lockstep and others), "lockstep", f"true with {', '.join(others)}", "controller and recorder alone")
+    require(
+        not (lockstep and others),
+        "lockstep",
+        f"true with {', '.join(others)}",
+        "controller and recorder alone",
+    )
     recorded = read_playback(log).types
     recorded = recorded.keys() - unsendable(recorded)
-    topics = argument(context, "topics") or ",".join(replayed_topics(recorded, nodes, namespace, autopilot))
+    topics = argument(context, "topics") or ",".join(
+        replayed_topics(recorded, nodes, namespace, autopilot)
+    )
     end_with_launch(context)
     run = Path()
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:
             fail_on_exit(event, context, run)
-        return complete(run, "playback completed") if RECORDER in nodes else [Shutdown(reason="playback completed")]
+        return (
+            complete(run, "playback completed")
+            if RECORDER in nodes
+            else [Shutdown(reason="playback completed")]
+        )
 
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
     loop = ["--loop"] if argument(context, "loop") == "true" else []
     stamps = ["--stamps", "recorded" if lockstep else "now"]
-    options = ["--topics", topics, "--rate", argument(context, "rate"), "--start", argument(context, "start"), *stamps, *loop]
-    player = ExecuteProcess(cmd=[rise_di, "play", str(log), *options], name="play", output="screen", on_exit=end)
+    options = [
+        "--topics",
+        topics,
+        "--rate",
+        argument(context, "rate"),
+        "--start",
+        argument(context, "start"),
+        *stamps,
+        *loop,
+    ]
+    player = ExecuteProcess(
+        cmd=[rise_di, "play", str(log), *options], name="play", output="screen", on_exit=end
+    )
     if not nodes:
         return [player]
     name = argument(context, "scenario")
@@ -115,8 +160,12 @@ def _play(context: LaunchContext) -> list[Action]:
         run = new_run(scenario, Path(argument(context, "runs")))
 
     def node(spec: NodeSpec) -> Node:
-        overrides = parameter_overrides(spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot)
+        overrides = parameter_overrides(
+            spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot
+        )
         return flight_node(spec, scenario, overrides, run)
 
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
-    return start_in_stages(context, run, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage)
+    return start_in_stages(
+        context, run, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage
+    )

@@ -42,7 +42,11 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
     def at_limits() -> tuple[Array, Array]:
         passed = _exchanged(u, stops, params)
-        target = _where_not(stops.has(passed) | free, passed, lambda: _by_priority(jnp.zeros_like(u), v, stops, params))
+        target = _where_not(
+            stops.has(passed) | free,
+            passed,
+            lambda: _by_priority(jnp.zeros_like(u), v, stops, params),
+        )
 
         def at_rate() -> Array:
             start = rate_range.clip(u_before)
@@ -73,7 +77,9 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
     arrives = limits.has(moved)
 
     def partly() -> Array:
-        def halve(_: int, now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        def halve(
+            _: int, now: tuple[Array, Array, Array, Array]
+        ) -> tuple[Array, Array, Array, Array]:
             reached, target, part, size = now
             halfway = _exchanged(u + (part + 0.5 * size) * move, limits, params)
             fits = limits.has(halfway)
@@ -89,7 +95,9 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
         step = target - reached
         room = jnp.where(step > 0.0, limits.high - reached, limits.low - reached)
         passes = jnp.abs(step) > jnp.abs(room)
-        last = jnp.min(jnp.where(passes, room, 1.0) / jnp.where(passes, step, 1.0), axis=0, initial=1.0)
+        last = jnp.min(
+            jnp.where(passes, room, 1.0) / jnp.where(passes, step, 1.0), axis=0, initial=1.0
+        )
         return limits.clip(reached + last * step)
 
     return _where_not(arrives, moved, partly)
@@ -103,8 +111,12 @@ def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:
         number, moved = now
         for j in range(len(exchange)):
             excess = moved[j] - jnp.minimum(jnp.maximum(moved[j], limits.low[j]), limits.high[j])
-            part = jnp.where(jnp.abs(exchange[j, j]) > SMALL, RELAXATION * excess / exchange[j, j], 0.0)
+            part = jnp.where(
+                jnp.abs(exchange[j, j]) > SMALL, RELAXATION * excess / exchange[j, j], 0.0
+            )
             moved = moved - exchange[:, j][:, None] * part
         return number + 1, moved
 
-    return jax.lax.while_loop(lambda now: (now[0] < SWEEPS) & ~jnp.all(limits.has(now[1])), sweep, (0, u))[1]
+    return jax.lax.while_loop(
+        lambda now: (now[0] < SWEEPS) & ~jnp.all(limits.has(now[1])), sweep, (0, u)
+    )[1]

@@ -20,14 +20,18 @@ from flight_core.vectors import Array, FloatArray
 
 
 class StateBlock(NamedTuple):
-    """Coupled states and the signals that act on them, as indices in x and in [x, p_1, ..., p_K, s]. Hashable."""
+    """Coupled states and the signals that act on them, as indices in x and in [x, p_1, ..., p_K,
+    s]. Hashable.
+    """
 
     rows: tuple[int, ...]
     columns: tuple[int, ...]
 
 
 class Change(NamedTuple):
-    """A drift of N aircraft: differences of the matrices of Fleet after `duration`, linear in time before."""
+    """A drift of N aircraft: differences of the matrices of Fleet after `duration`, linear in time
+    before.
+    """
 
     start: float  # s
     duration: float  # s
@@ -38,17 +42,22 @@ class Change(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """N aircraft over one tick of the controller, in K steps of the integration; q rows of the remainder, r of the forcing.
+    """N aircraft over one tick of the controller, in K steps of the integration; q rows of the
+    remainder, r of the forcing.
 
-    With p_k the actuators' mean positions over step k, the remainder s and the course's forcing w_k in step k, one tick is
+    With p_k the actuators' mean positions over step k, the remainder s and the course's forcing w_k
+    in step k, one tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
 
     blocks: tuple[StateBlock, ...]
-    tick: tuple[Array, ...]  # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
+    tick: tuple[
+        Array, ...
+    ]  # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
     forced: Array  # (n, K r, N)
-    rate: Array  # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
+    # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
+    rate: Array
     forced_rate: Array  # (m, r, N)
     wind: Array  # (N,) factor of the course's gusts and turbulence
     late: Array  # (N,) delay of u, whole ticks
@@ -66,16 +75,19 @@ def assemble(
 ) -> Fleet:
     """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, p).
 
-    With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with u held,
+    With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with
+    u held,
 
         tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma remainder]
-        forced = [Phi^(K-1) Gamma F, ..., Gamma F],    F = [gust_directions[course.axes], course.basis]
+        forced = [Phi^(K-1) Gamma F, ..., Gamma F],
+            F = [gust_directions[course.axes], course.basis]
 
-    The steps, and the actuators' mean positions in them, are those of `plant.advance`. The remainder is held over a tick, and
-    the forcing over a step. `wind` and `late` have a value for all or N; `late` is beyond the delay of the course.
-    `gust_directions` of shape (N, n, G) are the effects of wind on x_dot, of `uncertainty.gust_directions`; None: the plant's,
-    for all aircraft.
-    The drift of the plant multiplies the entries of all aircraft alike; the matrices above are then interpolated.
+    The steps, and the actuators' mean positions in them, are those of `plant.advance`. The
+    remainder is held over a tick, and the forcing over a step. `wind` and `late` have a value for
+    all or N; `late` is beyond the delay of the course. `gust_directions` of shape (N, n, G) are the
+    effects of wind on x_dot, of `uncertainty.gust_directions`; None: the plant's, for all aircraft.
+    The drift of the plant multiplies the entries of all aircraft alike; the matrices above are then
+    interpolated.
     """
     directions = plant.aircraft.gust_direction if gust_directions is None else gust_directions
     tick, forced, rate, forced_rate = begin = _matrices(A, B, directions, plant, course)
@@ -121,10 +133,16 @@ def _matrices(
     Phi, Gamma = (rk4(lambda t, x, u, L: L @ x + u, 0.0, x, u, L, dt) for x, u in pairs)
     powers = list(accumulate(repeat(Phi, K), lambda power, step: step @ power, initial=eye))
     held = [powers[K - 1 - k] @ Gamma for k in range(K)]
-    tick = [powers[K], *(held_step @ B for held_step in held), sum(held)[..., remainder_rows(aircraft)]]
+    tick = [
+        powers[K],
+        *(held_step @ B for held_step in held),
+        sum(held)[..., remainder_rows(aircraft)],
+    ]
     C = aircraft.C[course.order]
     parts = (directions[..., course.axes], course.basis)
-    forcing = np.concatenate([np.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2)
+    forcing = np.concatenate(
+        [np.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2
+    )
     forced = np.concatenate([held_step @ forcing for held_step in held], axis=2)
     return np.concatenate(tick, axis=2), forced, C @ np.concatenate([L, B], axis=2), C @ forcing
 
@@ -140,10 +158,15 @@ def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
-    """Connected components of the states, `moves` of shape (n, columns): in general longitudinal and lateral motion."""
+    """Connected components of the states, `moves` of shape (n, columns): in general longitudinal
+    and lateral motion.
+    """
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
-    return tuple(StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
+    return tuple(
+        StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist()))
+        for row in rows
+    )
 
 
 def at(t: Array, fleet: Fleet) -> Fleet:
@@ -153,5 +176,10 @@ def at(t: Array, fleet: Fleet) -> Fleet:
         return fleet
     part = share(t, change.start, change.duration)
     keys = ("tick", "forced", "rate", "forced_rate")
-    now = {key: jax.tree.map(lambda begin, end: begin + part * end, getattr(fleet, key), getattr(change, key)) for key in keys}
+    now = {
+        key: jax.tree.map(
+            lambda begin, end: begin + part * end, getattr(fleet, key), getattr(change, key)
+        )
+        for key in keys
+    }
     return fleet._replace(**now)

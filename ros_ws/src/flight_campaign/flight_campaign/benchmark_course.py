@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark course of the aircraft, tick by tick: reference, wind, errors of the sensors, feedforward.
+"""The benchmark course of the aircraft, tick by tick: reference, wind, errors of the sensors,
+feedforward.
 
-The course does not depend on the aircraft and is computed once, with the functions of the simulation in one process.
+The course does not depend on the aircraft and is computed once, with the functions of the
+simulation in one process.
 """
 
 from typing import NamedTuple
@@ -25,7 +27,8 @@ from rise_di_controller.feedforward import Nominal
 from rise_di_controller.guard import DT_RANGE
 
 HOLD, ENGAGE, STEP = range(3)
-"""Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of its law."""
+"""Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of
+its law."""
 
 
 class Segments(NamedTuple):
@@ -35,12 +38,16 @@ class Segments(NamedTuple):
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
     dt: FloatArray  # (T,) s since the previous sample, inside the controller's range
     y_m: FloatArray  # (T, m) the reference at the tick
-    sampled_y_m: FloatArray  # (T, m) the reference at the stamp of the y of the tick, and its derivative
+    sampled_y_m: (
+        FloatArray  # (T, m) the reference at the stamp of the y of the tick, and its derivative
+    )
     sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) sensor error of the y of the tick
     noise: FloatArray  # (T, m) noise in it
-    forcing: FloatArray  # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @ the rest
+    # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @
+    # the rest
+    forcing: FloatArray
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
     vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
@@ -48,11 +55,16 @@ class Segments(NamedTuple):
 
 
 class Course(NamedTuple):
-    """T ticks of the controller, the last at the end of the flight; channels in the law's order, states in the airframe's."""
+    """T ticks of the controller, the last at the end of the flight; channels in the law's order,
+    states in the airframe's.
+    """
 
     segments: Segments
-    axes: NDArray[np.int64]  # (g,) indices of the axes of the airframe's gusts along which there is wind
-    basis: FloatArray  # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
+    axes: NDArray[
+        np.int64
+    ]  # (g,) indices of the axes of the airframe's gusts along which there is wind
+    # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
+    basis: FloatArray
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
     u_late: int  # delay of u, ticks
@@ -64,15 +76,30 @@ def _require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError for an aircraft or a controller beyond a campaign."""
     aircraft = scenario.aircraft
     controller = scenario.controller
-    require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
+    require(
+        not aircraft.is_jsbsim,
+        "airframe",
+        aircraft.airframe,
+        "an airframe with matrices: JSBSim flies one at a time",
+    )
     fixed = getattr(controller, "learn", None) is None
-    require(fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn")
+    require(
+        fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn"
+    )
     at_trim = controller.guard().over_speed is None
     require(
-        at_trim, "controller.schedule", "models at other speeds", "none: the aircraft of a campaign fly at their trim speed"
+        at_trim,
+        "controller.schedule",
+        "models at other speeds",
+        "none: the aircraft of a campaign fly at their trim speed",
     )
     fixed = aircraft.over_airspeed is None
-    require(fixed, "aircraft.over_airspeed", aircraft.over_airspeed, "none: the aircraft of a campaign keep their trim speed")
+    require(
+        fixed,
+        "aircraft.over_airspeed",
+        aircraft.over_airspeed,
+        "none: the aircraft of a campaign keep their trim speed",
+    )
 
 
 def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArray, FloatArray]:
@@ -90,8 +117,9 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u by a part of a tick,
-    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u
+    by a part of a tick, dropouts of a y with a different rate than the ticks, or dropouts longer
+    than the age limit; for vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -108,7 +136,12 @@ def build_course(scenario: Scenario) -> Course:
     errors = aircraft.sensor_arrays()
     late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
     lossless = errors.dropout == 0.0 or tick_ns == sample_ns
-    require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) with dropouts")
+    require(
+        lossless,
+        "aircraft.rate",
+        f"{aircraft.rate:g} Hz",
+        f"controller.rate ({controller.rate:g} Hz) with dropouts",
+    )
     vanes = [outputs.index(name) for name in controller.vanes]
     u_delay_ns = nanoseconds(aircraft.actuators.delay)
     u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
@@ -129,7 +162,8 @@ def build_course(scenario: Scenario) -> Course:
     _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
     over_step, now = (
-        np.concatenate([blowing[:, axes], forcing @ basis], axis=1) for blowing, forcing in zip(wind, timed, strict=True)
+        np.concatenate([blowing[:, axes], forcing @ basis], axis=1)
+        for blowing, forcing in zip(wind, timed, strict=True)
     )
     guard = controller.guard()
     u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used])
@@ -152,7 +186,9 @@ def build_course(scenario: Scenario) -> Course:
     return Course(segments, axes, basis, order, late, u_late, seconds(tick_ns), steps)
 
 
-def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[bool]) -> tuple[NDArray[np.int32], FloatArray]:
+def _phases(
+    ticks: int, late: int, period: float, max_age: float, arrives: list[bool]
+) -> tuple[NDArray[np.int32], FloatArray]:
     phase = np.full(ticks, HOLD, dtype=np.int32)
     dt = np.zeros(ticks)
     last: int | None = None
@@ -176,15 +212,31 @@ def _require_plain_vanes(scenario: Scenario, late: int) -> None:
     sensors_of = scenario.aircraft.sensors
     key = "aircraft.vanes"
     if scenario.controller.vanes:
-        require(not late, "sensors.delay", f"{sensors_of.delay:g} s beside vanes", "0: a campaign has no late vanes")
-        plain = vanes.dropout == 0.0 and not np.isfinite(vanes.frozen_at).any() and not any(sensors_of.quantisation)
-        require(plain, key, "a vane that freezes, loses readings or has steps", "none: rise-di fly --in-process has these")
+        require(
+            not late,
+            "sensors.delay",
+            f"{sensors_of.delay:g} s beside vanes",
+            "0: a campaign has no late vanes",
+        )
+        plain = (
+            vanes.dropout == 0.0
+            and not np.isfinite(vanes.frozen_at).any()
+            and not any(sensors_of.quantisation)
+        )
+        require(
+            plain,
+            key,
+            "a vane that freezes, loses readings or has steps",
+            "none: rise-di fly --in-process has these",
+        )
 
 
 def _feedforward(
     nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArray, y_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a model."""
+    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a
+    model.
+    """
     u_ff = np.zeros_like(y_m)
     if nominal is None:
         return u_ff, np.zeros((len(y_m), 0))
@@ -211,7 +263,9 @@ class _Forcing(NamedTuple):
 def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:
     """The wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
     no_effect = np.zeros_like(plant.aircraft.gust_direction)
-    forced = plant_model.forcing(0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect)))
+    forced = plant_model.forcing(
+        0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))
+    )
     wind, timed = (
         # Simpson's rule, as in Runge-Kutta
         _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
@@ -229,7 +283,9 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
-    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad, in the order of the states, shape (T, n)."""
+    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad, in the order of
+    the states, shape (T, n).
+    """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):
         if axis != "longitudinal" and AIR_STATE[axis] in airframe.states:

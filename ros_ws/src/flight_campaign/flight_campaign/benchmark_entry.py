@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An entry of the public benchmark: what flies a set, a law with parameters or a function of Python."""
+"""An entry of the public benchmark: what flies a set, a law with parameters or a function of
+Python.
+"""
 
 import hashlib
 import inspect
@@ -34,7 +36,9 @@ NOT_STATED = "not stated"
 
 
 class Task(NamedTuple):
-    """What an entry may know of a set: channels, rate, and the parameters of the controller that every law gets."""
+    """What an entry may know of a set: channels, rate, and the parameters of the controller that
+    every law gets.
+    """
 
     set: str  # as "gusts"
     airframe: str  # as "osprey", or "jsbsim:f16"
@@ -45,10 +49,12 @@ class Task(NamedTuple):
 
 
 Step = Callable[[float, FloatArray, FloatArray], ArrayLike]
-"""step(t, y, y_m) -> u: t in s, the rest (m,), SI, deviations from trim, in the order of the task."""
+"""step(t, y, y_m) -> u: t in s, the rest (m,), SI, deviations from trim, in the order of the
+task."""
 
 Enter = Callable[[Task], Mapping[str, Any] | Step | None]
-"""A law for a task: a section `controller`, or a function that keeps the state of one aircraft; None takes no part."""
+"""A law for a task: a section `controller`, or a function that keeps the state of one aircraft;
+None takes no part."""
 
 
 class BenchmarkEntry(NamedTuple):
@@ -65,43 +71,71 @@ def task_of(name: str, sets: Sets) -> Task:
     """The task of a set."""
     scenario = sets.scenario(name)
     controller = scenario.controller
-    return Task(name, scenario.aircraft.airframe, controller.outputs, controller.inputs, controller.rate, frame(scenario))
+    return Task(
+        name,
+        scenario.aircraft.airframe,
+        controller.outputs,
+        controller.inputs,
+        controller.rate,
+        frame(scenario),
+    )
 
 
 def entered(entry: BenchmarkEntry, task: Task) -> ControllerConfig | Step | None:
-    """What flies a task. Raises ParameterError for a function that raises, a section that is none or changes the frame."""
+    """What flies a task. Raises ParameterError for a function that raises, a section that is none
+    or changes the frame.
+    """
     try:
         law = entry.enter(task)
     except ParameterError:
         raise
     except Exception as error:
         raised = f"{type(error).__name__}: {error}, for {task.set}"
-        raise ParameterError(f"{entry.name}: found {raised}, expected a function of a task that returns a law") from error
+        raise ParameterError(
+            f"{entry.name}: found {raised}, expected a function of a task that returns a law"
+        ) from error
     if law is None or not isinstance(law, Mapping):
-        require(law is None or callable(law), entry.name, law, "a section `controller`, a function of t, y, y_m, or None")
+        require(
+            law is None or callable(law),
+            entry.name,
+            law,
+            "a section `controller`, a function of t, y, y_m, or None",
+        )
         return law
     controller = AnyLaw.validate_mapping({**task.controller, **law}, f"{entry.name}: controller")
-    framed = AnyLaw.validate_mapping({**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name)
+    framed = AnyLaw.validate_mapping(
+        {**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name
+    )
     for key in FIXED:
         value = getattr(controller, key)
         expected = getattr(framed, key)
-        require(value == expected, f"{entry.name}: controller.{key}", value, f"{expected}, as every law of {task.set} has it")
+        require(
+            value == expected,
+            f"{entry.name}: controller.{key}",
+            value,
+            f"{expected}, as every law of {task.set} has it",
+        )
     return controller
 
 
 def stepped(step: Step, t: float, y: FloatArray, y_m: FloatArray, task: Task) -> FloatArray:
     """The u of a function, (m,).
 
-    Raises ParameterError for a function that raises, for a wrong shape, and for numbers that are not finite.
+    Raises ParameterError for a function that raises, for a wrong shape, and for numbers that are
+    not finite.
     """
     where = f"u in {task.set} at t = {t:g} s"
     expected = f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
     try:
         u = step(t, y.copy(), y_m.copy())
     except Exception as error:
-        raise ParameterError(f"{where}: found {type(error).__name__}: {error}, expected {expected}") from error
+        raise ParameterError(
+            f"{where}: found {type(error).__name__}: {error}, expected {expected}"
+        ) from error
     vector = as_array(u, where, expected)
-    require(vector.shape == (len(task.inputs),) and bool(np.isfinite(vector).all()), where, u, expected)
+    require(
+        vector.shape == (len(task.inputs),) and bool(np.isfinite(vector).all()), where, u, expected
+    )
     return vector
 
 
@@ -113,7 +147,8 @@ def find_entry(
     sees: str | None = None,
     knows: str | None = None,
 ) -> BenchmarkEntry:
-    """The entry that words name: MODULE:FUNCTION, a law of the comparison, or scenarios, one for each airframe.
+    """The entry that words name: MODULE:FUNCTION, a law of the comparison, or scenarios, one for
+    each airframe.
 
     `find` reads a scenario. Raises ParameterError for an unknown word.
     """
@@ -121,24 +156,36 @@ def find_entry(
     if ":" in first and not first.endswith(".yaml"):
         require(len(words) == 1, "ENTRY", " ".join(words), "one MODULE:FUNCTION")
         enter, source = _function(first)
-        return BenchmarkEntry(name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter)
+        return BenchmarkEntry(
+            name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter
+        )
     if first in REGISTERED:
         require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
         law = LAWS[first]
         tuned = _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
-        return BenchmarkEntry(name or first, sees or law.measurements, knows or law.model_data, *tuned)
+        return BenchmarkEntry(
+            name or first, sees or law.measurements, knows or law.model_data, *tuned
+        )
     scenarios = [find(word) for word in words]
     by_airframe = {scenario.aircraft.airframe: scenario.controller for scenario in scenarios}
-    require(len(by_airframe) == len(words), "ENTRY", " ".join(words), "one scenario for each airframe")
+    require(
+        len(by_airframe) == len(words), "ENTRY", " ".join(words), "one scenario for each airframe"
+    )
     known = sets.airframes()
     for airframe in by_airframe:
-        require(airframe in known, "ENTRY", f"a scenario of {airframe}", f"one of {', '.join(known)}")
-    return BenchmarkEntry(name or Path(first).stem, sees or "y", knows or NOT_STATED, *_of_airframes(by_airframe))
+        require(
+            airframe in known, "ENTRY", f"a scenario of {airframe}", f"one of {', '.join(known)}"
+        )
+    return BenchmarkEntry(
+        name or Path(first).stem, sees or "y", knows or NOT_STATED, *_of_airframes(by_airframe)
+    )
 
 
 def _of_airframes(controllers: Mapping[str, ControllerConfig]) -> tuple[str, Enter]:
     """Digest and entry of controllers by airframe."""
-    sections = {airframe: controller.model_dump(mode="json") for airframe, controller in controllers.items()}
+    sections = {
+        airframe: controller.model_dump(mode="json") for airframe, controller in controllers.items()
+    }
     modules = {type(controller) for controller in controllers.values()}
     text = json.dumps(sections, sort_keys=True).encode() + b"".join(sorted(map(_source, modules)))
     fixed = {airframe: _without_delay(section) for airframe, section in sections.items()}
@@ -153,19 +200,24 @@ def _without_delay(section: Mapping[str, Any]) -> dict[str, Any]:
 def _tuned(name: str, scenario: Scenario) -> ControllerConfig:
     tuned = tuned_gains.find(scenario, name, TUNED_ON)
     if tuned is None:
-        raise ParameterError(f"ENTRY: found {name}, which has no gains for {TUNED_IN}, expected a law that has them")
+        raise ParameterError(
+            f"ENTRY: found {name}, which has no gains for {TUNED_IN}, expected a law that has them"
+        )
     return tuned_controller(name, tuned, build_benchmark(scenario))
 
 
 def _function(text: str) -> tuple[Enter, str]:
-    """A function by MODULE:FUNCTION, of an installed package or of a file of this folder, and the digest of its module."""
+    """A function by MODULE:FUNCTION, of an installed package or of a file of this folder, and the
+    digest of its module.
+    """
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:
         function = resolve_name(text)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise ParameterError(
-            f"ENTRY: found {text!r} ({error}), expected MODULE:FUNCTION, of a package or a file here"
+            f"ENTRY: found {text!r} ({error}), expected MODULE:FUNCTION, of a package or a file "
+            "here"
         ) from None
     require(callable(function), "ENTRY", text, "a function of a task")
     return function, hashlib.sha256(_source(function)).hexdigest()

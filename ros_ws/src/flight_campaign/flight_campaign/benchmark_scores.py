@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The public benchmark: an entry flies every set in chunks that an interrupted run keeps, and one file has the scores."""
+"""The public benchmark: an entry flies every set in chunks that an interrupted run keeps, and one
+file has the scores.
+"""
 
 import json
 from collections.abc import Iterator
@@ -61,7 +63,10 @@ class Definition(Config):
         """The chunks, each (number of the set, chunk)."""
         for number, (name, flight_set) in enumerate(SETS.items()):
             if name not in self.not_flown:
-                yield from ((number, chunk) for chunk in range(-(-flight_set.aircraft(self.aircraft) // CHUNK)))
+                yield from (
+                    (number, chunk)
+                    for chunk in range(-(-flight_set.aircraft(self.aircraft) // CHUNK))
+                )
 
     def size(self, job: Job) -> int:
         """Number of aircraft of a chunk."""
@@ -78,9 +83,19 @@ def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
     entry = flights.entry
     not_flown = flights.not_flown()
     flies = len(not_flown) < len(SETS)
-    require(flies, entry.name, next(iter(not_flown.values()), ""), "an entry that flies one set at least")
+    require(
+        flies,
+        entry.name,
+        next(iter(not_flown.values()), ""),
+        "an entry that flies one set at least",
+    )
     sets = flights.sets
-    values: dict[str, Any] = {"version": VERSION, "digest": sets.digest(), "release": sets.release, "aircraft": aircraft}
+    values: dict[str, Any] = {
+        "version": VERSION,
+        "digest": sets.digest(),
+        "release": sets.release,
+        "aircraft": aircraft,
+    }
     values |= {
         "entry": entry.name,
         "sees": entry.sees,
@@ -93,7 +108,9 @@ def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
 
 
 class Benchmark:
-    """A run of the benchmark and its folder. A folder with chunks of the same definition is continued."""
+    """A run of the benchmark and its folder. A folder with chunks of the same definition is
+    continued.
+    """
 
     def __init__(self, folder: Path, definition: Definition) -> None:
         self.folder = folder
@@ -101,7 +118,12 @@ class Benchmark:
         path = folder / DEFINITION
         if is_file(path):
             same = path.read_text(encoding="utf-8") == definition.model_dump_json(indent=1)
-            require(same, "--output", f"{folder} with another entry, version or option", "another folder, or remove this one")
+            require(
+                same,
+                "--output",
+                f"{folder} with another entry, version or option",
+                "another folder, or remove this one",
+            )
         with writing("--output", folder, "a folder that can"):
             (folder / CHUNKS).mkdir(parents=True, exist_ok=True)
             write_file(path, definition.model_dump_json(indent=1))
@@ -111,8 +133,12 @@ class Benchmark:
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
     def fly(self, flights: "Flights", engine: Engine) -> Iterator[int]:
-        """Fly the missing chunks; yields the number of flights of each completed one. Raises ParameterError for a wrong u."""
-        for job, table in engine(partial(flights.fly, aircraft=self.definition.aircraft), self.missing()):
+        """Fly the missing chunks; yields the number of flights of each completed one. Raises
+        ParameterError for a wrong u.
+        """
+        for job, table in engine(
+            partial(flights.fly, aircraft=self.definition.aircraft), self.missing()
+        ):
             with writing("--output", self.folder, "a folder that can"):
                 write_file(self._path(job), table)
             yield self.definition.size(job)
@@ -127,7 +153,12 @@ class Benchmark:
             "release": definition.release,
             "aircraft": definition.aircraft,
         }
-        entry = {"name": definition.entry, "sees": definition.sees, "knows": definition.knows, "source": definition.source}
+        entry = {
+            "name": definition.entry,
+            "sees": definition.sees,
+            "knows": definition.knows,
+            "source": definition.source,
+        }
         scores = {"benchmark": benchmark, "entry": entry, "stack": definition.stack, "sets": scored}
         with writing("--output", self.folder, "a folder that can"):
             write_file(self.folder / SCORES, json.dumps(scores, indent=1, allow_nan=False) + "\n")
@@ -166,7 +197,9 @@ class Flights:
         self._prepared: dict[str, _Prepared] = {}
 
     def not_flown(self) -> dict[str, str]:
-        """A sentence for each set that the entry takes no part in. Raises ParameterError for a section that is none."""
+        """A sentence for each set that the entry takes no part in. Raises ParameterError for a
+        section that is none.
+        """
         reasons = {}
         for name in SETS:
             task = task_of(name, self.sets)
@@ -188,7 +221,14 @@ class Flights:
             return _Prepared(task, law, scenario, None, None, ())
         course = build_course(scenario)
         mission = None if scenario.guidance is None else missions.build(scenario, course)
-        return _Prepared(task, law, scenario, course, mission, tuple(round(edge * task.rate) for edge in SETS[name].edges))
+        return _Prepared(
+            task,
+            law,
+            scenario,
+            course,
+            mission,
+            tuple(round(edge * task.rate) for edge in SETS[name].edges),
+        )
 
     def fly(self, job: Job, aircraft: int) -> bytes:
         """Fly a chunk of a benchmark of `aircraft`: its rows as Parquet."""
@@ -203,7 +243,9 @@ class Flights:
         return encode(_fly_fleet(self.entry, prepared, seed, first, size), seed, 1.0)
 
 
-def _fly_fleet(entry: BenchmarkEntry, prepared: _Prepared, seed: int, first: int, size: int) -> Chunk:
+def _fly_fleet(
+    entry: BenchmarkEntry, prepared: _Prepared, seed: int, first: int, size: int
+) -> Chunk:
     """Fly uncertain aircraft first, first + 1, ..., as in a campaign."""
     scenario = prepared.scenario
     course = prepared.course
@@ -212,18 +254,29 @@ def _fly_fleet(entry: BenchmarkEntry, prepared: _Prepared, seed: int, first: int
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
     directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
     late = round(SETS[prepared.task.set].late / course.period)
-    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    aircraft = batch_matrices.assemble(
+        A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
+    )
     vehicle = batch.vehicle(scenario)
     if isinstance(prepared.law, ControllerConfig):
         law = prepared.law.tuned_law()
         params = batch.shared(law.params)
-        result = batch.fly(aircraft, vehicle, course, law.control_law, params, prepared.mission, prepared.windows)
+        result = batch.fly(
+            aircraft, vehicle, course, law.control_law, params, prepared.mission, prepared.windows
+        )
     else:
-        result = _stepped(Stepper(aircraft, vehicle, course, prepared.mission, prepared.windows), entry, prepared, size)
+        result = _stepped(
+            Stepper(aircraft, vehicle, course, prepared.mission, prepared.windows),
+            entry,
+            prepared,
+            size,
+        )
     return Chunk(first, np.asarray(result.diverged), _figures(result, prepared), {})
 
 
-def _stepped(flights: Stepper, entry: BenchmarkEntry, prepared: _Prepared, size: int) -> FleetResult:
+def _stepped(
+    flights: Stepper, entry: BenchmarkEntry, prepared: _Prepared, size: int
+) -> FleetResult:
     """Fly a function, one for each aircraft. That of a diverged aircraft is not called any more."""
     steps = [entered(entry, prepared.task) for _ in range(size)]
     u = np.zeros((len(prepared.task.inputs), size))
@@ -248,7 +301,9 @@ def _figures(result: FleetResult, prepared: _Prepared) -> dict[str, FloatArray]:
     else:
         figures = {name: np.asarray(values) for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, result.rms), ("slew", inputs, result.slew)):
-        figures |= {f"{kind}.{name}": row for name, row in zip(names, np.asarray(values), strict=True)}
+        figures |= {
+            f"{kind}.{name}": row for name, row in zip(names, np.asarray(values), strict=True)
+        }
     edges = (0.0, *SETS[prepared.task.set].edges, prepared.scenario.flight.duration)
     if len(edges) > 2:  # more than one window
         for begin, end, rms in zip(edges, edges[1:], np.asarray(result.windows), strict=False):
@@ -257,7 +312,9 @@ def _figures(result: FleetResult, prepared: _Prepared) -> dict[str, FloatArray]:
 
 
 class _FunctionController(Controller):
-    """A function in place of the guarded law of a flight in one process: called once a tick with the newest y and y_m."""
+    """A function in place of the guarded law of a flight in one process: called once a tick with
+    the newest y and y_m.
+    """
 
     def __init__(self, parameters: ControllerConfig, step: Step, task: Task) -> None:
         super().__init__(parameters)
@@ -271,17 +328,29 @@ class _FunctionController(Controller):
         y_m = self._y_m[-1]
         t = seconds(now_ns)
         u = stepped(self._step, t, y.value, y_m.value, self._task)
-        inputs = TickInputs(y.stamp_ns, y.value, y_m.value, seconds(y_m.stamp_ns - y.stamp_ns), seconds(self.period_ns))
+        inputs = TickInputs(
+            y.stamp_ns,
+            y.value,
+            y_m.value,
+            seconds(y_m.stamp_ns - y.stamp_ns),
+            seconds(self.period_ns),
+        )
         return ControlOutput(y.stamp_ns, u, inputs, lambda: np.zeros(0))
 
 
 def _fly_alone(entry: BenchmarkEntry, prepared: _Prepared) -> Chunk:
     """Fly the aircraft of the scenario in one process."""
-    law = prepared.law if isinstance(prepared.law, ControllerConfig) else entered(entry, prepared.task)
+    law = (
+        prepared.law
+        if isinstance(prepared.law, ControllerConfig)
+        else entered(entry, prepared.task)
+    )
     if isinstance(law, ControllerConfig) or law is None:
         tape = simulate(prepared.scenario)
     else:
-        tape = simulate(prepared.scenario, control=partial(_FunctionController, step=law, task=prepared.task))
+        tape = simulate(
+            prepared.scenario, control=partial(_FunctionController, step=law, task=prepared.task)
+        )
     if tape.outcome == INTERRUPTED:
         raise KeyboardInterrupt
     _, e = best_error(tape)
@@ -291,14 +360,18 @@ def _fly_alone(entry: BenchmarkEntry, prepared: _Prepared) -> Chunk:
     unit = score_units(e.names, prepared.scenario.aircraft.channels().outputs)
     figures = {"score": score(rms[:, None], unit)}
     for kind, names, values in (("rms", e.names, rms), ("slew", u.names, slew)):
-        figures |= {f"{kind}.{name}": np.array([value]) for name, value in zip(names, values, strict=True)}
+        figures |= {
+            f"{kind}.{name}": np.array([value]) for name, value in zip(names, values, strict=True)
+        }
     return Chunk(0, np.array([tape.outcome != COMPLETED]), figures, {})
 
 
 def scores_of(rows: "pl.DataFrame") -> dict[str, Any]:
-    """The scores of a set. A lost aircraft counts LOSS_OF_TRACK_SCORE; rms and slew are of those that did not diverge.
+    """The scores of a set. A lost aircraft counts LOSS_OF_TRACK_SCORE; rms and slew are of those
+    that did not diverge.
 
-    `over_time` has the mean score of each window, and `recovery` that of the window AFTER over that of BEFORE.
+    `over_time` has the mean score of each window, and `recovery` that of the window AFTER over that
+    of BEFORE.
     """
     flown = ~rows["diverged"].to_numpy()
 
@@ -310,10 +383,16 @@ def scores_of(rows: "pl.DataFrame") -> dict[str, Any]:
 
     def means(kind: str) -> dict[str, float | None]:
         names = [name for name in rows.columns if name.startswith(kind)]
-        return {name.removeprefix(kind): float(values(name)[flown].mean()) if flown.any() else None for name in names}
+        return {
+            name.removeprefix(kind): float(values(name)[flown].mean()) if flown.any() else None
+            for name in names
+        }
 
     total = counted("score")
-    scores: dict[str, Any] = {"aircraft": len(rows), "lost": int((total >= LOSS_OF_TRACK_SCORE).sum())}
+    scores: dict[str, Any] = {
+        "aircraft": len(rows),
+        "lost": int((total >= LOSS_OF_TRACK_SCORE).sum()),
+    }
     scores |= {
         "score": {"mean": float(total.mean()), "worst": float(total.max())},
         "rms": means("rms."),

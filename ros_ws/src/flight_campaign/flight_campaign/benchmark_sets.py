@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sets of flights of the public benchmark, a version of which never changes: aircraft, winds, faults and seeds.
+"""The sets of flights of the public benchmark, a version of which never changes: aircraft, winds,
+faults and seeds.
 
-A set is a scenario of the stack with changes. `Sets.digest` covers all that a law flies through, and no gains.
+A set is a scenario of the stack with changes. `Sets.digest` covers all that a law flies through,
+and no gains.
 """
 
 import hashlib
@@ -27,8 +29,22 @@ REPEAT = 60.0
 DAMAGED = ("elevator", "aileron")
 RELEASE_LENGTH = 40  # hex digits of a commit
 
-FRAME = ("rate", "outputs", "inputs", "D", "input_scale", "lag", "delay", "max_age", "hold", "ramp", "lower", "upper")
-"""Keys of the section `controller` that every law gets: channels, signs, scales and limits of the inputs, and the failsafe."""
+FRAME = (
+    "rate",
+    "outputs",
+    "inputs",
+    "D",
+    "input_scale",
+    "lag",
+    "delay",
+    "max_age",
+    "hold",
+    "ramp",
+    "lower",
+    "upper",
+)
+"""Keys of the section `controller` that every law gets: channels, signs, scales and limits of the
+inputs, and the failsafe."""
 
 
 class FlightSet(NamedTuple):
@@ -78,7 +94,9 @@ def seed_of(name: str, release: str, what: str) -> int:
 
 
 class Sets:
-    """The sets of a run: the scenarios of the stack by name, and the hash that fresh seeds come from, "" for the fixed ones."""
+    """The sets of a run: the scenarios of the stack by name, and the hash that fresh seeds come
+    from, "" for the fixed ones.
+    """
 
     def __init__(self, scenarios: Mapping[str, Scenario], release: str = "") -> None:
         self.release = release
@@ -93,37 +111,61 @@ class Sets:
         return sorted({scenario.aircraft.airframe for scenario in self._scenarios.values()})
 
     def digest(self) -> str:
-        """SHA-256 of the sets of this version: sections, frames, airframes, the fixed seeds and the rules of a score."""
+        """SHA-256 of the sets of this version: sections, frames, airframes, the fixed seeds and the
+        rules of a score.
+        """
         content = {}
         for name, flight_set in SETS.items():
             scenario = _flown(name, self._scenarios[flight_set.scenario], "")
-            sections = {key: getattr(scenario, key) for key in ("flight", "aircraft", "reference_model", "guidance")}
+            sections = {
+                key: getattr(scenario, key)
+                for key in ("flight", "aircraft", "reference_model", "guidance")
+            }
             content[name] = {
                 **{
-                    key: section and section.model_dump(mode="json", exclude_defaults=True) for key, section in sections.items()
+                    key: section and section.model_dump(mode="json", exclude_defaults=True)
+                    for key, section in sections.items()
                 },
                 "controller": frame(scenario),
                 "airframe": _airframe(scenario) if flight_set.fleet else None,
-                "rules": [UNCERTAINTY, flight_set.late, flight_set.edges, flight_set.divisor, seed_of(name, "", "aircraft")],
+                "rules": [
+                    UNCERTAINTY,
+                    flight_set.late,
+                    flight_set.edges,
+                    flight_set.divisor,
+                    seed_of(name, "", "aircraft"),
+                ],
             }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _flown(name: str, scenario: Scenario, release: str) -> Scenario:
     flight_set = SETS[name]
-    aircraft: dict[str, Any] = {"sensors": scenario.aircraft.sensors.model_dump() | {"seed": seed_of(name, release, "noise")}}
+    aircraft: dict[str, Any] = {
+        "sensors": scenario.aircraft.sensors.model_dump()
+        | {"seed": seed_of(name, release, "noise")}
+    }
     if scenario.aircraft.turbulence is not None:
-        air = scenario.aircraft.turbulence.model_dump() | {"seed": seed_of(name, release, "turbulence")}
+        air = scenario.aircraft.turbulence.model_dump() | {
+            "seed": seed_of(name, release, "turbulence")
+        }
         aircraft["turbulence"] = air
     if flight_set.turbulent:
-        aircraft |= {"gusts": {}, "turbulence": MODERATE | {"seed": seed_of(name, release, "turbulence")}}
+        aircraft |= {
+            "gusts": {},
+            "turbulence": MODERATE | {"seed": seed_of(name, release, "turbulence")},
+        }
     if flight_set.damaged:
-        times = [DAMAGE if key in DAMAGED else math.inf for key in scenario.aircraft.channels().inputs]
+        times = [
+            DAMAGE if key in DAMAGED else math.inf for key in scenario.aircraft.channels().inputs
+        ]
         aircraft["actuators"] = scenario.aircraft.actuators.model_dump() | {"weak_at": times}
         scenario = scenario.vary(reference_model={"pulses": _repeated(scenario)})
     if flight_set.fleet:
         aircraft |= {"rate": RATE, "step": STEP}
-        scenario = scenario.vary(aircraft=aircraft, reference_model={"rate": RATE}, controller={"delay": 0.0})
+        scenario = scenario.vary(
+            aircraft=aircraft, reference_model={"rate": RATE}, controller={"delay": 0.0}
+        )
     else:
         scenario = scenario.vary(aircraft=aircraft)
     return scenario.vary(**flight_set.changes) if flight_set.changes else scenario
@@ -145,8 +187,12 @@ def frame(scenario: Scenario) -> dict[str, Any]:
 
 
 def _airframe(scenario: Scenario) -> dict[str, Any]:
-    """The airframe as the sets fly it: they lose no thrust, so where an input gives none is left out."""
-    airframe = load_airframe(scenario.aircraft.airframe).model_dump(mode="json", exclude_defaults=True)
+    """The airframe as the sets fly it: they lose no thrust, so where an input gives none is left
+    out.
+    """
+    airframe = load_airframe(scenario.aircraft.airframe).model_dump(
+        mode="json", exclude_defaults=True
+    )
     for described in airframe["inputs"].values():
         described.pop("no_thrust", None)
     return airframe

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks; an interrupted campaign can be resumed.
+"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks; an interrupted
+campaign can be resumed.
 
-The folder of a campaign holds its definition, a table for each completed chunk, and at the end its figures and its report.
+The folder of a campaign holds its definition, a table for each completed chunk, and at the end its
+figures and its report.
 """
 
 import math
@@ -15,7 +17,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import Distribution, Spread, WindEffect, drawn_entries, gust_directions, sampled_matrices
+from aircraft_sim.uncertainty import (
+    Distribution,
+    Spread,
+    WindEffect,
+    drawn_entries,
+    gust_directions,
+    sampled_matrices,
+)
 from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign import equipment, learning_flights
@@ -46,7 +55,9 @@ MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are c
 
 
 class Sweep(Config):
-    """Factors of one parameter of the controller, or of its value in a channel; every aircraft flies with each of them."""
+    """Factors of one parameter of the controller, or of its value in a channel; every aircraft
+    flies with each of them.
+    """
 
     parameter: str = Field(description="its name, as beta, or with a channel of y or u, as beta[V]")
     factors: Positives
@@ -59,38 +70,68 @@ class Sweep(Config):
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
         """The parameter times a factor, in the channel alone where one is named.
 
-        A channel of u means the channel of y that it is paired with. Raises ParameterError for another parameter or channel.
+        A channel of u means the channel of y that it is paired with. Raises ParameterError for
+        another parameter or channel.
         """
         swept = swept_parameters(controller)
-        require(self.name in swept, "sweep", self.parameter, f"a parameter of the controller: {', '.join(swept)}")
+        require(
+            self.name in swept,
+            "sweep",
+            self.parameter,
+            f"a parameter of the controller: {', '.join(swept)}",
+        )
         value = getattr(controller, self.name)
         if self.name == self.parameter:
-            return tuple(factor * number for number in value) if isinstance(value, tuple) else factor * float(value)
+            return (
+                tuple(factor * number for number in value)
+                if isinstance(value, tuple)
+                else factor * float(value)
+            )
         m = len(controller.outputs)
-        by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)  # k_d of (22) has none for the last
-        require(by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel")
-        named = [*enumerate(controller.outputs[: len(value)]), *enumerate(controller.inputs[: len(value)])]
+        by_channel = isinstance(value, tuple) and len(value) in (
+            m - 1,
+            m,
+        )  # k_d of (22) has none for the last
+        require(
+            by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
+        )
+        named = [
+            *enumerate(controller.outputs[: len(value)]),
+            *enumerate(controller.inputs[: len(value)]),
+        ]
         places = [k for k, name in named if f"{self.name}[{name}]" == self.parameter]
         names = ", ".join(name for _, name in named)
-        require(bool(places), "sweep", self.parameter, f"{self.name}[CHANNEL], CHANNEL one of {names}")
-        return tuple(factor * number if k == places[0] else number for k, number in enumerate(value))
+        require(
+            bool(places), "sweep", self.parameter, f"{self.name}[CHANNEL], CHANNEL one of {names}"
+        )
+        return tuple(
+            factor * number if k == places[0] else number for k, number in enumerate(value)
+        )
 
 
 class Definition(Config):
-    """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the CPU."""
+    """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the
+    CPU.
+    """
 
     name: str  # of the scenario
     sections: dict[str, dict[str, object]]  # of the scenario, every parameter
     aircraft: int = Field(ge=1, le=2**32, description="how many aircraft fly")
-    uncertainty: float = Field(ge=0, lt=1, description="the largest part by which an entry of A and of B differs")
-    wind: WindEffect = Field(description="the effect of wind: by each aircraft's own A, or that of the airframe")
+    uncertainty: float = Field(
+        ge=0, lt=1, description="the largest part by which an entry of A and of B differs"
+    )
+    wind: WindEffect = Field(
+        description="the effect of wind: by each aircraft's own A, or that of the airframe"
+    )
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
     chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
     sweep: Sweep | None = None
     entries: dict[str, Annotated[float, Field(ge=0, lt=1)]] = Field(
         default={}, description="the largest part of entries with one of their own, by name"
     )
-    distribution: Distribution = Field(default="uniform", description="of the parts, within the largest")
+    distribution: Distribution = Field(
+        default="uniform", description="of the parts, within the largest"
+    )
     score_units: dict[str, Positive] = Field(
         default={}, description="unit of an rms error in the score by output, SI, if its own"
     )
@@ -102,7 +143,9 @@ class Definition(Config):
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
         """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
-        return equipment.drawn(scenario, Spread(self.entries, self.distribution), self.seed, first, count)
+        return equipment.drawn(
+            scenario, Spread(self.entries, self.distribution), self.seed, first, count
+        )
 
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
@@ -123,9 +166,15 @@ class Definition(Config):
         }
         entries = self.spread.entries
         scenario = self.scenario(case)
-        uncertainty |= {"entries": [*entries], "parts": [*entries.values()], "distribution": self.distribution}
+        uncertainty |= {
+            "entries": [*entries],
+            "parts": [*entries.values()],
+            "distribution": self.distribution,
+        }
         drawn = self.drawn_equipment(scenario, number, 1)
-        equipped = equipment.with_equipment(scenario, {name: float(value[0]) for name, value in drawn.items()})
+        equipped = equipment.with_equipment(
+            scenario, {name: float(value[0]) for name, value in drawn.items()}
+        )
         return equipped.vary(aircraft={"uncertainty": uncertainty})
 
     @property
@@ -139,7 +188,9 @@ class Definition(Config):
 
     def label(self, case: int) -> str:
         """The name of a case in tables."""
-        return self.name if self.sweep is None else f"{self.sweep.parameter} x {self.factor(case):g}"
+        return (
+            self.name if self.sweep is None else f"{self.sweep.parameter} x {self.factor(case):g}"
+        )
 
     def size(self, job: Job) -> int:
         """Number of aircraft of a chunk."""
@@ -153,7 +204,9 @@ class Definition(Config):
 
 def swept_parameters(controller: ControllerConfig) -> list[str]:
     """Parameters that a sweep may multiply: the numbers of the law itself, and input_scale."""
-    names = [name for name in type(controller).model_fields if name not in ControllerConfig.model_fields]
+    names = [
+        name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
+    ]
     values = ((name, np.atleast_1d(getattr(controller, name))) for name in names)
     return [*(name for name, value in values if value.dtype == np.float64), "input_scale"]
 
@@ -163,8 +216,18 @@ def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str
     outputs = scenario.controller.outputs
     stated_units = dict(units)
     for name, unit in stated_units.items():
-        require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
-        require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
+        require(
+            name in outputs,
+            "score",
+            repr(name),
+            f"an output of the controller: {', '.join(outputs)}",
+        )
+        require(
+            math.isfinite(unit) and unit > 0.0,
+            f"score.{name}",
+            f"{unit:g}",
+            "a unit of rms error above 0, SI",
+        )
     require(
         scenario.guidance is None or not stated_units,
         "score",
@@ -189,8 +252,8 @@ def define(
 ) -> Definition:
     """The definition of a campaign over a scenario.
 
-    `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units of the
-    score by output, SI. `chunk` None: CHUNK, or 1 with a learner.
+    `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units
+    of the score by output, SI. `chunk` None: CHUNK, or 1 with a learner.
 
     Raises ParameterError if a campaign cannot fly it.
     """
@@ -204,16 +267,28 @@ def define(
             from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 
             missions.build(scenario, course)
-    published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
+    published = scenario.vary(
+        aircraft={"uncertainty": {}}
+    )  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
     stated_units = _permitted_units(scenario, units or {})
     airframe_spread = spread._replace(entries=equipment.matrix_entries(spread.entries))
-    sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, airframe_spread)
+    sampled_matrices(
+        load_airframe(scenario.aircraft.airframe),
+        uncertainty,
+        uncertainty,
+        seed,
+        0,
+        1,
+        airframe_spread,
+    )
     values = {
         "name": scenario.name,
         "sections": {
-            name: section.model_dump(mode="json") for name in SCHEMAS if (section := getattr(published, name)) is not None
+            name: section.model_dump(mode="json")
+            for name in SCHEMAS
+            if (section := getattr(published, name)) is not None
         },
         "aircraft": aircraft,
         "uncertainty": uncertainty,
@@ -232,9 +307,11 @@ def define(
 
 
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no other inputs.
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no
+    other inputs.
 
-    `learner` makes the learner of a scenario. Raises ParameterError for a chunk that does not fit into memory.
+    `learner` makes the learner of a scenario. Raises ParameterError for a chunk that does not fit
+    into memory.
     """
     definition = Definition.model_validate_json(text)
     try:
@@ -246,7 +323,9 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
         if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
             raise
         demand = f"{definition.chunk} aircraft at once, which need more memory than there is"
-        raise ParameterError(f"chunk: found {demand}, expected fewer, or shorter delays of the aircraft") from None
+        raise ParameterError(
+            f"chunk: found {demand}, expected fewer, or shorter delays of the aircraft"
+        ) from None
     return encode(figures, definition.seed, definition.factor(job[0]))
 
 
@@ -260,25 +339,43 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     count = definition.size(job)
     part = definition.uncertainty
     scenario, course, vehicle, law, mission = _prepare(text, case)
-    # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
+    # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft
+    # are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk, definition.spread)
+    A, B = sampled_matrices(
+        airframe, part, part, definition.seed, first, definition.chunk, definition.spread
+    )
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, definition.chunk)
     late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
-    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    aircraft = batch_matrices.assemble(
+        A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
+    )
     vehicle = batch.with_equipment(vehicle, scenario, equipped)
     result = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
-    rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
+    rms, largest, slew = (
+        np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew)
+    )
     outputs = scenario.controller.outputs
     inputs = scenario.controller.effectors
     if result.mission is None:
-        figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
+        figures = {
+            "score": score(
+                rms,
+                score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units),
+            )
+        }
     else:
         figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
-    for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
+    for kind, names, values in (
+        ("rms", outputs, rms),
+        ("max", outputs, largest),
+        ("slew", inputs, slew),
+    ):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    entries = drawn_entries(airframe, A[:count], B[:count]) | {name: value[:count] for name, value in equipped.items()}
+    entries = drawn_entries(airframe, A[:count], B[:count]) | {
+        name: value[:count] for name, value in equipped.items()
+    }
     return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
 
 
@@ -301,11 +398,18 @@ def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chun
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
     entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
-    flown = [learning_flights.fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    flown = [
+        learning_flights.fly(definition.aircraft_scenario(first + k, case), learner)
+        for k in range(count)
+    ]
     outputs = scenario.controller.outputs
     by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
     rms = np.array([by_kind["rms"][name] for name in outputs])
-    figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
+    figures = {
+        "score": score(
+            rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units)
+        )
+    }
     for kind, by_channel in by_kind.items():
         figures |= {f"{kind}.{name}": values for name, values in by_channel.items()}
     for name in LearningOutcome._fields:
@@ -332,7 +436,13 @@ def _prepare(text: str, case: int) -> _Shared:
     law = scenario.controller.tuned_law()
     course = build_course(scenario)
     mission = None if scenario.guidance is None else missions.build(scenario, course)
-    return _Shared(scenario, course, batch.vehicle(scenario), law._replace(params=batch.shared(law.params)), mission)
+    return _Shared(
+        scenario,
+        course,
+        batch.vehicle(scenario),
+        law._replace(params=batch.shared(law.params)),
+        mission,
+    )
 
 
 class Campaign:
@@ -354,9 +464,13 @@ class Campaign:
     def resume(cls, folder: Path) -> "Campaign":
         """The campaign of a folder. Raises ParameterError for a folder without one."""
         try:
-            definition = Definition.model_validate_json((folder / DEFINITION).read_text(encoding="utf-8"))
+            definition = Definition.model_validate_json(
+                (folder / DEFINITION).read_text(encoding="utf-8")
+            )
         except (OSError, ValueError) as error:
-            raise ParameterError(f"{folder}: found no campaign ({error}), expected the folder of one") from None
+            raise ParameterError(
+                f"{folder}: found no campaign ({error}), expected the folder of one"
+            ) from None
         with writing("", folder, "the folder of a campaign, which can"):
             (folder / CHUNKS).mkdir(exist_ok=True)
         return cls(folder, definition)
@@ -370,12 +484,16 @@ class Campaign:
 
         `learner` makes the learner of a scenario.
         """
-        for job, table in engine(partial(fly_chunk, self.definition.model_dump_json(), learner=learner), self.missing()):
+        for job, table in engine(
+            partial(fly_chunk, self.definition.model_dump_json(), learner=learner), self.missing()
+        ):
             _write(self._path(job), table)
             yield self.definition.size(job)
 
     def tally(self, case: int) -> Tally:
-        """Statistics of a case, summed in the order of the chunks. Raises ParameterError for a damaged file."""
+        """Statistics of a case, summed in the order of the chunks. Raises ParameterError for a
+        damaged file.
+        """
         total = Tally()
         for job in self._flown():
             if job[0] == case:
@@ -383,10 +501,14 @@ class Campaign:
         return total
 
     def rows(self, case: int | None = None) -> "pl.LazyFrame":
-        """The table of the completed chunks of a case or of all, ordered by case, then number; `rows` has the columns."""
+        """The table of the completed chunks of a case or of all, ordered by case, then number;
+        `rows` has the columns.
+        """
         import polars as pl  # noqa: PLC0415 - some tenths of a second
 
-        return pl.scan_parquet([self._path(job) for job in self._flown() if case in {None, job[0]}], glob=False)
+        return pl.scan_parquet(
+            [self._path(job) for job in self._flown() if case in {None, job[0]}], glob=False
+        )
 
     def write_rows(self, path: Path) -> None:
         """Write the table as one Parquet file, chunk by chunk. Raises OSError."""
@@ -394,12 +516,18 @@ class Campaign:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
+        """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case;
+        None without a linear loop.
+        """
         definition = self.definition
         scenario = self.definition.scenario(case)
         try:
             return margins(
-                scenario, min(definition.aircraft, MARGIN_AIRCRAFT), definition.uncertainty, definition.seed, definition.spread
+                scenario,
+                min(definition.aircraft, MARGIN_AIRCRAFT),
+                definition.uncertainty,
+                definition.seed,
+                definition.spread,
             )
         except ParameterError:
             return None
@@ -408,7 +536,9 @@ class Campaign:
         return [job for job in self.definition.jobs() if self._path(job).exists()]
 
     def influence(self, case: int, worst: int) -> dict[str, Any]:
-        """Rank correlations of the drawn entries with the score of a case; `worst` is the number of its worst aircraft."""
+        """Rank correlations of the drawn entries with the score of a case; `worst` is the number of
+        its worst aircraft.
+        """
         import polars as pl  # noqa: PLC0415 - as above
 
         rows = self.rows(case)
@@ -416,9 +546,17 @@ class Campaign:
         matrices = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
         published = {name: float(value[0]) for name, value in matrices.items()}
         published |= equipment.references(self.definition.scenario(), self.definition.entries)
-        parts = {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published}
+        parts = {
+            name: self.definition.entries.get(name, self.definition.uncertainty)
+            for name in published
+        }
         parts |= {equipment.DELAY: 1.0}
-        return influence(rows.head(RANKED).collect(), rows.filter(pl.col("number") == worst).collect(), published, parts)
+        return influence(
+            rows.head(RANKED).collect(),
+            rows.filter(pl.col("number") == worst).collect(),
+            published,
+            parts,
+        )
 
     def _read(self, job: Job) -> "pl.DataFrame":
         import polars as pl  # noqa: PLC0415 - as above
@@ -429,7 +567,10 @@ class Campaign:
             table = pl.read_parquet(path, glob=False)
         except pl.exceptions.PolarsError:
             table = pl.DataFrame()
-        again = f"the figures of {size} aircraft of this campaign; remove the file, and the same command flies them again"
+        again = (
+            f"the figures of {size} aircraft of this campaign; remove the file, and the "
+            "same command flies them again"
+        )
         require(table.height == size, str(path), f"{table.height or 'none'}", again)
         return table
 

@@ -22,38 +22,64 @@ from flight_analysis.report.html import Line, Page, Section, TableGroup, page_ht
 from flight_analysis.report.margin_figures import LEAST_MARGINS, least_margins, margins_as_json
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_analysis.report.summary import NO_UNIT, NO_VALUE, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null
+from flight_analysis.report.summary import (
+    NO_UNIT,
+    NO_VALUE,
+    QUANTITY_UNITS,
+    Column,
+    DisplayUnit,
+    display_units,
+    finite_or_null,
+)
 from flight_analysis.report.tables import Table
 from flight_campaign import equipment
 from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
-from flight_campaign.statistics import EDGES, FIRST_MODEL, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
+from flight_campaign.statistics import (
+    EDGES,
+    FIRST_MODEL,
+    LOSS_OF_TRACK_SCORE,
+    PER_DECADE,
+    Figure,
+    Tally,
+)
 from flight_core.files import display_path, write_file, writing
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
-WIND_EFFECTS: dict[WindEffect, str] = {"air_relative": "by each aircraft's own A", "published": "that of the airframe"}
+WIND_EFFECTS: dict[WindEffect, str] = {
+    "air_relative": "by each aircraft's own A",
+    "published": "that of the airframe",
+}
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 ENTRIES_SHOWN = 6
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
-OF_LEARNER = {FIRST_MODEL: "first model (s)", "models": "models that flew", "refused": "models refused"}
+OF_LEARNER = {
+    FIRST_MODEL: "first model (s)",
+    "models": "models that flew",
+    "refused": "models refused",
+}
 
 
 OVERVIEW_LEGEND = (
-    "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay margin: of all inputs at once."
-    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer by their A and B;"
-    " lags and delay of the controller's section"
+    "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay "
+    "margin: of all inputs at once."
+    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer by "
+    "their A and B; lags and delay of the controller's section"
 )
 
 
 LEARNER_LEGEND = (
-    "first model: when it flew; models refused: by the learner, which tells why in the flight, or by the controller; fallbacks:"
-    " to the law of the start, in all outputs or in some. The margins above are those of the law of the start"
+    "first model: when it flew; models refused: by the learner, which tells why in the flight, "
+    "or by the controller; fallbacks:"
+    " to the law of the start, in all outputs or in some. The margins above are those of the "
+    "law of the start"
 )
 
 
 def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
-    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary and the overview.
+    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary
+    and the overview.
 
     Raises ParameterError.
     """
@@ -62,7 +88,11 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
     margins = [campaign.margins(case) for case in range(definition.cases)]
     with writing("", campaign.folder, "a folder and a disk that can"):
         cases = [
-            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign, case, tally)}
+            {
+                "factor": definition.factor(case),
+                **tally.summary(),
+                "fly_again": _write_worst(campaign, case, tally),
+            }
             | {"margins": None if loop_margins is None else margins_as_json(loop_margins)}
             | {"influence": _influence(campaign, case, tally)}
             for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True))
@@ -92,28 +122,49 @@ def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, 
     for aircraft in tally.worst[:RERUN]:
         path = _path(campaign, case, str(aircraft.number))
         write_file(path, scenario_yaml(definition.aircraft_scenario(aircraft.number, case)))
-        again.append({"number": aircraft.number, "score": aircraft.score, "command": _command(path)})
+        again.append(
+            {"number": aircraft.number, "score": aircraft.score, "command": _command(path)}
+        )
     return again
 
 
 def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
-    """Rank correlations of a case; writes the airframe and the scenario of the worst corner where there is one."""
+    """Rank correlations of a case; writes the airframe and the scenario of the worst corner where
+    there is one.
+    """
     definition = campaign.definition
     ranked = campaign.influence(case, tally.worst[0].number)
-    corner = {entry["entry"]: entry["worst_corner"] for entry in ranked["entries"] if entry["worst_corner"]}
+    corner = {
+        entry["entry"]: entry["worst_corner"]
+        for entry in ranked["entries"]
+        if entry["worst_corner"]
+    }
     if not corner:
         return ranked | {"command": None}
     scenario = definition.scenario(case)
     path = _path(campaign, case, "corner")
-    airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
+    airframe = path.with_name(
+        "corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml"
+    ).absolute()
     known = equipment.references(scenario, definition.entries)
-    equipment_parts = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
+    equipment_parts = {
+        name: known[name] * (1.0 + part) for name, part in corner.items() if name in known
+    }
     matrix_parts = {name: part for name, part in corner.items() if name not in known}
-    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), matrix_parts, definition.wind)))
+    write_file(
+        airframe,
+        as_yaml(
+            with_entries(load_airframe(scenario.aircraft.airframe), matrix_parts, definition.wind)
+        ),
+    )
     learn = getattr(scenario.controller, "learn", None)
-    if learn is not None and learn.prior is None:  # the learner begins with the airframe, not with the corner
+    if (
+        learn is not None and learn.prior is None
+    ):  # the learner begins with the airframe, not with the corner
         scenario = scenario.vary(controller={"learn": {"prior": scenario.aircraft.airframe}})
-    cornered = equipment.with_equipment(scenario, equipment_parts).vary(aircraft={"airframe": str(airframe)})
+    cornered = equipment.with_equipment(scenario, equipment_parts).vary(
+        aircraft={"airframe": str(airframe)}
+    )
     write_file(path, scenario_yaml(cornered))
     return ranked | {"command": _command(path)}
 
@@ -136,30 +187,47 @@ def write_page(
     cases: Sequence[Mapping[str, Any]],
     margins: Sequence[LoopMargins | None],
 ) -> None:
-    """Write the report of a campaign: for each case a tally, the figures of the summary, and the margins of the loop."""
+    """Write the report of a campaign: for each case a tally, the figures of the summary, and the
+    margins of the loop.
+    """
     scenario = definition.scenario()
     units = QUANTITY_UNITS | display_units(scenario)
     labels = _labels(definition)
     title = f"Campaign {definition.name}"
     text = (
         f"{tallies[0].flights} aircraft, every entry of A and B within"
-        f" ±{100 * definition.uncertainty:g} % of the airframe{_spread_of_entries(definition)}, seed {definition.seed};"
-        f" the same wind and noise for all, the effect of wind on x_dot {WIND_EFFECTS[definition.wind]};"
-        " true errors at the controller's ticks."
-        f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
+        f" ±{100 * definition.uncertainty:g} % of the airframe{_spread_of_entries(definition)}, "
+        f"seed {definition.seed}; the same wind and noise for all, the effect of wind on x_dot "
+        f"{WIND_EFFECTS[definition.wind]}; true errors at the controller's ticks."
+        f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score "
+        f"above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     if scenario.learns():
         tables.append(_without_model(labels, tallies))
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
     tables.append(_worst(labels, cases))
-    tables += [influence_table(label, case) for label, case in zip(labels, cases, strict=True) if case["influence"]["entries"]]
+    tables += [
+        influence_table(label, case)
+        for label, case in zip(labels, cases, strict=True)
+        if case["influence"]["entries"]
+    ]
     sections = [
-        Section("Score", "share of the aircraft by score", _spread(labels, tallies, ["score"], {}), over_time=False),
+        Section(
+            "Score",
+            "share of the aircraft by score",
+            _spread(labels, tallies, ["score"], {}),
+            over_time=False,
+        ),
         Section(
             "Errors",
             "share of the aircraft by rms of the true error",
-            _spread(labels, tallies, [name for name in tallies[0].figures if name.startswith("rms.")], units),
+            _spread(
+                labels,
+                tallies,
+                [name for name in tallies[0].figures if name.startswith("rms.")],
+                units,
+            ),
             over_time=False,
         ),
         Section("Sweep", "score over the factor", _sweep(definition, tallies), over_time=False),
@@ -168,7 +236,9 @@ def write_page(
     write_file(path, page_html(page))
 
 
-def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]) -> Table:
+def overview(
+    definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]
+) -> Table:
     """Scores, lost aircraft and margins, a column for each case."""
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
@@ -176,11 +246,21 @@ def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence
         lost = tally.lost + tally.diverged
         worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
         columns.append(
-            [f"{score.mean:.3g}", worst, f"{100.0 * lost / max(tally.flights, 1):.3g}", *least_margins(loop_margins)]
+            [
+                f"{score.mean:.3g}",
+                worst,
+                f"{100.0 * lost / max(tally.flights, 1):.3g}",
+                *least_margins(loop_margins),
+            ]
         )
     names = ("score, mean", "score, worst", "lost or diverged, %", *LEAST_MARGINS)
     rows = [[name, *cells] for name, *cells in zip(names, *columns, strict=True)]
-    return Table("Score and margins", [Column("", label) for label in _labels(definition)], rows, OVERVIEW_LEGEND)
+    return Table(
+        "Score and margins",
+        [Column("", label) for label in _labels(definition)],
+        rows,
+        OVERVIEW_LEGEND,
+    )
 
 
 def _spread_of_entries(definition: Definition) -> str:
@@ -195,10 +275,19 @@ def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = 
     """What the score of a campaign counts; `score_units` replaces usual units by output, SI."""
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.aircraft.channels().speed
-        return f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s of flight at the trim speed"
+        return (
+            f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s "
+            "of flight at the trim speed"
+        )
     units = display_units(scenario)
-    stated = [f"{name} {unit * units[name].factor:g} {units[name].unit}" for name, unit in (score_units or {}).items()]
-    return f"the sum over the channels of rms error in {', '.join([*stated, '10 mrad/s (p: 20) and 0.1 m/s'])}"
+    stated = [
+        f"{name} {unit * units[name].factor:g} {units[name].unit}"
+        for name, unit in (score_units or {}).items()
+    ]
+    return (
+        "the sum over the channels of rms error in "
+        f"{', '.join([*stated, '10 mrad/s (p: 20) and 0.1 m/s'])}"
+    )
 
 
 def _labels(definition: Definition) -> list[str]:
@@ -206,7 +295,10 @@ def _labels(definition: Definition) -> list[str]:
 
 
 def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column(*pair) for pair in product(("diverged", "loss of track"), ("aircraft", "%", "95 % interval"))]
+    columns = [
+        Column(*pair)
+        for pair in product(("diverged", "loss of track"), ("aircraft", "%", "95 % interval"))
+    ]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         row = [label]
@@ -222,13 +314,26 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> Table:
-    rows = [[label, str(tally.without_model()), str(tally.flights)] for label, tally in zip(labels, tallies, strict=True)]
-    return Table("Aircraft that learn", [Column("", "without a model"), Column("", "of")], rows, LEARNER_LEGEND)
+    rows = [
+        [label, str(tally.without_model()), str(tally.flights)]
+        for label, tally in zip(labels, tallies, strict=True)
+    ]
+    return Table(
+        "Aircraft that learn",
+        [Column("", "without a model"), Column("", "of")],
+        rows,
+        LEARNER_LEGEND,
+    )
 
 
 def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
     columns = [Column("", head) for head in FIGURE_HEADINGS]
-    return Table(label, columns, figure_rows(tally, units), "of flights that did not diverge; slew: mean abs(u_dot)")
+    return Table(
+        label,
+        columns,
+        figure_rows(tally, units),
+        "of flights that did not diverge; slew: mean abs(u_dot)",
+    )
 
 
 def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
@@ -236,8 +341,14 @@ def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str
     rows = []
     for name, figure in tally.figures.items():
         label, factor = _label(name, units)
-        values = (figure.mean, *(figure.quantile(share) for share in SPREAD.values()), figure.largest)
-        rows.append([label, *(f"{value * factor:.3g}" if figure.count else NO_VALUE for value in values)])
+        values = (
+            figure.mean,
+            *(figure.quantile(share) for share in SPREAD.values()),
+            figure.largest,
+        )
+        rows.append(
+            [label, *(f"{value * factor:.3g}" if figure.count else NO_VALUE for value in values)]
+        )
     return rows
 
 
@@ -257,7 +368,12 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
         for flight in case["fly_again"]:
             score = "diverged" if flight["score"] is None else f"{flight['score']:.3g}"
             rows.append([label, str(flight["number"]), score, flight["command"]])
-    return Table("Worst flights", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
+    return Table(
+        "Worst flights",
+        columns,
+        rows,
+        "--lockstep in place of --in-process flies it over ROS 2 topics",
+    )
 
 
 def influence_table(label: str, case: Mapping[str, Any]) -> Table:
@@ -273,7 +389,8 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
         for entry in ranked["entries"][:ENTRIES_SHOWN]
     ]
     legend = (
-        f"rank correlation (Spearman, {ranked['aircraft']} aircraft) of the size of the entry with the score: above 0 larger"
+        f"rank correlation (Spearman, {ranked['aircraft']} aircraft) of the size of the entry "
+        "with the score: above 0 larger"
         " entries fly worse. Worst corner: the limits on the side of the higher score"
     )
     if ranked["chance"] is not None:
@@ -289,7 +406,10 @@ def _corner(value: float) -> str:
 
 
 def _spread(
-    labels: Sequence[str], tallies: Sequence[Tally], names: Sequence[str], units: Mapping[str, DisplayUnit]
+    labels: Sequence[str],
+    tallies: Sequence[Tally],
+    names: Sequence[str],
+    units: Mapping[str, DisplayUnit],
 ) -> plotting.Figure:
     figure = plotting.Figure(len(names), min(len(names), 2), 190, spacing=0.2)
     for place, name in enumerate(names):
@@ -337,7 +457,12 @@ def _sweep(definition: Definition, tallies: Sequence[Tally]) -> plotting.Figure 
         curves[label] = [score.quantile(share) for score in scores]
     curves["worst"] = [score.largest for score in scores]
     for (label, values), colour in zip(curves.items(), COLOURS, strict=True):
-        look = {"type": "scatter", "mode": "lines+markers", "name": label, "line": {"color": colour}}
+        look = {
+            "type": "scatter",
+            "mode": "lines+markers",
+            "name": label,
+            "line": {"color": colour},
+        }
         figure.add(look | {"x": np.array(definition.sweep.factors), "y": np.array(values)})
     figure.x[0] |= {"title": {"text": f"{definition.sweep.parameter} times"}, "type": "log"}
     figure.y[0] |= {"title": {"text": "score"}, "rangemode": "tozero"}

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engines for the chunks of a campaign: threads of this process, or dask workers, with equal results."""
+"""Engines for the chunks of a campaign: threads of this process, or dask workers, with equal
+results.
+"""
 
 import logging
 import os
@@ -18,8 +20,8 @@ RECONNECT = 60.0
 """s to wait for a scheduler at the start, and after its loss."""
 
 LOST_WORKER_TIMEOUT = {"distributed.deploy.lost-worker-timeout": "10 minutes"}
-"""After the default, 15 s, a cluster gives up a dead worker that starts again. On a busy host a start may take longer, and the
-campaign would wait for ever for a cluster without workers."""
+"""After the default, 15 s, a cluster gives up a dead worker that starts again. On a busy host a
+start may take longer, and the campaign would wait for ever for a cluster without workers."""
 
 AHEAD = 2  # queued chunks a worker: enough to keep it busy, few enough for constant memory
 
@@ -32,7 +34,9 @@ Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
 
 
 def require_jax() -> None:
-    """Raise ParameterError where JAX is not installed or finds no device, as with JAX_PLATFORMS of another host."""
+    """Raise ParameterError where JAX is not installed or finds no device, as with JAX_PLATFORMS of
+    another host.
+    """
     require_package("jax")
     import jax  # noqa: PLC0415 - takes a second, which few commands need
 
@@ -41,23 +45,32 @@ def require_jax() -> None:
     except (RuntimeError, AssertionError) as error:
         platforms = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).partition("\n")[0] or "no such device"
-        raise ParameterError(f"JAX_PLATFORMS: found {platforms!r} ({reason}), expected cpu, or a device of this host") from None
+        raise ParameterError(
+            f"JAX_PLATFORMS: found {platforms!r} ({reason}), expected cpu, or a device of this host"
+        ) from None
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Threads of this process. The loop is compiled once and releases the interpreter lock, so threads run in parallel."""
+    """Threads of this process. The loop is compiled once and releases the interpreter lock, so
+    threads run in parallel.
+    """
     count = workers or os.cpu_count() or 1
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
         waiting = iter(jobs)
         pool = ThreadPoolExecutor(count, thread_name_prefix="campaign")
         try:
-            underway: dict[Future[Any], Job] = {pool.submit(work, job): job for job in islice(waiting, AHEAD * count)}
+            underway: dict[Future[Any], Job] = {
+                pool.submit(work, job): job for job in islice(waiting, AHEAD * count)
+            }
             while underway:
                 finished, _ = wait(underway, return_when=FIRST_COMPLETED)
                 for future in finished:
                     job = underway.pop(future)
-                    underway.update((pool.submit(work, following), following) for following in islice(waiting, 1))
+                    underway.update(
+                        (pool.submit(work, following), following)
+                        for following in islice(waiting, 1)
+                    )
                     yield job, future.result()
         finally:
             pool.shutdown(cancel_futures=True)
@@ -66,7 +79,8 @@ def threads(workers: int | None = None) -> Engine:
 
 
 def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
-    """Processes of this machine, or the workers of a scheduler. The chunks of a dead worker run again.
+    """Processes of this machine, or the workers of a scheduler. The chunks of a dead worker run
+    again.
 
     A scheduler gets the lost chunks again when the scheduler is back within RECONNECT.
     """
@@ -78,7 +92,13 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
         waiting = iter(jobs)
         count = workers or os.cpu_count() or 1
         patience = CONNECT
-        for part in ("", ".client", ".nanny", ".scheduler", ".worker"):  # they log the loss of a peer as tracebacks
+        for part in (
+            "",
+            ".client",
+            ".nanny",
+            ".scheduler",
+            ".worker",
+        ):  # they log the loss of a peer as tracebacks
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
         lost: list[Job] = []
         while True:
@@ -87,16 +107,22 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                 try:
                     if scheduler is None:
                         cluster = stack.enter_context(_local_cluster(count))
-                    client = stack.enter_context(Client(scheduler or cluster, timeout=f"{patience:g}s"))
+                    client = stack.enter_context(
+                        Client(scheduler or cluster, timeout=f"{patience:g}s")
+                    )
                     ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
                 except (OSError, ValueError) as error:  # ValueError: no address at all
                     if scheduler is None:
-                        raise ParameterError(f"--engine dask: its workers did not start on this host ({error})") from None
+                        raise ParameterError(
+                            f"--engine dask: its workers did not start on this host ({error})"
+                        ) from None
                     where = f"found {scheduler}, expected a reachable dask scheduler"
                     raise ParameterError(f"--scheduler: {where} ({error})") from None
                 try:
                     for job in [*lost, *islice(waiting, max(ahead - len(lost), 0))]:
-                        underway[client.submit(work, job, pure=False)] = job  # never a cached result
+                        underway[client.submit(work, job, pure=False)] = (
+                            job  # never a cached result
+                        )
                     finished = as_completed(list(underway))
                     for future in finished:
                         result = future.result()
@@ -110,8 +136,13 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     lost = list(underway.values())
                     patience = RECONNECT
                 except KilledWorker as error:
-                    failure = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
-                    raise ParameterError(f"--engine dask: found {failure}, expected a smaller --set chunk") from None
+                    failure = (
+                        f"a chunk that ended {error.allowed_failures + 1} workers, as one "
+                        "that needs too much memory does"
+                    )
+                    raise ParameterError(
+                        f"--engine dask: found {failure}, expected a smaller --set chunk"
+                    ) from None
                 else:
                     return
 
@@ -129,6 +160,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
         try:
             yield cluster
         finally:
-            # a worker that is just starting again cannot be joined yet; its outcome is no outcome of the campaign
+            # a worker that is just starting again cannot be joined yet; its outcome is no outcome
+            # of the campaign
             with suppress(TimeoutError, AssertionError):
                 cluster.close()

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign, drawn as the entries of A and B.
+"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign, drawn
+as the entries of A and B.
 
-An entry is lag[INPUT], a time constant in s, noise[OUTPUT], a standard deviation in SI, or delay, s; lag and noise alone mean
-all. The entry delay is the largest delay of u beyond that of the scenario, drawn in whole periods of the controller.
+An entry is lag[INPUT], a time constant in s, noise[OUTPUT], a standard deviation in SI, or delay,
+s; lag and noise alone mean all. The entry delay is the largest delay of u beyond that of the
+scenario, drawn in whole periods of the controller.
 """
 
 import math
@@ -36,15 +38,23 @@ def published(scenario: Scenario) -> dict[str, float]:
     """The lags above 0 and the noise above 0 of a scenario by name, SI."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
-    named = (("lag", channels.inputs, aircraft.actuators.lag), ("noise", channels.outputs, aircraft.sensors.noise))
+    named = (
+        ("lag", channels.inputs, aircraft.actuators.lag),
+        ("noise", channels.outputs, aircraft.sensors.noise),
+    )
     above: dict[str, float] = {}
     for kind, names, values in named:
-        above |= {f"{kind}[{name}]": value for name, value in zip(names, values, strict=False) if value > 0.0}
+        above |= {
+            f"{kind}[{name}]": value
+            for name, value in zip(names, values, strict=False)
+            if value > 0.0
+        }
     return above
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """The entries, with each channel in place of lag and noise, whose own entry counts, and the delay in whole periods.
+    """The entries, with each channel in place of lag and noise, whose own entry counts, and the
+    delay in whole periods.
 
     Raises ParameterError for an unknown entry.
     """
@@ -61,17 +71,24 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
             every[name] = part
             continue
         chosen = [entry for entry in known if name in (entry, entry.partition("[")[0])]
-        expected = f"a lag or a noise above 0: {', '.join(known) or 'none'}; delay, or an entry of A or B, as A[q,q]"
+        expected = (
+            f"a lag or a noise above 0: {', '.join(known) or 'none'}; delay, or an entry "
+            "of A or B, as A[q,q]"
+        )
         require(bool(chosen), "uncertainty", f"entry {name}", expected)
         every |= {entry: entries.get(entry, part) for entry in chosen}
     return every
 
 
-def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int) -> dict[str, FloatArray]:
-    """Drawn lags, noise and delays of the aircraft first, first + 1, ... of a seed by entry, (count,) each.
+def drawn(
+    scenario: Scenario, spread: Spread, seed: int, first: int, count: int
+) -> dict[str, FloatArray]:
+    """Drawn lags, noise and delays of the aircraft first, first + 1, ... of a seed by entry,
+    (count,) each.
 
-    A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
-    value depends on seed and number alone. The entries of `spread` are those of `expanded`.
+    A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the
+    largest one, in whole periods. A value depends on seed and number alone. The entries of `spread`
+    are those of `expanded`.
     """
     known = published(scenario)
     rate = scenario.controller.rate
@@ -89,13 +106,21 @@ def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int)
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Values of which a deviation is a part: `published`, and half of the largest delay, which is drawn within +-100 %."""
+    """Values of which a deviation is a part: `published`, and half of the largest delay, which is
+    drawn within +-100 %.
+    """
     return published(scenario) | ({DELAY: entries[DELAY] / 2.0} if DELAY in entries else {})
 
 
-def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]) -> list[Any]:
-    """The values of a kind in the order of the channels, `otherwise` where a channel has no value."""
-    return [values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)]
+def in_order(
+    values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
+) -> list[Any]:
+    """The values of a kind in the order of the channels, `otherwise` where a channel has no
+    value.
+    """
+    return [
+        values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)
+    ]
 
 
 def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
@@ -105,7 +130,11 @@ def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
     changes = {}
     delay = aircraft.actuators.delay + values.get(DELAY, 0.0)
     if any(name.startswith("lag[") or name == DELAY for name in values):
-        lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag) if aircraft.actuators.lag else []
+        lag = (
+            in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
+            if aircraft.actuators.lag
+            else []
+        )
         changes["actuators"] = aircraft.actuators.model_dump() | {"lag": lag, "delay": delay}
     if any(name.startswith("noise[") for name in values):
         noise = in_order(values, "noise", tuple(channels.outputs), aircraft.sensors.noise)

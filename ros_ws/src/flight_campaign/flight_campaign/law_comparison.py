@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of tuned laws on the same aircraft, winds, noise and limits: nominal, uncertain, and with delayed inputs."""
+"""Comparison of tuned laws on the same aircraft, winds, noise and limits: nominal, uncertain, and
+with delayed inputs.
+"""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +30,8 @@ class Scores(NamedTuple):
 
     mean: float  # infinite if one diverged
     worst: float
-    lost: float  # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
+    # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
+    lost: float
 
 
 class Level(NamedTuple):
@@ -46,10 +49,14 @@ class LawResult(NamedTuple):
     costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
-    lost_late: dict[float, float]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    lost_late: dict[
+        float, float
+    ]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
     rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
     slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
-    margins: Margins | None  # of the nominal aircraft; None for a law without a linear loop from y to u
+    margins: (
+        Margins | None
+    )  # of the nominal aircraft; None for a law without a linear loop from y to u
 
 
 def compare(
@@ -63,8 +70,9 @@ def compare(
 ) -> Iterator[LawResult]:
     """Simulate the laws with their gain sets on the same flights; a thread flies a law.
 
-    The flights, by wind: the nominal aircraft and `aircraft` uncertain aircraft of `seed` per level. In gusts also the aircraft
-    of the first level with u late by `delays`, ticks. Raises ParameterError for an uncertainty outside [0, 1).
+    The flights, by wind: the nominal aircraft and `aircraft` uncertain aircraft of `seed` per
+    level. In gusts also the aircraft of the first level with u late by `delays`, ticks. Raises
+    ParameterError for an uncertainty outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
@@ -88,14 +96,24 @@ def compare(
         for objective, gains in tuned[name].items():
             params = law.params(as_gains(gains), benchmark.model)
             flown = {
-                wind: batch.fly(disturbed, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
+                wind: batch.fly(
+                    disturbed,
+                    benchmark.vehicle,
+                    benchmark.courses[wind][law.feedforward],
+                    control_law,
+                    params,
+                )
                 for wind, disturbed in flights.items()
             }
-            scores = {wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()}
+            scores = {
+                wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()
+            }
             delayed = scores[GUST][len(in_time) :].reshape(len(delays), aircraft)
             by_level = []
             for level, part in zip(levels, parts, strict=True):
-                by_level.append(Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()}))
+                by_level.append(
+                    Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()})
+                )
             law_results.append(
                 LawResult(
                     name,
@@ -103,7 +121,10 @@ def compare(
                     gains.costs,
                     {wind: float(costs[0]) for wind, costs in scores.items()},
                     tuple(by_level),
-                    {ticks * benchmark.model.period: _lost(costs) for ticks, costs in zip(delays, delayed, strict=True)},
+                    {
+                        ticks * benchmark.model.period: _lost(costs)
+                        for ticks, costs in zip(delays, delayed, strict=True)
+                    },
                     np.asarray(flown[GUST].rms)[:, 0],
                     np.asarray(flown[GUST].slew)[:, 0],
                     _margins(law, gains, benchmark),
@@ -122,18 +143,25 @@ def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
 
 
 def score_cells(result: LawResult) -> list[str]:
-    """The scores of a law as cells of a table: by wind the score of the nominal aircraft, then mean (worst) by level."""
+    """The scores of a law as cells of a table: by wind the score of the nominal aircraft, then mean
+    (worst) by level.
+    """
     cells = []
     for wind, nominal in result.scores.items():
         uncertain = (level.scores[wind] for level in result.levels)
-        cells += [f"{nominal:.2f}", *(f"{scores.mean:.2f} ({scores.worst:.2f})" for scores in uncertain)]
+        cells += [
+            f"{nominal:.2f}",
+            *(f"{scores.mean:.2f} ({scores.worst:.2f})" for scores in uncertain),
+        ]
     return cells
 
 
 def _margins(law: Law, gains: TuningResult, benchmark: Benchmark) -> Margins | None:
     if not has_margins(law):
         return None
-    return Margins(*(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model)))
+    return Margins(
+        *(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model))
+    )
 
 
 def _scores(scores: FloatArray) -> Scores:

@@ -12,12 +12,15 @@ MEASURES_Y = "y"  # of a law whose linear loop is closed by y alone
 
 
 def has_margins(law: Law) -> bool:
-    """Whether a law has a linear loop from y to u: not with further measurements, the implicit sign or a root of the error."""
+    """Whether a law has a linear loop from y to u: not with further measurements, the implicit sign
+    or a root of the error.
+    """
     return law.linear and law.measurements == MEASURES_Y
 
 
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
-    """Margins for N sets of gains, (m, N) or (1, N), shapes (N, m) and (N,), without those of all inputs at once.
+    """Margins for N sets of gains, (m, N) or (1, N), shapes (N, m) and (N,), without those of all
+    inputs at once.
 
     u has no delay, as in a benchmark.
     """

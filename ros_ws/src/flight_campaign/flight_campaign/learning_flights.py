@@ -19,7 +19,8 @@ from flight_core.tape import Tape
 from rise_di_controller.proposals import Event, EventKind
 
 MakeLearner = Callable[[Scenario], Learn | None]
-"""Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises ParameterError."""
+"""Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises
+ParameterError."""
 
 
 class LearningOutcome(NamedTuple):
@@ -70,5 +71,15 @@ def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError for a scenario with a learner that a campaign cannot fly."""
     aircraft = scenario.aircraft
     route = scenario.guidance
-    require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: a campaign draws their entries")
-    require(route is None, "guidance", "a section beside controller.learn", "none: the aircraft of a mission do not learn")
+    require(
+        not aircraft.is_jsbsim,
+        "airframe",
+        aircraft.airframe,
+        "an airframe with matrices: a campaign draws their entries",
+    )
+    require(
+        route is None,
+        "guidance",
+        "a section beside controller.learn",
+        "none: the aircraft of a mission do not learn",
+    )

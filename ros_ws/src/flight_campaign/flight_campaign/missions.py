@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Missions of a fleet: the aircraft of a guided scenario fly the route, with a reference model, pose and guidance per aircraft.
+"""Missions of a fleet: the aircraft of a guided scenario fly the route, with a reference model,
+pose and guidance per aircraft.
 
-The last axis of every array is the aircraft. The equations come from the nodes: `flight_guidance.modes.follow` and
-`command`, `aircraft_sim.pose`, `reference_model.model`.
+The last axis of every array is the aircraft. The equations come from the nodes:
+`flight_guidance.modes.follow` and `command`, `aircraft_sim.pose`, `reference_model.model`.
 """
 
 from dataclasses import dataclass
@@ -58,9 +59,9 @@ class Legs(NamedTuple):
     start: Array  # where a line or an arc begins
     start_course: Array  # rad
     start_curvature: Array  # 1/m
-    turn: (
-        Array  # the circle onto the leg that the leg itself is: the radius of an arc over the radius of the route; 0 of a line
-    )
+    # the circle onto the leg that the leg itself is: the radius of an arc over the radius of the
+    # route; 0 of a line
+    turn: Array
     near: Array  # m, from the end, within which the leg counts as flown
     from_altitude: Array  # m, of the waypoint that the leg leaves
     slope: Array  # of the altitude along a line, 1
@@ -74,7 +75,9 @@ class Legs(NamedTuple):
 )
 @dataclass(frozen=True)
 class Mission:
-    """Common parameters of a fleet. m outputs, in the reference model's order; n states of the reference model."""
+    """Common parameters of a fleet. m outputs, in the reference model's order; n states of the
+    reference model.
+    """
 
     action: Array  # (T,) of guidance at the ticks: HOLD, ENGAGE or STEP
     legs: Legs
@@ -124,29 +127,62 @@ class MissionState(NamedTuple):
 
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
-    """The section `guidance` of a scenario. Raises ParameterError for a guidance beyond a campaign of missions."""
+    """The section `guidance` of a scenario. Raises ParameterError for a guidance beyond a campaign
+    of missions.
+    """
     guidance = scenario.guidance
     aircraft = scenario.aircraft
     reference = scenario.reference_model
     if guidance is None or guidance.route is None:
         expected = "a route, whose cross-track error is the score of a campaign of missions"
         raise ParameterError(f"guidance.route: found none, expected {expected}")
-    require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices, which a campaign varies")
+    require(
+        not aircraft.is_jsbsim,
+        "airframe",
+        aircraft.airframe,
+        "an airframe with matrices, which a campaign varies",
+    )
     without_feedforward = scenario.controller.guard().nominal is None
-    require(without_feedforward, "controller.feedforward", "a model", "none where guidance commands the reference")
-    require(aircraft.start == StartConfig(), "aircraft.start", "another place", "the origin in a campaign of missions")
-    require(not guidance.program, "guidance.program", ", ".join(guidance.program), "a route alone in a campaign of missions")
-    require(not reference.live.bounds, "reference_model.live.bounds", "bounds", "none in a campaign of missions")
+    require(
+        without_feedforward,
+        "controller.feedforward",
+        "a model",
+        "none where guidance commands the reference",
+    )
+    require(
+        aircraft.start == StartConfig(),
+        "aircraft.start",
+        "another place",
+        "the origin in a campaign of missions",
+    )
+    require(
+        not guidance.program,
+        "guidance.program",
+        ", ".join(guidance.program),
+        "a route alone in a campaign of missions",
+    )
+    require(
+        not reference.live.bounds,
+        "reference_model.live.bounds",
+        "bounds",
+        "none in a campaign of missions",
+    )
     profile = reference.profile()
     commanded = bool(profile.change.any() or profile.amplitude.any())
-    require(not commanded, "reference_model", "a profile of commands", "none beside guidance in a campaign of missions")
+    require(
+        not commanded,
+        "reference_model",
+        "a profile of commands",
+        "none beside guidance in a campaign of missions",
+    )
     return guidance
 
 
 def build(scenario: Scenario, course: Course) -> Mission:
     """The mission of a guided scenario over a course.
 
-    Raises ParameterError as `require_mission`, and for a rate of guidance that does not meet the ticks.
+    Raises ParameterError as `require_mission`, and for a rate of guidance that does not meet the
+    ticks.
     """
     guidance = require_mission(scenario)
     aircraft = scenario.aircraft
@@ -175,7 +211,12 @@ def build(scenario: Scenario, course: Course) -> Mission:
     order = [reference.outputs.index(name) for name in names]
     route = guidance.plan(guidance.waypoints())
     loiters = any(path.is_orbit(leg) for leg in route.legs[:-1])
-    require(not loiters, "guidance.route", "circles round a waypoint", "lines and fillets alone in a campaign of missions")
+    require(
+        not loiters,
+        "guidance.route",
+        "circles round a waypoint",
+        "lines and fillets alone in a campaign of missions",
+    )
     airframe = aircraft.load()[0]
     states = list(airframe.states)
     places = tuple(states.index(name) if name in states else None for name in POSE_STATES)
@@ -207,7 +248,9 @@ def legs_of(route: Route) -> Legs:
     return Legs(
         lines,
         points([leg.start if isinstance(leg, Line) else leg.centre for leg in legs]),
-        np.array([path.course_of(leg.start, leg.end) if isinstance(leg, Line) else 0.0 for leg in legs]),
+        np.array(
+            [path.course_of(leg.start, leg.end) if isinstance(leg, Line) else 0.0 for leg in legs]
+        ),
         np.array([1.0 if isinstance(leg, Line) else leg.radius for leg in legs]),
         points([leg.end or (0.0, 0.0) for leg in legs]),
         np.array([path.end_course(leg) if leg.end is not None else 0.0 for leg in legs]),
@@ -257,7 +300,9 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
 
 
 def reference(state: MissionState, mission: Mission) -> tuple[MissionState, Array, Array, Array]:
-    """The state with y_m of a tick; y_m at the tick, y_m at the stamp of y, and the slope; shapes (m, N)."""
+    """The state with y_m of a tick; y_m at the tick, y_m at the stamp of y, and the slope; shapes
+    (m, N).
+    """
     y_m = mission.C @ state.x_m
     arriving = jnp.concatenate([y_m[None], state.y_m_before])
     sampled = arriving[-1]
@@ -265,20 +310,28 @@ def reference(state: MissionState, mission: Mission) -> tuple[MissionState, Arra
     return state._replace(y_m_before=arriving[:-1], y_m=sampled), y_m, sampled, slope
 
 
-def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Array, mission: Mission) -> MissionState:
-    """The state after guidance at a tick, from x (n, N), and an arriving y in the law's order, (m, N)."""
+def guide(
+    state: MissionState, x: Array, y: Array, segment: Segments, action: Array, mission: Mission
+) -> MissionState:
+    """The state after guidance at a tick, from x (n, N), and an arriving y in the law's order, (m,
+    N).
+    """
     y = jnp.where(segment.phase == HOLD, state.y, y)
     state = state._replace(y=y)
     pose = _pose(state, x, segment.t, mission)
     y_of = dict(zip(mission.outputs, y, strict=True))
     speed = modes.true_airspeed(y_of["V"], mission.guidance)
     course = jnp.atan2(pose["v_east"], pose["v_north"])
-    now = _GuidanceStep(state, mission, mission.guidance, pose, y_of, speed, (pose["north"], pose["east"]), course)
+    now = _GuidanceStep(
+        state, mission, mission.guidance, pose, y_of, speed, (pose["north"], pose["east"]), course
+    )
     return jax.lax.switch(action, (lambda: state, now.begin, now.step))
 
 
 class _GuidanceStep(NamedTuple):
-    """A step of guidance of N missions: the state before, the pose, y, the airspeed, and position and course over ground."""
+    """A step of guidance of N missions: the state before, the pose, y, the airspeed, and position
+    and course over ground.
+    """
 
     state: MissionState
     mission: Mission
@@ -301,27 +354,41 @@ class _GuidanceStep(NamedTuple):
     def _joins(self, leg: Legs) -> Array:
         """Side of the circle onto a leg, 0 near the leg."""
         start = (leg.start[0], leg.start[1])
-        side = path.joining(start, leg.start_course, self.mission.radius, leg.near, self.position, self.course)
+        side = path.joining(
+            start, leg.start_course, self.mission.radius, leg.near, self.position, self.course
+        )
         return jnp.where(leg.has_end, jnp.where(leg.is_line, side, jnp.abs(side) * leg.turn), 0.0)
 
     def _onto(self, leg: Legs, place: path.Point) -> Array:
-        return path.joined((leg.start[0], leg.start[1]), leg.start_course, leg.near, place, self.course)
+        return path.joined(
+            (leg.start[0], leg.start[1]), leg.start_course, leg.near, place, self.course
+        )
 
-    def _fly(self, before: GuidanceState, number: Array, joining: Array, missed: Array) -> MissionState:
+    def _fly(
+        self, before: GuidanceState, number: Array, joining: Array, missed: Array
+    ) -> MissionState:
         leg, following, joins_leg = self._legs_at(number), self._legs_at(number + 1), joining != 0.0
         origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
-        line, circle = path.line_error(origin, leg.track, self.position), path.circle_error(origin, leg.radius, self.position)
+        line, circle = (
+            path.line_error(origin, leg.track, self.position),
+            path.circle_error(origin, leg.radius, self.position),
+        )
         radius = jnp.where(joins_leg, joining, 1.0) * self.mission.radius
-        way = path.circle_error(path.joining_centre(start, leg.start_course, radius), radius, self.position)
+        way = path.circle_error(
+            path.joining_centre(start, leg.start_course, radius), radius, self.position
+        )
         on_leg = [jnp.where(leg.is_line, *pair) for pair in zip(line, circle, strict=True)]
         error = PathError(*(jnp.where(joins_leg, *pair) for pair in zip(way, on_leg, strict=True)))
 
         def begins(place: path.Point) -> Array:
-            return jnp.where(joins_leg, self._onto(leg, place), self._entered(leg, following, place))
+            return jnp.where(
+                joins_leg, self._onto(leg, place), self._entered(leg, following, place)
+            )
 
         entry = jnp.where(joins_leg, leg.start_curvature, leg.entry)
         altitude, climb = (
-            jnp.where(joins_leg, *pair) for pair in zip((leg.from_altitude, 0.0), _profile(leg, self.pose), strict=True)
+            jnp.where(joins_leg, *pair)
+            for pair in zip((leg.from_altitude, 0.0), _profile(leg, self.pose), strict=True)
         )
         escape, home_altitude, homing, error = self._within_fence(before, error)
         if self.params.fence is not None:
@@ -331,8 +398,12 @@ class _GuidanceStep(NamedTuple):
         wanted = modes.follow(error, entry, begins, before.slip, self.pose, self.speed, self.params)
         wanted = modes.escaping_bank(escape, wanted, self.pose, self.speed, self.params)
         target = Target(altitude=altitude, climb=climb, V=jnp.where(joins_leg, leg.from_V, leg.V))
-        flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target)
-        after, _ = modes.command(flies, self.pose, self.y_of, wanted, seconds(self.params.period_ns), self.params)
+        flies = before._replace(
+            mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target
+        )
+        after, _ = modes.command(
+            flies, self.pose, self.y_of, wanted, seconds(self.params.period_ns), self.params
+        )
         off, counts = self.pose["altitude"] - altitude, leg.has_end & ~joins_leg & ~homing
         return self.state._replace(
             u_m=jnp.stack(after.u_m),
@@ -353,7 +424,10 @@ class _GuidanceStep(NamedTuple):
             fence=escape.action,
             home_altitude=home_altitude,
             clearance=jnp.minimum(self.state.clearance, escape.clearance),
-            from_home=jnp.hypot(self.pose["north"] - self.params.home.north, self.pose["east"] - self.params.home.east),
+            from_home=jnp.hypot(
+                self.pose["north"] - self.params.home.north,
+                self.pose["east"] - self.params.home.east,
+            ),
         )
 
     def begin(self) -> MissionState:
@@ -376,13 +450,21 @@ class _GuidanceStep(NamedTuple):
         )
         leg, joins_leg = self._legs_at(self.state.leg), self.state.joining != 0.0
         ends = self._passed(leg, self.position) & ~joins_leg & (self.state.fence == 0.0)
-        missed = ends & (jnp.hypot(self.position[0] - leg.end[0], self.position[1] - leg.end[1]) > leg.near)
+        missed = ends & (
+            jnp.hypot(self.position[0] - leg.end[0], self.position[1] - leg.end[1]) > leg.near
+        )
         number = jnp.where(ends, self.state.leg + 1, self.state.leg)
         still = jnp.where(joins_leg & ~self._onto(leg, self.position), self.state.joining, 0.0)
-        return self._fly(before, number, jnp.where(ends, self._joins(self._legs_at(number)), still), missed)
+        return self._fly(
+            before, number, jnp.where(ends, self._joins(self._legs_at(number)), still), missed
+        )
 
-    def _within_fence(self, before: GuidanceState, error: PathError) -> tuple[Escape, Array, Array, PathError]:
-        """The action of the fence, the altitude of the flight home, whether the aircraft flies home, and the path error."""
+    def _within_fence(
+        self, before: GuidanceState, error: PathError
+    ) -> tuple[Escape, Array, Array, PathError]:
+        """The action of the fence, the altitude of the flight home, whether the aircraft flies
+        home, and the path error.
+        """
         escape, home_altitude, homing = (
             Escape(self.state.fence, False, self.state.clearance, 0.0, 0.0),
             self.state.home_altitude,
@@ -397,8 +479,12 @@ class _GuidanceStep(NamedTuple):
             homing = escape.action != 0.0
             home = targets.home(self.pose, self.params)
             home_altitude = jnp.where(escape.begins, home["altitude"], self.state.home_altitude)
-            orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), self.position)
-            error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))
+            orbit = path.circle_error(
+                (home["north"], home["east"]), jnp.asarray(home["radius"]), self.position
+            )
+            error = PathError(
+                *(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True))
+            )
         return escape, home_altitude, homing, error
 
 
@@ -446,12 +532,13 @@ def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str
 
 
 def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
-    """Score, cross-track error and altitude error on the route, largest bank, with a fence the last distance from home.
+    """Score, cross-track error and altitude error on the route, largest bank, with a fence the last
+    distance from home.
 
     Shapes (N,), SI.
 
-    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the last waypoint, which
-    begins at the centre, is left out.
+    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the
+    last waypoint, which begins at the centre, is left out.
     """
     samples = jnp.maximum(state.samples, 1.0)
     fenced = {"max.breach": jnp.maximum(-state.clearance, 0.0), "home": state.from_home}

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registered laws beside the laws of the catalogue: the controller of a scenario and the gains in the scenario."""
+"""Registered laws beside the laws of the catalogue: the controller of a scenario and the gains in
+the scenario.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -25,13 +27,21 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
     """The positive numbers of the law itself by name, without matrices."""
-    names = (name for name in type(controller).model_fields if name not in ControllerConfig.model_fields)
+    names = (
+        name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
+    )
     values = {name: np.atleast_1d(getattr(controller, name)) for name in names}
-    return {name: value.tolist() for name, value in values.items() if value.dtype == np.float64 and (value > 0.0).all()}
+    return {
+        name: value.tolist()
+        for name, value in values.items()
+        if value.dtype == np.float64 and (value > 0.0).all()
+    }
 
 
 def registered_law(controller: ControllerConfig, name: str) -> Law:
-    """The law of a controller, with the gains as the start of a search; the rest of the controller stays."""
+    """The law of a controller, with the gains as the start of a search; the rest of the controller
+    stays.
+    """
     start = own_gains(controller)
     scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}
 
@@ -41,7 +51,11 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         each = []
         for k in range(count):
             values = {key: _value(gain[:, k], key in scalars) for key, gain in wide.items()}
-            tuned = type(controller).validate_mapping(controller.model_dump() | values, name).tuned_law()
+            tuned = (
+                type(controller)
+                .validate_mapping(controller.model_dump() | values, name)
+                .tuned_law()
+            )
             each.append(tuned.params)
         return jax.tree.map(_last, *each)
 
@@ -63,19 +77,23 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 
 
 def _last(*leaves: Any) -> FloatArray:
-    """A parameter of N candidates, with the candidates in the last axis; (m, 1) for equal values."""
+    """A parameter of N candidates, with the candidates in the last axis; (m, 1) for equal
+    values.
+    """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):
         return first if first.ndim != 1 else first[:, None]
     return np.stack([np.asarray(leaf, dtype=np.float64) for leaf in leaves], axis=-1)
 
 
-def find_laws(names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]) -> dict[str, ControllerConfig | None]:
+def find_laws(
+    names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]
+) -> dict[str, ControllerConfig | None]:
     """For each name the controller that flies, None for a law of the catalogue.
 
-    Beside the catalogue a name may be the law of the scenario's own controller, or a key of `others`: scenarios given in place
-    of a law. Raises ParameterError for an unknown name, for an allocation, and for a controller with a different rate or order
-    of the channels.
+    Beside the catalogue a name may be the law of the scenario's own controller, or a key of
+    `others`: scenarios given in place of a law. Raises ParameterError for an unknown name, for an
+    allocation, and for a controller with a different rate or order of the channels.
     """
     effectors = "none: the laws that are compared command the effectors"
     require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
@@ -89,8 +107,14 @@ def find_laws(names: Iterable[str], scenario: Scenario, others: Mapping[str, Sce
         elif name == scenario.controller.law:
             controller = scenario.controller
         else:
-            flown = "the path of a scenario file whose controller flies it" if name in laws.names() else "a scenario file"
-            raise ParameterError(f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flown}")
+            flown = (
+                "the path of a scenario file whose controller flies it"
+                if name in laws.names()
+                else "a scenario file"
+            )
+            raise ParameterError(
+                f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flown}"
+            )
         for key in ("outputs", "inputs", "rate"):
             expected = getattr(scenario.controller, key)
             require(
@@ -99,18 +123,23 @@ def find_laws(names: Iterable[str], scenario: Scenario, others: Mapping[str, Sce
                 getattr(controller, key),
                 f"{expected}, as in {scenario.name}",
             )
-        controllers[name] = controller.model_copy(update={"delay": 0.0})  # in a benchmark topics have no delay
+        controllers[name] = controller.model_copy(
+            update={"delay": 0.0}
+        )  # in a benchmark topics have no delay
     return controllers
 
 
 def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
     """The laws by name: of the catalogue, or of a controller."""
     return {
-        name: LAWS[name] if controller is None else registered_law(controller, name) for name, controller in controllers.items()
+        name: LAWS[name] if controller is None else registered_law(controller, name)
+        for name, controller in controllers.items()
     }
 
 
-def with_courses(benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]) -> Benchmark:
+def with_courses(
+    benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]
+) -> Benchmark:
     """The benchmark with the courses of the feedforwards of these controllers."""
     courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
     for name, controller in controllers.items():

@@ -13,7 +13,8 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
     import polars as pl
 
 KEYS = ("seed", "number", "factor", "diverged", "lost")
-"""Columns of every table; "factor" is that of the sweep, 1 without one. Figures follow, then the drawn entries."""
+"""Columns of every table; "factor" is that of the sweep, 1 without one. Figures follow, then the
+drawn entries."""
 
 
 class Chunk(NamedTuple):
@@ -22,11 +23,15 @@ class Chunk(NamedTuple):
     first: int  # number of the first
     diverged: FloatArray  # (N,)
     figures: dict[str, FloatArray]  # (N,) each, by name
-    entries: dict[str, FloatArray]  # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
+    entries: dict[
+        str, FloatArray
+    ]  # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
 
 
 def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
-    """The table of a chunk as Parquet (zstd), SI; figures of a diverged aircraft, and NaN, are null."""
+    """The table of a chunk as Parquet (zstd), SI; figures of a diverged aircraft, and NaN, are
+    null.
+    """
     import polars as pl  # noqa: PLC0415
 
     count = len(chunk.diverged)
@@ -43,14 +48,18 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
             **chunk.entries,
         }
     )
-    table = table.with_columns(pl.when(~diverged).then(pl.col(name).fill_nan(None)).alias(name) for name in chunk.figures)
+    table = table.with_columns(
+        pl.when(~diverged).then(pl.col(name).fill_nan(None)).alias(name) for name in chunk.figures
+    )
     table.write_parquet(stream)
     return stream.getvalue()
 
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
     """The columns with drawn entries: of A and B, lags, noise and the delay of u."""
-    return [name for name in table.columns if name.startswith(("A[", "B[")) or is_of_equipment(name)]
+    return [
+        name for name in table.columns if name.startswith(("A[", "B[")) or is_of_equipment(name)
+    ]
 
 
 def tally_of(table: "pl.DataFrame") -> Tally:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo statistics of constant size: moments, histograms and the worst flights, summed chunk by chunk."""
+"""Monte Carlo statistics of constant size: moments, histograms and the worst flights, summed chunk
+by chunk.
+"""
 
 import math
 from collections import Counter
@@ -17,12 +19,14 @@ from flight_core.vectors import FloatArray
 
 PER_DECADE = 100
 DECADES = (-8, 6)
-"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a flight."""
+"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a
+flight."""
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
 SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
-"""Unit of an rms error in the score, by dimension of the channel. p counts half, since its commands are larger."""
+"""Unit of an rms error in the score, by dimension of the channel. p counts half, since its commands
+are larger."""
 
 SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel; it replaces that of its unit
 
@@ -41,7 +45,9 @@ class Figure(Config):
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # none yet
-    bins: dict[int, int] = Field(default={})  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
+    bins: dict[int, int] = Field(
+        default={}
+    )  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
 
     @classmethod
     def from_values(cls, values: FloatArray) -> Self:
@@ -49,7 +55,9 @@ class Figure(Config):
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
-        places, counts = np.unique(np.searchsorted(EDGES, values, side="right") - 1, return_counts=True)
+        places, counts = np.unique(
+            np.searchsorted(EDGES, values, side="right") - 1, return_counts=True
+        )
         mean = float(np.mean(values))
         bins = dict(zip(places.tolist(), counts.tolist(), strict=True))
         squares = float(np.sum((values - mean) ** 2))
@@ -57,7 +65,9 @@ class Figure(Config):
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, added: Self) -> Self:
-        """The figures together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
+        """The figures together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise
+        algorithm, 1979.
+        """
         count = self.count + added.count
         if not count:
             return self
@@ -103,12 +113,18 @@ class Tally(Config):
     flights: int = 0
     diverged: int = 0
     lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
-    figures: dict[str, Figure] = Field(default={})  # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    figures: dict[str, Figure] = Field(
+        default={}
+    )  # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
     worst: tuple[Worst, ...] = ()  # the worst first
 
     @classmethod
-    def from_flights(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
-        """The tally of the aircraft first, first + 1, ...; every figure of shape (N,), the "score" included."""
+    def from_flights(
+        cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]
+    ) -> Self:
+        """The tally of the aircraft first, first + 1, ...; every figure of shape (N,), the "score"
+        included.
+        """
         bounded = ~np.asarray(diverged, dtype=bool)
         score = np.asarray(figures["score"])
         rank = np.where(bounded, score, np.inf)
@@ -117,24 +133,40 @@ class Tally(Config):
             flights=len(bounded),
             diverged=int((~bounded).sum()),
             lost=int(lost_track(diverged, score).sum()),
-            figures={name: Figure.from_values(np.asarray(values)[bounded]) for name, values in figures.items()},
-            worst=tuple(Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None) for k in order),
+            figures={
+                name: Figure.from_values(np.asarray(values)[bounded])
+                for name, values in figures.items()
+            },
+            worst=tuple(
+                Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None)
+                for k in order
+            ),
         )
 
     def __add__(self, added: Self) -> Self:
         names = list(self.figures) or list(added.figures)
-        worst = sorted((*self.worst, *added.worst), key=lambda flight: -math.inf if flight.score is None else -flight.score)
+        worst = sorted(
+            (*self.worst, *added.worst),
+            key=lambda flight: -math.inf if flight.score is None else -flight.score,
+        )
         return type(self)(
             flights=self.flights + added.flights,
             diverged=self.diverged + added.diverged,
             lost=self.lost + added.lost,
-            figures={name: self.figures.get(name, Figure()) + added.figures.get(name, Figure()) for name in names},
+            figures={
+                name: self.figures.get(name, Figure()) + added.figures.get(name, Figure())
+                for name in names
+            },
             worst=tuple(worst[:WORST_KEPT]),
         )
 
     def without_model(self) -> int | None:
         """Number of flights without a model, diverged ones excluded; None without learners."""
-        return self.flights - self.diverged - self.figures[FIRST_MODEL].count if FIRST_MODEL in self.figures else None
+        return (
+            self.flights - self.diverged - self.figures[FIRST_MODEL].count
+            if FIRST_MODEL in self.figures
+            else None
+        )
 
     def summary(self) -> dict[str, Any]:
         """The statistics as figures of a file, SI."""
@@ -146,11 +178,22 @@ class Tally(Config):
         named = {}
         for name, figure in self.figures.items():
             quantiles = {f"q{100 * part:g}": figure.quantile(part) for part in QUANTILES}
-            named[name] = {"mean": figure.mean, "deviation": figure.deviation, "worst": figure.largest} | quantiles
-        return {"flights": self.flights, **shares, "figures": named, "worst": [flight.model_dump() for flight in self.worst]}
+            named[name] = {
+                "mean": figure.mean,
+                "deviation": figure.deviation,
+                "worst": figure.largest,
+            } | quantiles
+        return {
+            "flights": self.flights,
+            **shares,
+            "figures": named,
+            "worst": [flight.model_dump() for flight in self.worst],
+        }
 
     def share(self, count: int) -> tuple[float, float, float]:
-        """A number of flights as a share, and the 95 % confidence interval (Clopper-Pearson), 0 to 1."""
+        """A number of flights as a share, and the 95 % confidence interval (Clopper-Pearson), 0 to
+        1.
+        """
         from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
 
         interval = binomtest(count, self.flights).proportion_ci(0.95, method="exact")
@@ -158,22 +201,39 @@ class Tally(Config):
 
 
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
-    """Which flights lost track, shape (N,): those that did not diverge with a score above LOSS_OF_TRACK_SCORE."""
+    """Which flights lost track, shape (N,): those that did not diverge with a score above
+    LOSS_OF_TRACK_SCORE.
+    """
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
 
-def score_units(outputs: Sequence[str], units: Mapping[str, str], stated: Mapping[str, float] | None = None) -> FloatArray:
-    """Units of the rms errors of the channels in the score, SI, shape (m,); `stated` replaces usual units by output.
+def score_units(
+    outputs: Sequence[str], units: Mapping[str, str], stated: Mapping[str, float] | None = None
+) -> FloatArray:
+    """Units of the rms errors of the channels in the score, SI, shape (m,); `stated` replaces usual
+    units by output.
 
     Raises ParameterError for an output without a unit in the score.
     """
     known = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
         counted = name in known or quantity(units[name]).dimension in SCORE_UNIT
-        require(counted, "outputs", f"{name} in {units[name]}", "rad/s or m/s, or a unit of the score for this output")
-    return np.array([known[name] if name in known else SCORE_UNIT[quantity(units[name]).dimension] for name in outputs])
+        require(
+            counted,
+            "outputs",
+            f"{name} in {units[name]}",
+            "rad/s or m/s, or a unit of the score for this output",
+        )
+    return np.array(
+        [
+            known[name] if name in known else SCORE_UNIT[quantity(units[name]).dimension]
+            for name in outputs
+        ]
+    )
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): 1 a channel is 10 mrad/s or 0.1 m/s, 20 in p."""
+    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): 1 a channel is 10
+    mrad/s or 0.1 m/s, 20 in p.
+    """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tuned gains of a comparison as the controller of a scenario, under the registered law of the same equations."""
+"""Tuned gains of a comparison as the controller of a scenario, under the registered law of the same
+equations.
+"""
 
 from typing import Any
 
@@ -33,7 +35,8 @@ REGISTERED = {
     "l1_ff": "l1",
     "lqg": "lqg",
 }
-"""The registered law of a law of the catalogue: of those that measure y alone and that a scenario can fly."""
+"""The registered law of a law of the catalogue: of those that measure y alone and that a scenario
+can fly."""
 
 RISE_DI_GAINS = ("K", "Lambda", "beta", "softening", "omega")
 DESIGNS = {
@@ -50,16 +53,24 @@ def require_registered(name: str) -> None:
 
 
 def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> ControllerConfig:
-    """The controller that flies as a law of the catalogue with tuned gains, in the inputs of the benchmark: 1 / abs(Omega_ii).
+    """The controller that flies as a law of the catalogue with tuned gains, in the inputs of the
+    benchmark: 1 / abs(Omega_ii).
 
-    Topics have no delay, as in the benchmark. Raises ParameterError for a law that no scenario flies.
+    Topics have no delay, as in the benchmark. Raises ParameterError for a law that no scenario
+    flies.
     """
     require_registered(name)
     model = benchmark.model
     base = benchmark.scenario.controller
     shared = set(ControllerConfig.model_fields) - {"law", "feedforward", "observer"}
-    values = {key: value for key, value in base.model_dump(exclude_none=True).items() if key in shared}
-    values |= {"law": REGISTERED[name], "input_scale": model.input_scale.tolist(), "D": [int(sign) for sign in model.D]}
+    values = {
+        key: value for key, value in base.model_dump(exclude_none=True).items() if key in shared
+    }
+    values |= {
+        "law": REGISTERED[name],
+        "input_scale": model.input_scale.tolist(),
+        "D": [int(sign) for sign in model.D],
+    }
     feedforward = _feedforward(name, benchmark)
     if feedforward is not None:
         values["feedforward"] = feedforward.model_dump(exclude_none=True)
@@ -67,17 +78,25 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
         values["observer"] = _observer(name, tuned, benchmark).model_dump()
     gains = as_gains(tuned)
     if REGISTERED[name] == "rise_di":
-        law_gains = {key: np.broadcast_to(gains[key][:, 0], model.lag.shape) for key in RISE_DI_GAINS if key in gains}
+        law_gains = {
+            key: np.broadcast_to(gains[key][:, 0], model.lag.shape)
+            for key in RISE_DI_GAINS
+            if key in gains
+        }
         values |= _rise_di(law_gains, model.input_scale)
     elif REGISTERED[name] != "lqg":
-        values |= {key: tuned.gains[key] for key in ("K", "Lambda", "bandwidth") if key in tuned.gains}
+        values |= {
+            key: tuned.gains[key] for key in ("K", "Lambda", "bandwidth") if key in tuned.gains
+        }
     if REGISTERED[name] == "l1":
         values["Omega"] = model.Omega.ravel().tolist()
     return AnyLaw.validate_mapping(values, "controller")
 
 
 def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
-    """Parameters of RISE-DI: a K that (22) does not have is a larger one with a smaller input scale, the same loop."""
+    """Parameters of RISE-DI: a K that (22) does not have is a larger one with a smaller input
+    scale, the same loop.
+    """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
     permitted = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
@@ -100,18 +119,31 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
     controller = benchmark.scenario.controller
     if LAWS[name].feedforward == AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
-    return integrator_model(controller, benchmark.model.Omega) if LAWS[name].feedforward == INTEGRATORS else None
+    return (
+        integrator_model(controller, benchmark.model.Omega)
+        if LAWS[name].feedforward == INTEGRATORS
+        else None
+    )
 
 
 def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverConfig:
-    """The observer of a law, with its bound of u_o; the margin is that of the search, so none is required of it."""
+    """The observer of a law, with its bound of u_o; the margin is that of the search, so none is
+    required of it.
+    """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]
     integrators = LAWS[name].feedforward == INTEGRATORS
-    states, axes = (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
-    design = DESIGNS[name](as_gains(tuned), benchmark.model, Names(states, controller.inputs, controller.outputs, axes))
-    matrices = {key: np.asarray(getattr(design, key)).ravel().tolist() for key in ("Phi", "Gamma", "L", "F")}
+    states, axes = (
+        (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
+    )
+    design = DESIGNS[name](
+        as_gains(tuned), benchmark.model, Names(states, controller.inputs, controller.outputs, axes)
+    )
+    matrices = {
+        key: np.asarray(getattr(design, key)).ravel().tolist() for key in ("Phi", "Gamma", "L", "F")
+    }
     part = 1.0 if name == "lqg" else PART
     return ObserverConfig.validate_mapping(
-        matrices | {"rate": controller.rate, "states": design.states, "part": part, "margin": 0.0}, "observer"
+        matrices | {"rate": controller.rate, "states": design.states, "part": part, "margin": 0.0},
+        "observer",
     )

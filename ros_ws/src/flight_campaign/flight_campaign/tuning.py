@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal aircraft and around it."""
+"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal
+aircraft and around it.
+"""
 
 import os
 from collections.abc import Callable, Iterable
@@ -33,7 +35,8 @@ from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.linear_loop import Loop
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
-"""rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
+"""rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error.
+60 deg/s and 600 %/s."""
 
 GUST = "gust"
 TURBULENCE = "turbulence"
@@ -55,36 +58,53 @@ class Objective(NamedTuple):
 # Turbulence has half the weight, since scores in it are about twice those in the gusts.
 OBJECTIVES = {
     "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
-    "gust_turbulence": Objective("gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False),
-    "delay": Objective("gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True),
+    "gust_turbulence": Objective(
+        "gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False
+    ),
+    "delay": Objective(
+        "gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True
+    ),
     "margins": Objective(
-        "gusts and turbulence within margins of 45 deg and 6 dB", {GUST: 1.0, TURBULENCE: 0.5}, 1, False, REQUIREMENT
+        "gusts and turbulence within margins of 45 deg and 6 dB",
+        {GUST: 1.0, TURBULENCE: 0.5},
+        1,
+        False,
+        REQUIREMENT,
     ),
 }
 
 UNCERTAIN_AIRCRAFT = 12
 UNCERTAINTY = 0.4
 UNCERTAINTY_SEED = 40
-"""Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds by default."""
+"""Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds
+by default."""
 
 DELAY_TICKS = 2
-"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the loop's lag is 15 ms."""
+"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the
+loop's lag is 15 ms."""
 
 POPULATION = 16
 GENERATIONS = 88
 GENERATIONS_PER_GAIN = 6
 INITIAL_SIGMA = 0.4
-"""A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains on. INITIAL_SIGMA is the
-first standard deviation of log(gain)."""
+"""A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
+on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
-PARTS = 2  # of the candidates of a generation, flown side by side; a flight in a smaller part takes more processor time
+# of the candidates of a generation, flown side by side; a flight in a smaller part takes more
+# processor time
+PARTS = 2
 
-MAX_COST = 1000.0  # cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost
-STEP = 0.005  # s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of a finer step.
+# cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost
+MAX_COST = 1000.0
+# s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
+# a finer step.
+STEP = 0.005
 
 
 class Benchmark(NamedTuple):
-    """The setting in which laws are tuned and compared: one scenario in two winds, channels in the law's order."""
+    """The setting in which laws are tuned and compared: one scenario in two winds, channels in the
+    law's order.
+    """
 
     scenario: Scenario
     model: NominalModel
@@ -98,13 +118,18 @@ class Benchmark(NamedTuple):
 
 
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
-    """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate, topics without delay.
+    """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate,
+    topics without delay.
 
-    Its winds are those of the scenario, and turbulence of `turbulence_seed` alone, `turbulence_of`. Raises ParameterError for a
-    scenario that a campaign cannot fly, and for outputs whose unit has no score.
+    Its winds are those of the scenario, and turbulence of `turbulence_seed` alone, `turbulence_of`.
+    Raises ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has
+    no score.
     """
     scenario = scenario.vary(
-        aircraft={"rate": scenario.controller.rate, "step": min(STEP, 1.0 / scenario.controller.rate)},
+        aircraft={
+            "rate": scenario.controller.rate,
+            "step": min(STEP, 1.0 / scenario.controller.rate),
+        },
         reference_model={"rate": scenario.controller.rate},
         controller={"delay": 0.0, "feedforward": None, "observer": None},
     )
@@ -124,7 +149,13 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     unit = score_units(controller.outputs, airframe.units_of_outputs())
     noise = scenario.aircraft.sensor_arrays().noise[rows]
     loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
-    model = nominal_model(airframe, controller.outputs, controller.inputs, np.where(noise > 0.0, noise, unit / 10.0), loop)
+    model = nominal_model(
+        airframe,
+        controller.outputs,
+        controller.inputs,
+        np.where(noise > 0.0, noise, unit / 10.0),
+        loop,
+    )
     model = model._replace(
         D=np.array(controller.D, dtype=np.float64),
         lower=in_law_order(actuators.lower, -np.inf),
@@ -144,39 +175,65 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
 
 def turbulence_of(scenario: Scenario) -> dict[str, float]:
-    """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at 100 m where it has none."""
+    """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at
+    100 m where it has none.
+    """
     turbulence = scenario.aircraft.turbulence
-    return MODERATE if turbulence is None else turbulence.model_dump(exclude={"seed"}, exclude_none=True)
+    return (
+        MODERATE
+        if turbulence is None
+        else turbulence.model_dump(exclude={"seed"}, exclude_none=True)
+    )
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """The course of a scenario whose controller has the aircraft as the model of its feedforward, by the model of that."""
-    course, controller, (airframe, _) = build_course(scenario), scenario.controller, scenario.aircraft.load()
+    """The course of a scenario whose controller has the aircraft as the model of its feedforward,
+    by the model of that.
+    """
+    course, controller, (airframe, _) = (
+        build_course(scenario),
+        scenario.controller,
+        scenario.aircraft.load(),
+    )
     rows, columns = law_order(airframe, controller)
     Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
-    integrators = scenario.vary(controller={"feedforward": integrator_model(controller, Omega).model_dump()})
+    integrators = scenario.vary(
+        controller={"feedforward": integrator_model(controller, Omega).model_dump()}
+    )
     none = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
-    return {NONE: course._replace(segments=none), AIRCRAFT: course, INTEGRATORS: build_course(integrators)}
+    return {
+        NONE: course._replace(segments=none),
+        AIRCRAFT: course,
+        INTEGRATORS: build_course(integrators),
+    }
 
 
 def score(result: FleetResult, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms of the true error / unit, shape (N,); infinite if a flight diverged."""
+    """Sum over the channels of rms of the true error / unit, shape (N,); infinite if a flight
+    diverged.
+    """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
 
 
 def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
-    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,), at most MAX_COST."""
+    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,), at most
+    MAX_COST.
+    """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
     total = score(result, benchmark.unit) + activity
     return np.where(np.isfinite(total), np.minimum(total, MAX_COST), MAX_COST)
 
 
-def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark) -> Fleet:
+def benchmark_fleet(
+    A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark
+) -> Fleet:
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
-    return batch_matrices.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
+    return batch_matrices.assemble(
+        A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions
+    )
 
 
 class Evaluation(NamedTuple):
@@ -188,9 +245,11 @@ class Evaluation(NamedTuple):
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Flights of one evaluation of the cost, by wind: all aircraft with u in time, and the late ones.
+    """Flights of one evaluation of the cost, by wind: all aircraft with u in time, and the late
+    ones.
 
-        cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the late ones)
+        cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the
+        late ones)
 
     No flight is in calm air: in the flights with gusts the manoeuvre comes first, in calm air.
     """
@@ -203,21 +262,27 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     late = np.repeat([0, objective.delay * benchmark.delay], counts)
     share = np.repeat([1.0 / count for count in counts], counts)
     return [
-        Evaluation(wind, benchmark_fleet(A[numbers], B[numbers], late, wind, benchmark), weight * share)
+        Evaluation(
+            wind, benchmark_fleet(A[numbers], B[numbers], late, wind, benchmark), weight * share
+        )
         for wind, weight in objective.weights.items()
     ]
 
 
 def repeat_flights(flights: Fleet, times: int) -> Fleet:
     """The same flights several times, one set after the other."""
-    tiled = jax.tree.map(lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=()))
+    tiled = jax.tree.map(
+        lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=())
+    )
     return tiled._replace(blocks=flights.blocks)
 
 
 def spread_over(params: Any, single: Any, flights: int) -> Any:
-    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (.., candidates flights).
+    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (..,
+    candidates flights).
 
-    `single` are the parameters of one candidate. What has the same shape in both is common to all candidates, and stays.
+    `single` are the parameters of one candidate. What has the same shape in both is common to all
+    candidates, and stays.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
@@ -228,7 +293,10 @@ def spread_over(params: Any, single: Any, flights: int) -> Any:
 
 def generation_count(law: Law, benchmark: Benchmark) -> int:
     """Generations of a search."""
-    return max(GENERATIONS, GENERATIONS_PER_GAIN * sum(map(len, initial_gains(law, benchmark.model).values())))
+    return max(
+        GENERATIONS,
+        GENERATIONS_PER_GAIN * sum(map(len, initial_gains(law, benchmark.model).values())),
+    )
 
 
 def tune(
@@ -239,12 +307,14 @@ def tune(
     generations: int | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> TuningResult:
-    """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several seeds; all seeds run together.
+    """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several
+    seeds; all seeds run together.
 
-    The cost of a candidate is the weighted sum over the flights of `evaluations`. A loop with a part of the margins that the
-    objective requires costs MAX_COST times the rest. Threads fly a part of the candidates in one wind each. `progress` receives
-    the generation and the smallest cost so far.
-    Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
+    The cost of a candidate is the weighted sum over the flights of `evaluations`. A loop with a
+    part of the margins that the objective requires costs MAX_COST times the rest. Threads fly a
+    part of the candidates in one wind each. `progress` receives the generation and the smallest
+    cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package
+    `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
@@ -277,19 +347,30 @@ def tune(
         if objective.requirement is None or not has_margins(law):
             return np.zeros(together)
         margins = nominal_margins(law, gains_of(part), benchmark.model)
-        return np.asarray(MAX_COST * (1.0 - np.minimum(least_fractions(margins, objective.requirement), 1.0)))
+        return np.asarray(
+            MAX_COST * (1.0 - np.minimum(least_fractions(margins, objective.requirement), 1.0))
+        )
 
     options = {"popsize": POPULATION, "verbose": -9}
-    searches = [cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds]
+    searches = [
+        cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds
+    ]
     best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
     generations = generation_count(law, benchmark) if generations is None else generations
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for generation in range(generations):
             asked = [np.array(search.ask()) for search in searches]
             parts = np.split(np.concatenate(asked), PARTS)
-            params = [spread_over(law.params(gains_of(part), benchmark.model), single, each) for part in parts]
-            weighted = np.array(list(pool.map(costs, product(params, flights)))).reshape(PARTS, len(flights), together)
-            by_search = (weighted.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(len(seeds), POPULATION)
+            params = [
+                spread_over(law.params(gains_of(part), benchmark.model), single, each)
+                for part in parts
+            ]
+            weighted = np.array(list(pool.map(costs, product(params, flights)))).reshape(
+                PARTS, len(flights), together
+            )
+            by_search = (weighted.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(
+                len(seeds), POPULATION
+            )
             for k, (search, values) in enumerate(zip(searches, by_search, strict=True)):
                 search.tell(list(asked[k]), list(values))
                 least = int(np.argmin(values))

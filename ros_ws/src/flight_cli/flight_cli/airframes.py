@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: the assumptions of the theorem, on the airframes of the library or your own; a new airframe."""
+"""`rise-di airframes`: the assumptions of the theorem, on the airframes of the library or your own;
+a new airframe.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +15,13 @@ from flight_cli.output import new_table, parse_numbers, print_json
 from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.parameters import require
-from flight_design.gains.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
+from flight_design.gains.airframe_properties import (
+    AirframeFacts,
+    ComplexArray,
+    airframe_facts,
+    library,
+    marginal_sentence,
+)
 from rise_di.own_airframe import NewAirframe, new_airframe
 
 
@@ -22,50 +30,99 @@ def airframes(
         list[str] | None,
         typer.Argument(
             metavar="[AIRFRAME]...",
-            help="Names, or airframe files (.yaml); by default the library. With --write one: an airframe file, a MATLAB file"
+            help="Names, or airframe files (.yaml); by default the library. With --write one: "
+            "an airframe file, a MATLAB file"
             " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
         ),
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write NAME.yaml and NAME_flight.yaml, an airframe that flies.")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Write NAME.yaml and NAME_flight.yaml, an airframe that flies."
+        ),
     ] = None,
-    name: Annotated[str, typer.Option("--set name", help="Name of the airframe; by default that of the file.")] = "",
-    speed: Annotated[str | None, typer.Option("--set speed", help='Trim speed, in m/s or with a unit: "176 ft/s".')] = None,
+    name: Annotated[
+        str, typer.Option("--set name", help="Name of the airframe; by default that of the file.")
+    ] = "",
+    speed: Annotated[
+        str | None,
+        typer.Option("--set speed", help='Trim speed, in m/s or with a unit: "176 ft/s".'),
+    ] = None,
     states: Annotated[
-        str, typer.Option(help='States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".')
+        str,
+        typer.Option(
+            help='States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".'
+        ),
     ] = "",
     inputs: Annotated[
-        str, typer.Option(help='Inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1".')
+        str,
+        typer.Option(
+            help='Inputs in the order of B, with units and effects: "elevator: rad nose down, '
+            'thrust: 1".'
+        ),
     ] = "",
     outputs: Annotated[
         str,
-        typer.Option(help='As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = 0.987 u + 0.163 w".'),
+        typer.Option(
+            help='As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
+            '0.987 u + 0.163 w".'
+        ),
     ] = "",
     thrust: Annotated[
-        bool, typer.Option("--set thrust", help="Add an input thrust in units of the weight along the flight path.")
+        bool,
+        typer.Option(
+            "--set thrust", help="Add an input thrust in units of the weight along the flight path."
+        ),
     ] = False,
-    lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the order of the inputs: 0.05,0.3")] = None,
-    mass: Annotated[str | None, typer.Option("--set mass", help='Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')] = None,
-    Ixx: Annotated[str | None, typer.Option("--set Ixx", help='Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')] = None,
+    lag: Annotated[
+        str | None,
+        typer.Option(help="Lags of the actuators in s, in the order of the inputs: 0.05,0.3"),
+    ] = None,
+    mass: Annotated[
+        str | None,
+        typer.Option("--set mass", help='Beside AVL\'s derivatives: "3.2 kg" or "85 slug".'),
+    ] = None,
+    Ixx: Annotated[
+        str | None, typer.Option("--set Ixx", help='Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
+    ] = None,
     Iyy: Annotated[str | None, typer.Option("--set Iyy", help="As --Ixx.")] = None,
     Izz: Annotated[str | None, typer.Option("--set Izz", help="As --Ixx.")] = None,
     Ixz: Annotated[str | None, typer.Option("--set Ixz", help="As --Ixx; by default 0.")] = None,
-    density: Annotated[str | None, typer.Option("--set density", help='"1.225 kg/m^3" or "0.002377 slug/ft^3".')] = None,
-    length: Annotated[str | None, typer.Option("--set length", help="Unit of length of AVL's file, by default m.")] = None,
-    text: Annotated[str, typer.Option("--set source", help="Where the figures come from: a book and a page.")] = "",
-    replace: Annotated[bool, typer.Option("--set replace", help="Replace files of these names.")] = False,
+    density: Annotated[
+        str | None, typer.Option("--set density", help='"1.225 kg/m^3" or "0.002377 slug/ft^3".')
+    ] = None,
+    length: Annotated[
+        str | None, typer.Option("--set length", help="Unit of length of AVL's file, by default m.")
+    ] = None,
+    text: Annotated[
+        str, typer.Option("--set source", help="Where the figures come from: a book and a page.")
+    ] = "",
+    replace: Annotated[
+        bool, typer.Option("--set replace", help="Replace files of these names.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
 
-    With --write FOLDER: make NAME.yaml, an airframe that is checked against physics, and NAME_flight.yaml, a scenario with
-    selected gains. It has been flown once in this process: rise-di fly NAME_flight.yaml --in-process.
+    With --write FOLDER: make NAME.yaml, an airframe that is checked against physics, and
+    NAME_flight.yaml, a scenario with selected gains. It has been flown once in this process:
+    rise-di fly NAME_flight.yaml --in-process.
 
     Exit status: 0, or 2 for a file with a mistake.
     """
     if write is not None:
-        require(len(names or ()) == 1, "airframes", f"{len(names or ())} sources", "one beside --write")
-        body = {"mass": mass, "Ixx": Ixx, "Iyy": Iyy, "Izz": Izz, "Ixz": Ixz, "density": density, "length": length}
+        require(
+            len(names or ()) == 1, "airframes", f"{len(names or ())} sources", "one beside --write"
+        )
+        body = {
+            "mass": mass,
+            "Ixx": Ixx,
+            "Iyy": Iyy,
+            "Izz": Izz,
+            "Ixz": Ixz,
+            "density": density,
+            "length": length,
+        }
         lags = None if lag is None else parse_numbers(lag)
         require(lags is None or bool(lags), "lag", repr(lag), "seconds separated by commas")
         with Console().status("selecting gains and flying"):
@@ -94,26 +151,43 @@ def airframes(
     for airframe in facts:
         signs.add_row(
             airframe.name,
-            "none" if airframe.D is None else " ".join("+" if sign > 0 else "-" for sign in airframe.D),
+            "none"
+            if airframe.D is None
+            else " ".join("+" if sign > 0 else "-" for sign in airframe.D),
             airframe.remedy,
             "-" if airframe.coupling is None else f"{airframe.coupling:.3g}",
         )
     console.print(signs)
-    assumptions = _table("Assumptions 1 and 3", "airframe", "n, m", "controllable", "zeros", "integrated")
+    assumptions = _table(
+        "Assumptions 1 and 3", "airframe", "n, m", "controllable", "zeros", "integrated"
+    )
     for airframe in facts:
         yes = "yes" if airframe.controllable else "no"
         assumptions.add_row(
-            airframe.name, f"{airframe.n}, {airframe.m}", yes, airframe.zero_dynamics, ", ".join(airframe.integrated) or "-"
+            airframe.name,
+            f"{airframe.n}, {airframe.m}",
+            yes,
+            airframe.zero_dynamics,
+            ", ".join(airframe.integrated) or "-",
         )
     console.print(assumptions)
-    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", "airframe", "poles", "zeros at", "minors")
+    roots = _table(
+        "Poles and zeros in 1/s, leading minors of C B in SI",
+        "airframe",
+        "poles",
+        "zeros at",
+        "minors",
+    )
     for airframe in facts:
         minors = "  ".join(f"{minor:.3g}" for minor in airframe.minors)
-        roots.add_row(airframe.name, _format_roots(airframe.poles), _format_roots(airframe.zeros), minors)
+        roots.add_row(
+            airframe.name, _format_roots(airframe.poles), _format_roots(airframe.zeros), minors
+        )
     console.print(roots)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
     console.print(
-        f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).",
+        f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling "
+        "is max abs(U - I).",
         soft_wrap=True,
     )
     if marginal := marginal_sentence(facts):
@@ -124,7 +198,10 @@ def _show_draft(draft: NewAirframe) -> None:
     """What was read, and the files that were written."""
     frame = draft.airframe
     print(f"read:     {draft.note}")
-    effects = (f"{key} ({channel.unit}, positive: {channel.positive})" for key, channel in frame.inputs.items())
+    effects = (
+        f"{key} ({channel.unit}, positive: {channel.positive})"
+        for key, channel in frame.inputs.items()
+    )
     print(f"inputs:   {', '.join(effects)}")
     print(f"outputs:  {', '.join(frame.outputs)}")
     print(f"airframe: {display_path(draft.airframe_file)}")
@@ -133,14 +210,18 @@ def _show_draft(draft: NewAirframe) -> None:
 
 
 def _table(title: str, *headings: str) -> Table:
-    return new_table(title, headings, left_aligned=headings, wrapped=("poles", "zeros at", "minors"))
+    return new_table(
+        title, headings, left_aligned=headings, wrapped=("poles", "zeros at", "minors")
+    )
 
 
 def _format_roots(roots: ComplexArray) -> str:
     """Roots as text: a conjugate pair once, a root that is zero to rounding as 0."""
     shown = []
     for root in roots:
-        real, imaginary = (0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag))
+        real, imaginary = (
+            0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag)
+        )
         if imaginary >= 0.0:
             shown.append(f"{real:.3g}" + (f"+-{imaginary:.3g}j" if imaginary else ""))
     return "  ".join(shown) or "none"

@@ -23,7 +23,8 @@ from flight_core.parameters import require
 
 FOLDER = "benchmark-"
 LEGEND = (
-    "score: sum of rms of the true error over the unit of a channel (10 mrad/s, p 20, V 0.1 m/s), of a mission the largest"
+    "score: sum of rms of the true error over the unit of a channel (10 mrad/s, p 20, V 0.1 "
+    "m/s), of a mission the largest"
     " cross-track error in half seconds of flight; a lost aircraft counts 10"
 )
 
@@ -32,23 +33,40 @@ def benchmark(
     entry: Annotated[
         list[str],
         typer.Argument(
-            help="Scenarios whose controllers fly, one for each airframe; or a law of compare, as pi; or MODULE:FUNCTION."
+            help="Scenarios whose controllers fly, one for each airframe; or a law of compare, "
+            "as pi; or MODULE:FUNCTION."
         ),
     ],
-    aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft of a set; fewer to try an entry.")] = 200,
+    aircraft: Annotated[
+        int, typer.Option(min=1, help="Uncertain aircraft of a set; fewer to try an entry.")
+    ] = 200,
     name: Annotated[str | None, typer.Option(help="Name of the entry.")] = None,
-    sees: Annotated[str | None, typer.Option(help="What the law measures beside y_m, as in: y.")] = None,
-    knows: Annotated[str | None, typer.Option(help="What the law knows of the aircraft beside D, as in: Omega_ii.")] = None,
+    sees: Annotated[
+        str | None, typer.Option(help="What the law measures beside y_m, as in: y.")
+    ] = None,
+    knows: Annotated[
+        str | None,
+        typer.Option(help="What the law knows of the aircraft beside D, as in: Omega_ii."),
+    ] = None,
     release: Annotated[
-        str, typer.Option(help="Hash of the commit of a release: fresh seeds; by default the fixed seeds.")
+        str,
+        typer.Option(
+            help="Hash of the commit of a release: fresh seeds; by default the fixed seeds."
+        ),
     ] = "",
     output: Annotated[
-        Path | None, typer.Option(help="Folder of the run, which an interrupted run continues; by default in runs.")
+        Path | None,
+        typer.Option(
+            help="Folder of the run, which an interrupted run continues; by default in runs."
+        ),
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Threads; by default one a core.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Threads; by default one a core.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly the public benchmark with a law, and write a file of scores. The same command continues an interrupted run.
+    """Fly the public benchmark with a law, and write a file of scores. The same command continues
+    an interrupted run.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted.
     """
@@ -60,7 +78,9 @@ def benchmark(
         entered = find_entry(entry, sets, find_scenario, name, sees, knows)
         flights = Flights(entered, sets)
         definition = define(flights, aircraft, version("rise-di"))
-    run = Benchmark(output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)), definition)
+    run = Benchmark(
+        output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)), definition
+    )
     _fly(run, flights, engines.threads(workers), quiet=as_json)
     scores = run.scores()
     if as_json:
@@ -88,18 +108,36 @@ def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: boo
 def _show(console: Console, scores: Mapping[str, Any]) -> None:
     entry = scores["entry"]
     seeds = scores["benchmark"]["release"] or "fixed"
-    title = f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows {entry['knows']}"
-    table = new_table(title, ("set", "flights", "score", "worst", "lost"), left_aligned=("set",), wrapped=("set",))
+    title = (
+        f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows "
+        f"{entry['knows']}"
+    )
+    table = new_table(
+        title, ("set", "flights", "score", "worst", "lost"), left_aligned=("set",), wrapped=("set",)
+    )
     for scored in scores["sets"].values():
         if "not_flown" not in scored:
-            figures = (f"{scored['score']['mean']:.2f}", f"{scored['score']['worst']:.2f}", str(scored["lost"]))
+            figures = (
+                f"{scored['score']['mean']:.2f}",
+                f"{scored['score']['worst']:.2f}",
+                str(scored["lost"]),
+            )
             table.add_row(scored["title"], str(scored["aircraft"]), *figures)
     console.print(table)
     for scored in scores["sets"].values():
         if "over_time" in scored:
-            windows = ", ".join(f"{window} s {value:.2f}" for window, value in scored["over_time"].items())
-            console.print(f"over time, damage at 60 s: {windows}; recovery {scored['recovery']:.2f}", highlight=False)
+            windows = ", ".join(
+                f"{window} s {value:.2f}" for window, value in scored["over_time"].items()
+            )
+            console.print(
+                f"over time, damage at 60 s: {windows}; recovery {scored['recovery']:.2f}",
+                highlight=False,
+            )
     for scored in scores["sets"].values():
         if "not_flown" in scored:
-            console.print(f"not flown: {scored['title']}: {scored['not_flown']}", highlight=False, markup=False)
+            console.print(
+                f"not flown: {scored['title']}: {scored['not_flown']}",
+                highlight=False,
+                markup=False,
+            )
     console.print(LEGEND, style="dim", highlight=False)

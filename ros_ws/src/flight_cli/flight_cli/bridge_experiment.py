@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di identify` that excites the aircraft behind a channel map, and writes a scenario that flies it."""
+"""The part of `rise-di identify` that excites the aircraft behind a channel map, and writes a
+scenario that flies it.
+"""
 
 import shlex
 from collections.abc import Mapping
@@ -58,12 +60,24 @@ def identify_behind_bridge(
     needed: Requirement,
     accept: bool,
 ) -> None:
-    """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
+    """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it
+    into `folder`.
+    """
     channel_map = load_map(map_name)
-    require(0.0 < amplitude <= 1.0, "amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
+    require(
+        0.0 < amplitude <= 1.0,
+        "amplitude",
+        amplitude,
+        "above 0 and at most 1, a part of the limits of the map",
+    )
     known = speed is not None or not has_airspeed(channel_map)
     require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
-    require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
+    require(
+        folder.is_dir() or not folder.exists(),
+        "--write",
+        folder,
+        "a folder, or the name of a new one",
+    )
     console = Console(quiet=as_json)
     if log is None:
         require_envelope(channel_map)
@@ -78,7 +92,12 @@ def identify_behind_bridge(
         console.print(sentence, highlight=False, soft_wrap=True)
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, channels, speed, str(airframe.resolve()), needed)
-    require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --set accept beside --bridge")
+    require(
+        accept or not flyable.lacking,
+        "identify",
+        flyable.lacking,
+        "the margins, or --set accept beside --bridge",
+    )
     written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
     _write(folder, files)
@@ -88,25 +107,52 @@ def identify_behind_bridge(
         return
     _show_gains(console, channels, response, flyable)
     scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
-    console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
+    console.print(
+        f"to fly it: rise-di fly {scenario} --bridge {copied} --send",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _identified(
-    console: Console, channel_map: ChannelMap, tape: Tape, spans: list[tuple[int, int]], speed: float | None
+    console: Console,
+    channel_map: ChannelMap,
+    tape: Tape,
+    spans: list[tuple[int, int]],
+    speed: float | None,
 ) -> tuple[dict[str, float], Response, Channels]:
-    """Trims, step responses and channels of an experiment, shown. Raises ParameterError for a channel that is not certain."""
+    """Trims, step responses and channels of an experiment, shown. Raises ParameterError for a
+    channel that is not certain.
+    """
     pairing, _ = channel_pairs(channel_map)
     is_imported = COMMANDS in tape
-    trims = median_trims(tape[COMMANDS]) if is_imported else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
-    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
-    _show_response(console, channel_map.name, response, trims, sum(stop - start for start, stop in spans) / NANOSECONDS)
+    trims = (
+        median_trims(tape[COMMANDS])
+        if is_imported
+        else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
+    )
+    response = identify_response(
+        tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans
+    )
+    _show_response(
+        console,
+        channel_map.name,
+        response,
+        trims,
+        sum(stop - start for start, stop in spans) / NANOSECONDS,
+    )
     models = channel_models(channel_map, tape, spans, speed)
     _show_models(console, response, models)
     return trims, response, join(channel_map, response, models)
 
 
 def _excite(
-    console: Console, channel_map: ChannelMap, map_name: str, speed: float | None, folder: Path, amplitude: float
+    console: Console,
+    channel_map: ChannelMap,
+    map_name: str,
+    speed: float | None,
+    folder: Path,
+    amplitude: float,
 ) -> Path:
     """Fly the experiment; the folder of its run."""
     airframe = folder / "experiment_airframe.yaml"
@@ -142,7 +188,8 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
     """The whole experiment, before it begins."""
     controller = planned.controller
     table = new_table(
-        f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after another",
+        f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
+        "another",
         ("input", "amplitude", "doublets, s", "multisine, s", "Hz"),
         left_aligned=("input",),
     )
@@ -150,23 +197,30 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
         width = controller.width[i]
         band = f"{controller.lowest[i]:g} to {controller.highest[i]:g}"
         table.add_row(
-            name, f"{controller.amplitude[i]:.3g}", f"{2 * width:g}, {4 * width:g}", f"{controller.period[i]:g}", band
+            name,
+            f"{controller.amplitude[i]:.3g}",
+            f"{2 * width:g}, {4 * width:g}",
+            f"{controller.period[i]:g}",
+            band,
         )
     console.print(table)
     console.print(
-        f"{'Hover' if hovers else 'Fly straight and level'}, in the mode in which the map engages, then in another terminal:"
-        " rise-di engage (within"
-        f" {duration - controller.duration:.0f} s). The pilot's override, rise-di engage --off and Ctrl-C end it at any time.",
+        f"{'Hover' if hovers else 'Fly straight and level'}, in the mode in which the map "
+        "engages, then in another terminal: rise-di engage (within"
+        f" {duration - controller.duration:.0f} s). The pilot's override, rise-di engage --off "
+        "and Ctrl-C end it at any time.",
         highlight=False,
         soft_wrap=True,
     )
 
 
 def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """The tape of an experiment, the engaged spans, ns, and a sentence on an early end by the bridge, else empty.
+    """The tape of an experiment, the engaged spans, ns, and a sentence on an early end by the
+    bridge, else empty.
 
     A flight of `rise-di import` is a single span.
-    Raises ParameterError for a log without an engagement, and for a flight under feedback: u follows y.
+    Raises ParameterError for a log without an engagement, and for a flight under feedback: u
+    follows y.
     """
     recorded = read_run(run)
     warn_of_lacks(recorded)
@@ -178,25 +232,43 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
         return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], ""
     parameters = None if recorded.scenario is None else recorded_parameters(recorded.scenario)
     law = "not recorded" if parameters is None else parameters.law
-    require(law == OPEN_LOOP, f"{run}: law", law, f"{OPEN_LOOP}: the log of an experiment, or of rise-di import")
+    require(
+        law == OPEN_LOOP,
+        f"{run}: law",
+        law,
+        f"{OPEN_LOOP}: the log of an experiment, or of rise-di import",
+    )
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:
-        raise ParameterError(f"{run}: found no engagement, expected a flight in which the bridge was engaged")
-    spans = [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
-    return tape, spans, cut_short(flown, parameters.duration) if isinstance(parameters, ExcitationConfig) else ""
+        raise ParameterError(
+            f"{run}: found no engagement, expected a flight in which the bridge was engaged"
+        )
+    spans = [
+        (engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1]))
+        for engagement in flown
+    ]
+    return (
+        tape,
+        spans,
+        cut_short(flown, parameters.duration) if isinstance(parameters, ExcitationConfig) else "",
+    )
 
 
 def _digits(value: float, digits: int) -> str:
-    """A value by its leading digits, without an exponent up to 1e6: a narrow column would cut it off."""
+    """A value by its leading digits, without an exponent up to 1e6: a narrow column would cut it
+    off.
+    """
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
-def _show_response(console: Console, name_of_map: str, response: Response, trims: dict[str, float], engaged: float) -> None:
+def _show_response(
+    console: Console, name_of_map: str, response: Response, trims: dict[str, float], engaged: float
+) -> None:
     headings = ("input", "trim", "moves", "Omega", "+-", "lag", "+-", "delay", "+-")
     table = new_table(
-        f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s without gaps of {engaged:.0f} s engaged;"
-        " SI, standard errors",
+        f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s without gaps "
+        f"of {engaged:.0f} s engaged; SI, standard errors",
         headings,
         left_aligned=("input", "moves"),
     )
@@ -216,23 +288,49 @@ def _show_response(console: Console, name_of_map: str, response: Response, trims
 
 def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
     parameters = ("input", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
-    table = new_table("Models of the channels, SI, fitted to the output error", parameters, left_aligned=("input",))
+    table = new_table(
+        "Models of the channels, SI, fitted to the output error",
+        parameters,
+        left_aligned=("input",),
+    )
     estimates = ("channel", "abs(y / u)", "+-", "y behind u, rad", "+-", "used")
-    loop = new_table("The models at the frequency of the loop, standard errors", estimates, left_aligned=("channel", "used"))
+    loop = new_table(
+        "The models at the frequency of the loop, standard errors",
+        estimates,
+        left_aligned=("channel", "used"),
+    )
     for output, name, model in zip(response.outputs, response.inputs, models, strict=True):
         channel = f"{output} by {name}"
         if model is not None:
-            values = (model.Omega, model.lag, model.delay, model.damping, model.stiffness, model.slow / model.Omega)
-            table.add_row(name, *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %")
+            values = (
+                model.Omega,
+                model.lag,
+                model.delay,
+                model.damping,
+                model.stiffness,
+                model.slow / model.Omega,
+            )
+            table.add_row(
+                name, *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %"
+            )
             numbers = chain.from_iterable(model.at_loop_frequency())
-            loop.add_row(channel, *(f"{value:.3g}" for value in numbers), "model" if model.usable else "step response")
+            loop.add_row(
+                channel,
+                *(f"{value:.3g}" for value in numbers),
+                "model" if model.usable else "step response",
+            )
     console.print(table, loop)
-    uncertain = [name for name, model in zip(response.outputs, models, strict=True) if model is None or not model.usable]
+    uncertain = [
+        name
+        for name, model in zip(response.outputs, models, strict=True)
+        if model is None or not model.usable
+    ]
     if uncertain:
         console.print(
-            f"{', '.join(uncertain)}: no certain model without a zero above {FASTEST_ZERO:g} 1/s, so that the law has"
-            f" {uncertain[0]}_dot = Omega u from the step response: no damping in its feedforward, and the integral by"
-            " bandwidth alone.",
+            f"{', '.join(uncertain)}: no certain model without a zero above {FASTEST_ZERO:g} "
+            "1/s, so that the law has"
+            f" {uncertain[0]}_dot = Omega u from the step response: no damping in its "
+            "feedforward, and the integral by bandwidth alone.",
             highlight=False,
             soft_wrap=True,
         )
@@ -241,21 +339,30 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:
     controller = flyable.controller
     params = flyable.controller.law_params()
-    table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"), left_aligned=("channel",))
+    table = new_table(
+        "Gains by lag and delay",
+        ("channel", "bandwidth, rad/s", "Lambda, 1/s"),
+        left_aligned=("channel",),
+    )
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         place = response.outputs.index(output)
         bandwidth = params.K[i] * params.input_scale[i] * abs(channels.Omega[place, place])
         table.add_row(f"{output} by {name}", f"{bandwidth:.3g}", f"{params.Lambda[i]:.3g}")
     console.print(table)
     if flyable.delay_margin is not None:
-        console.print(f"delay margin beyond the identified delay: {1e3 * flyable.delay_margin:.0f} ms", highlight=False)
+        console.print(
+            f"delay margin beyond the identified delay: {1e3 * flyable.delay_margin:.0f} ms",
+            highlight=False,
+        )
 
 
 def _as_json(
     response: Response, channels: Channels, flyable: Flyable, trims: dict[str, float], folder: Path
 ) -> dict[str, object]:
     def numbers(values: Any) -> dict[str, Any]:
-        arrays = {key: value for key, value in values._asdict().items() if isinstance(value, np.ndarray)}
+        arrays = {
+            key: value for key, value in values._asdict().items() if isinstance(value, np.ndarray)
+        }
         return {key: value.tolist() for key, value in arrays.items()}
 
     return {

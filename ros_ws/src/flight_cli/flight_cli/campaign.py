@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain aircraft."""
+"""`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain
+aircraft.
+"""
 
 import math
 import shlex
@@ -21,7 +23,13 @@ from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_analysis.report.tables import Table
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNK, Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, influence_table, write_results
+from flight_campaign.campaign_report import (
+    FIGURE_HEADINGS,
+    WIND_EFFECTS,
+    figure_rows,
+    influence_table,
+    write_results,
+)
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -38,7 +46,19 @@ from flight_core.parameters import require
 from flight_design.learning.scenario_learner import learner
 
 OF_DEFINITION = (
-    *("aircraft", "uncertainty", "entry", "distribution", "score", "wind", "seed", "sweep", "duration", "chunk", "runs"),
+    *(
+        "aircraft",
+        "uncertainty",
+        "entry",
+        "distribution",
+        "score",
+        "wind",
+        "seed",
+        "sweep",
+        "duration",
+        "chunk",
+        "runs",
+    ),
 )  # options of a new campaign
 
 
@@ -54,80 +74,117 @@ def campaign(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="Name of a scenario, or path of a scenario file (.yaml); or the folder of an interrupted campaign to continue."
+            help="Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
+            "interrupted campaign to continue."
         ),
     ] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="How many uncertain aircraft.")] = 1000,
-    uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")] = 0.3,
+    uncertainty: Annotated[
+        float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")
+    ] = 0.3,
     wind: Annotated[
         WindEffect | None,
         typer.Option(
-            "--set wind", help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."
+            "--set wind",
+            help="Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+            "the scenario's.",
         ),
     ] = None,
     entry: Annotated[
         list[str] | None,
         typer.Option(
             "--set entry",
-            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', lag=0.5, noise=0.5, delay=0.02 (s).",
+            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
+            "lag=0.5, noise=0.5, delay=0.02 (s).",
         ),
     ] = None,
     distribution: Annotated[
         Distribution | None,
         typer.Option(
             "--set distribution",
-            help="Of the deviations: uniform, normal with three standard deviations at the limit, or its two limits.",
+            help="Of the deviations: uniform, normal with three standard deviations at the "
+            "limit, or its two limits.",
         ),
     ] = None,
     score: Annotated[
         list[str] | None,
         typer.Option(
-            "--set score", help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."
+            "--set score",
+            help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each "
+            "output.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
         str | None,
-        typer.Option(help="A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 or 'beta[V]=0.5,1,2'."),
+        typer.Option(
+            help="A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
+            "or 'beta[V]=0.5,1,2'."
+        ),
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")
+    ] = None,
     chunk: Annotated[
         int | None,
         typer.Option(
-            "--set chunk", min=1, help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU."
+            "--set chunk",
+            min=1,
+            help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on "
+            "a GPU.",
         ),
     ] = None,
     engine: Annotated[
         EngineName | None,
-        typer.Option(help="Threads of this process, or processes and hosts of dask; by default dask with a learner."),
+        typer.Option(
+            help="Threads of this process, or processes and hosts of dask; by default dask with "
+            "a learner."
+        ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option("--set workers", min=1, help="Threads or processes; by default one a core.")
+        int | None,
+        typer.Option("--set workers", min=1, help="Threads or processes; by default one a core."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option("--set scheduler", help="Address of a dask scheduler, as in tcp://host:8786.")
+        str | None,
+        typer.Option("--set scheduler", help="Address of a dask scheduler, as in tcp://host:8786."),
     ] = None,
-    runs: Annotated[Path, typer.Option("--set runs", help="Folder that the campaign's folder is made in.")] = Path("runs"),
+    runs: Annotated[
+        Path, typer.Option("--set runs", help="Folder that the campaign's folder is made in.")
+    ] = Path("runs"),
     rows: Annotated[
-        Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
+        Path | None,
+        typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a scenario, many at once.
+    """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a
+    scenario, many at once.
 
-    Aircraft with a learner fly one by one on each core, as by rise-di fly --in-process, half a minute each.
+    Aircraft with a learner fly one by one on each core, as by rise-di fly --in-process, half a
+    minute each.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
     engines.require_jax()
-    require(scheduler is None or engine is EngineName.DASK, "scheduler", scheduler, "--engine dask with it")
+    require(
+        scheduler is None or engine is EngineName.DASK,
+        "scheduler",
+        scheduler,
+        "--engine dask with it",
+    )
     if rows is not None:
         require(rows.parent.is_dir(), "rows", rows, "a file in a folder that exists")
     if Path(scenario).is_dir():
         for name in OF_DEFINITION:
             source = context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
-            require(is_default, name, "it beside a folder", "none: the folder of a campaign holds its definition")
+            require(
+                is_default,
+                name,
+                "it beside a folder",
+                "none: the folder of a campaign holds its definition",
+            )
         monte_carlo = Campaign.resume(Path(scenario))
     else:
         chosen = find_scenario(scenario, duration)
@@ -142,8 +199,14 @@ def campaign(
         definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     if engine is None:
-        engine = EngineName.DASK if monte_carlo.definition.scenario().learns() else EngineName.THREADS
-    flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
+        engine = (
+            EngineName.DASK if monte_carlo.definition.scenario().learns() else EngineName.THREADS
+        )
+    flies = (
+        engines.threads(workers)
+        if engine is EngineName.THREADS
+        else engines.dask(workers, scheduler)
+    )
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
     figures, results = write_results(monte_carlo)
     if rows is not None:
@@ -154,13 +217,22 @@ def campaign(
         return
     console = Console()
     for case in range(monte_carlo.definition.cases):
-        _show(console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case])
+        _show(
+            console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case]
+        )
         if figures["cases"][case]["influence"]["entries"]:
-            _print(console, influence_table(monte_carlo.definition.label(case), figures["cases"][case]), "entry")
+            _print(
+                console,
+                influence_table(monte_carlo.definition.label(case), figures["cases"][case]),
+                "entry",
+            )
     _print(console, results, "figure")
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
-    print(f"folder:  {display_path(monte_carlo.folder)}\nreport:  {display_path(monte_carlo.folder / REPORT)}")
+    print(
+        f"folder:  {display_path(monte_carlo.folder)}\nreport:  "
+        f"{display_path(monte_carlo.folder / REPORT)}"
+    )
 
 
 def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
@@ -169,7 +241,12 @@ def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str,
     for text in texts:
         name, _, value = text.rpartition("=")
         parsed = parse_numbers(value)
-        require(bool(name) and len(parsed) == 1 and name not in numbers, option, repr(text), f"a name and a number: {example}")
+        require(
+            bool(name) and len(parsed) == 1 and name not in numbers,
+            option,
+            repr(text),
+            f"a name and a number: {example}",
+        )
         numbers[name] = parsed[0]
     return numbers
 
@@ -178,8 +255,15 @@ def _parse_sweep(text: str) -> Sweep:
     name, _, values = text.partition("=")
     factors = parse_numbers(values)
     fits = bool(factors) and all(map(math.isfinite, factors))
-    require(fits, "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2 or beta[V]=0.5,1,2")
-    return Sweep.validate_mapping({"parameter": name.removeprefix("controller."), "factors": factors}, "--sweep")
+    require(
+        fits,
+        "--sweep",
+        repr(text),
+        "a parameter and factors, as in beta=0.5,1,2 or beta[V]=0.5,1,2",
+    )
+    return Sweep.validate_mapping(
+        {"parameter": name.removeprefix("controller."), "factors": factors}, "--sweep"
+    )
 
 
 def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
@@ -199,7 +283,11 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
             for flights in monte_carlo.fly(engine, learner):
                 flown += flights
                 speed = flown * seconds / (time.monotonic() - begin)
-                bar.update(task, completed=stored + flown, shown=f"{speed:,.0f} aircraft-seconds per second")
+                bar.update(
+                    task,
+                    completed=stored + flown,
+                    shown=f"{speed:,.0f} aircraft-seconds per second",
+                )
     except KeyboardInterrupt:
         print(
             f"interrupted after {stored + flown} of {total}; continue with:"
@@ -212,7 +300,9 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
 def _print(console: Console, results: Table, first: str) -> None:
     """Print a table of the page; `first` heads the names of the rows."""
     table = new_table(
-        escape(f"\n{results.caption}"), (first, *(escape(column.head) for column in results.columns)), left_aligned=(first,)
+        escape(f"\n{results.caption}"),
+        (first, *(escape(column.head) for column in results.columns)),
+        left_aligned=(first,),
     )
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
@@ -220,9 +310,14 @@ def _print(console: Console, results: Table, first: str) -> None:
     console.print(results.legend, style="dim", highlight=False, soft_wrap=True)
 
 
-def _show(console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]) -> None:
+def _show(
+    console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]
+) -> None:
     units = QUANTITY_UNITS | display_units(definition.scenario(case))
-    title = f"\n{definition.name}: {tally.flights} aircraft within +-{100 * definition.uncertainty:g} %, seed {definition.seed}"
+    title = (
+        f"\n{definition.name}: {tally.flights} aircraft within "
+        f"+-{100 * definition.uncertainty:g} %, seed {definition.seed}"
+    )
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
@@ -230,15 +325,24 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     for row in figure_rows(tally, units):
         table.add_row(*row)
     console.print(table)
-    for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
+    for word, count in (
+        ("diverged", tally.diverged),
+        (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost),
+    ):
         share, low, high = tally.share(count)
-        console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
+        console.print(
+            f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to "
+            f"{100 * high:.2g})"
+        )
     if (unmodelled := tally.without_model()) is not None:
-        console.print(f"without a model: {unmodelled} of {tally.flights}; fallbacks: to the law of the start")
+        console.print(
+            f"without a model: {unmodelled} of {tally.flights}; fallbacks: to the law of the start"
+        )
     for flight in figures["fly_again"]:
         score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"
         console.print(
-            f"worst: aircraft {flight['number']}, {score}; again: {flight['command']} (or --lockstep, over topics)",
+            f"worst: aircraft {flight['number']}, {score}; again: {flight['command']} (or "
+            "--lockstep, over topics)",
             soft_wrap=True,
             highlight=False,
         )

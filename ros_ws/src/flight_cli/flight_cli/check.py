@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check`: a channel map beside the D of the controller, a recorded flight, and releases of an autopilot."""
+"""`rise-di check`: a channel map beside the D of the controller, a recorded flight, and releases of
+an autopilot.
+"""
 
 import sys
 from collections.abc import Sequence
@@ -12,49 +14,70 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import version_faults
-from autopilot_bridge.map_check import CheckedRow, check_map, definitions_below, installed_definitions, is_known
+from autopilot_bridge.map_check import (
+    CheckedRow,
+    check_map,
+    definitions_below,
+    installed_definitions,
+    is_known,
+)
 from autopilot_bridge.params import MAVLINK, ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
 from flight_cli.words import AsJson
 from flight_design.identification.response_identification import MIN_RATIO
-from flight_design.identification.sign_check import SignCheck, check_scenario, motion_as_channel_grows
+from flight_design.identification.sign_check import (
+    SignCheck,
+    check_scenario,
+    motion_as_channel_grows,
+)
 
 CONTRADICTS = 1
 INSTALLED = "installed"  # in place of a folder: the message packages of this host
 
 
 def check(
-    map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")],
-    airframe: Annotated[str | None, typer.Option(help="Airframe; by default that of the scenario.")] = None,
+    map_name: Annotated[
+        str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")
+    ],
+    airframe: Annotated[
+        str | None, typer.Option(help="Airframe; by default that of the scenario.")
+    ] = None,
     scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_servo",
     run: Annotated[
-        Path | None, typer.Option(help="A recorded flight with y and u, each input excited; with a bridge, its engaged time.")
+        Path | None,
+        typer.Option(
+            help="A recorded flight with y and u, each input excited; with a bridge, its "
+            "engaged time."
+        ),
     ] = None,
     namespace: LogNamespace = None,
     definitions: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Check the rows instead: the sources of a message package, of one release; several, each a column; or"
-            f" {INSTALLED}."
+            help="Check the rows instead: the sources of a message package, of one release; "
+            f"several, each a column; or {INSTALLED}."
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
-    With --definitions, tell for which releases of an autopilot the rows of the map hold: topic, field and constants of each.
-    Rows of MAVLink always stand against pymavlink.
+    With --definitions, tell for which releases of an autopilot the rows of the map hold: topic,
+    field and constants of each. Rows of MAVLink always stand against pymavlink.
 
-    A sign without a certain measurement is no contradiction: a ? in the table, and a sentence with the necessary excitation.
-    Exit status: 0 agreement, 1 a contradiction or a row that does not hold, 2 bad input.
+    A sign without a certain measurement is no contradiction: a ? in the table, and a sentence with
+    the necessary excitation. Exit status: 0 agreement, 1 a contradiction or a row that does not
+    hold, 2 bad input.
     """
     channel_map = load_map(map_name)
     if definitions:
         _check_rows(channel_map, definitions, as_json)
         return
-    for fault in version_faults((topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")):
+    for fault in version_faults(
+        (topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")
+    ):
         print(f"warning: {fault}", file=sys.stderr)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
@@ -64,7 +87,12 @@ def check(
     if as_json:
         channels = [channel._asdict() for channel in checked.channels]
         sentences = list(checked.contradictions)
-        result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}
+        result = {
+            "map": channel_map.name,
+            "channels": channels,
+            "seconds": checked.seconds,
+            "contradictions": sentences,
+        }
         print_json(result)
     else:
         _show(Console(), channel_map, checked, frame.name)
@@ -78,7 +106,15 @@ def check(
 
 def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airframe: str) -> None:
     title = f"Map {channel_map.name}, airframe {airframe}: what a positive u does"
-    headings = ("u", "moves", "seen in", "effect", "D", "of law", *(["recorded"] if checked.seconds else []))
+    headings = (
+        "u",
+        "moves",
+        "seen in",
+        "effect",
+        "D",
+        "of law",
+        *(["recorded"] if checked.seconds else []),
+    )
     table = new_table(title, headings, left_aligned=("u", "moves", "seen in"))
     for channel in checked.channels:
         cells = [
@@ -90,7 +126,10 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
             f"{channel.D_controller:+d}" + ("" if channel.D_controller == channel.D else " !"),
         ]
         if channel.measured is not None and channel.ratio is not None:
-            cells.append(f"{channel.measured:+.3g} ({channel.ratio:.0f}){' ' if channel.ratio >= MIN_RATIO else '?'}")
+            cells.append(
+                f"{channel.measured:+.3g} "
+                f"({channel.ratio:.0f}){' ' if channel.ratio >= MIN_RATIO else '?'}"
+            )
         table.add_row(*cells)
     console.print(table)
     headings = ("channel", "raw value", "topic")
@@ -98,13 +137,17 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
     for channel in checked.channels:
         command = channel_map.inputs[channel.input]
         output = channel_map.outputs[channel.output]
-        fields.add_row(f"u.{channel.input}", _format_field(command), channel_map.messages[command.message].topic)
+        fields.add_row(
+            f"u.{channel.input}",
+            _format_field(command),
+            channel_map.messages[command.message].topic,
+        )
         fields.add_row(f"y.{channel.output}", _format_field(output), output.topic)
     console.print(fields)
     if checked.seconds:
         console.print(
-            f"recorded: Omega_ii from {checked.seconds:.0f} s, in brackets the response in standard errors;"
-            f" below {MIN_RATIO:g} the sign is not certain (?)",
+            f"recorded: Omega_ii from {checked.seconds:.0f} s, in brackets the response in "
+            f"standard errors; below {MIN_RATIO:g} the sign is not certain (?)",
             style="dim",
         )
 
@@ -115,23 +158,37 @@ def _format_field(row: OutputRow | InputRow) -> str:
 
 
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
-    """Compare the rows of a map with the message definitions of releases, and show each that does not hold."""
+    """Compare the rows of a map with the message definitions of releases, and show each that does
+    not hold.
+    """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)
-    mavlink_types = {kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")}
+    mavlink_types = {
+        kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")
+    }
     names = [folder.resolve().name for folder in definitions]
     releases = [
-        installed if str(folder) == INSTALLED else {**definitions_below(folder, kinds), **mavlink_types}
+        installed
+        if str(folder) == INSTALLED
+        else {**definitions_below(folder, kinds), **mavlink_types}
         for folder in definitions
     ]
     rows = check_map(channel_map, releases)
     if as_json:
-        print_json({"map": channel_map.name, "releases": names, "rows": [row._asdict() for row in rows]})
+        print_json(
+            {"map": channel_map.name, "releases": names, "rows": [row._asdict() for row in rows]}
+        )
     else:
         _show_rows(channel_map.name, rows, names)
         for name, types in zip(names, releases, strict=True):
-            if absent := sorted({kind.partition("/")[0] for kind in kinds if not is_known(types, kind)}):
-                print(f"note: {name}: no definition of {', '.join(absent)}: make messages, or another folder", file=sys.stderr)
+            if absent := sorted(
+                {kind.partition("/")[0] for kind in kinds if not is_known(types, kind)}
+            ):
+                print(
+                    f"note: {name}: no definition of {', '.join(absent)}: make messages, or "
+                    "another folder",
+                    file=sys.stderr,
+                )
     if any(any(row.faults) for row in rows):
         raise typer.Exit(CONTRADICTS)
 
@@ -143,7 +200,12 @@ def _show_rows(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -
         by_release = faults.setdefault(row.key, [{} for _ in releases])
         for sentences, fault in zip(by_release, row.faults, strict=True):
             sentences.update({fault: None} if fault else {})
-    table = new_table(f"Map {name}: which rows hold", ("row", *releases), left_aligned=("row", *releases), wrapped=releases)
+    table = new_table(
+        f"Map {name}: which rows hold",
+        ("row", *releases),
+        left_aligned=("row", *releases),
+        wrapped=releases,
+    )
     for key, by_release in faults.items():
         table.add_row(key, *("no" if fault else "holds" for fault in by_release))
     Console().print(table)

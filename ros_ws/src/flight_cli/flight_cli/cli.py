@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The `rise-di` command: what it can do. A command's module is imported when it runs, so that --help is quick."""
+"""The `rise-di` command: what it can do. A command's module is imported when it runs, so that
+--help is quick.
+"""
 
 import signal
 
@@ -27,45 +29,60 @@ FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 NICE = 10  # of a command that may run beside a flight
-GARBAGE_THRESHOLD = 100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
+GARBAGE_THRESHOLD = (
+    100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
+)
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
 GROUPS = MappingProxyType(
     {
         "Fly": {
-            "fly": "Fly a scenario or a fleet over ROS 2 topics, in real time or in lockstep, or in one process.",
+            "fly": "Fly a scenario or a fleet over ROS 2 topics, in real time or in lockstep, "
+            "or in one process.",
             "scenarios": "List the scenarios: what each flies, its aircraft and its law.",
-            "guide": "Command a running guided flight: a heading, an altitude, hold, home, another route.",
-            "network": "Write the profile of the middleware for nodes on several hosts, and check the network.",
+            "guide": "Command a running guided flight: a heading, an altitude, hold, home, "
+            "another route.",
+            "network": "Write the profile of the middleware for nodes on several hosts, and "
+            "check the network.",
         },
         "Look": {
-            "report": "Write the report page of a run again, compare several, export figures and data, repair a log.",
-            "watch": "See a flight on a page, in the terminal, in Foxglove or in FlightGear, live or recorded.",
-            "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
+            "report": "Write the report page of a run again, compare several, export figures "
+            "and data, repair a log.",
+            "watch": "See a flight on a page, in the terminal, in Foxglove or in FlightGear, "
+            "live or recorded.",
+            "replay": "Compute every tick of a recorded flight again and compare it with the "
+            "log bit by bit.",
             "play": "Publish the topics of a recorded flight again with their timing.",
-            "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
+            "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a "
+            "scenario.",
         },
         "Design": {
-            "airframes": "Show airframes and what the theorem asks of each, or make one of your own that flies.",
+            "airframes": "Show airframes and what the theorem asks of each, or make one of your "
+            "own that flies.",
             "gains": "Select gains for an airframe, and check every condition on them.",
-            "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
-            "learn": "Repeat the learner on the log of a flight, with other settings, and write the model.",
-            "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
+            "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an "
+            "airframe from a log.",
+            "learn": "Repeat the learner on the log of a flight, with other settings, and write "
+            "the model.",
+            "export": "Write the controller of a scenario as C99, with a proof that C and "
+            "Python give the same bits.",
         },
         "Autopilot": {
             "engage": "Engage or disengage the autopilot behind a running bridge.",
-            "check": "Compare the signs of a channel map with the D of the controller, its rows with releases.",
+            "check": "Compare the signs of a channel map with the D of the controller, its rows "
+            "with releases.",
             "import": "Make a bag from the log of an autopilot: DataFlash, tlog or ULog.",
         },
         "Study": {
             "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
             "compare": "Compare RISE-DI with other control laws on the same aircraft.",
-            "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file of scores.",
+            "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file "
+            "of scores.",
         },
     }
 )
-"""What each command does, by group. The function `NAME` of the module `flight_cli.NAME` is the command, with _ after a
-keyword."""
+"""What each command does, by group. The function `NAME` of the module `flight_cli.NAME` is the
+command, with _ after a keyword."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
@@ -79,14 +96,19 @@ def _show_version(wanted: bool) -> None:
 
 def _options(
     show_version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Fly, record and analyse RISE dynamic inversion."""
 
 
 def application(words: Collection[str]) -> typer.Typer:
-    """The command line with the commands among the words; further commands have name and help alone."""
+    """The command line with the commands among the words; further commands have name and help
+    alone.
+    """
     app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, cls=Commands)
     app.callback()(_options)
     for group, commands in GROUPS.items():
@@ -99,7 +121,9 @@ def application(words: Collection[str]) -> typer.Typer:
 
 
 def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
-    """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference: Python prints and ignores it there."""
+    """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference: Python
+    prints and ignores it there.
+    """
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.signal(signal.SIGALRM, signal.default_int_handler)
         signal.setitimer(signal.ITIMER_REAL, REPEATED_AFTER)
@@ -113,8 +137,13 @@ def main() -> None:
     if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
         with suppress(OSError):
             os.nice(NICE)
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it interrupts no node when it wakes up
-    words = [*sys.argv[1:2], *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split()]
+            os.sched_setscheduler(
+                0, os.SCHED_BATCH, os.sched_param(0)
+            )  # it interrupts no node when it wakes up
+    words = [
+        *sys.argv[1:2],
+        *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split(),
+    ]
     try:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -137,7 +166,10 @@ def main() -> None:
         if error.errno not in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python writes the rest at its end
-        print(f"error: output: cannot be written ({error.strerror}), expected a disk with space", file=sys.stderr)
+        print(
+            f"error: output: cannot be written ({error.strerror}), expected a disk with space",
+            file=sys.stderr,
+        )
         sys.exit(FAILED)
 
 

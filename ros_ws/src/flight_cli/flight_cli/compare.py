@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and further control laws on the same aircraft, tuned by the same procedure."""
+"""`rise-di compare`: RISE-DI and further control laws on the same aircraft, tuned by the same
+procedure.
+"""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +28,14 @@ from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
 from flight_campaign.law_margins import has_margins
 from flight_campaign.tuning import Benchmark
-from flight_cli.output import COUNT_COLUMNS, LICENCE, new_table, parse_numbers, progress_bar, write_text
+from flight_cli.output import (
+    COUNT_COLUMNS,
+    LICENCE,
+    new_table,
+    parse_numbers,
+    progress_bar,
+    write_text,
+)
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -51,25 +60,32 @@ margins: least phase margin, deg, and largest sensitivity of the linear loop on 
 cost: the least of {seeds} seeds of the tuning, and the difference to the largest. It is the mean of score + slew over
   {slew}, of the nominal and {uncertain} uncertain aircraft at +-{level:g} %, once with u in time and once late:
 {costs}
-"""
+"""  # noqa: E501 - a text as it is written
 WIDTH = 200  # characters, the least width of the table
 
 
 def compare(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")
+    ] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 200,
-    uncertainty: Annotated[str, typer.Option(help="Largest relative deviations of A and B, as in 0.3,0.5")] = "0.3,0.5",
+    uncertainty: Annotated[
+        str, typer.Option(help="Largest relative deviations of A and B, as in 0.3,0.5")
+    ] = "0.3,0.5",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
     wind: Annotated[
         WindEffect | None,
         typer.Option(
-            "--set wind", help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."
+            "--set wind",
+            help="Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+            "the scenario's.",
         ),
     ] = None,
     laws: Annotated[
         str | None,
         typer.Option(
-            help="Laws to compare, by name: rise,pi,l1; all by default. A scenario file in place of a name: its controller."
+            help="Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
+            "place of a name: its controller."
         ),
     ] = None,
     tuning: Annotated[
@@ -77,21 +93,37 @@ def compare(
         typer.Option(help=f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}."),
     ] = "gust_turbulence",
     tune: Annotated[
-        bool, typer.Option("--tune", help="First tune the laws that have no gains for this scenario: minutes a law.")
+        bool,
+        typer.Option(
+            "--tune",
+            help="First tune the laws that have no gains for this scenario: minutes a law.",
+        ),
     ] = False,
     turbulence_seed: Annotated[
-        int, typer.Option("--set turbulence_seed", min=0, help="Seed of the turbulence, unlike that of the tuning.")
+        int,
+        typer.Option(
+            "--set turbulence_seed",
+            min=0,
+            help="Seed of the turbulence, unlike that of the tuning.",
+        ),
     ] = law_comparison.TURBULENCE_SEED,
     gains: Annotated[
-        Path | None, typer.Option("--set gains", help="File of tuned gains; by default the one of the stack.")
+        Path | None,
+        typer.Option("--set gains", help="File of tuned gains; by default the one of the stack."),
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(help="File for the gains of one law as a section of a scenario, which flies with the score shown."),
+        typer.Option(
+            help="File for the gains of one law as a section of a scenario, which flies with "
+            "the score shown."
+        ),
     ] = None,
-    to_json: Annotated[Path | None, typer.Option("--json", help="File to write the figures to, SI.")] = None,
+    to_json: Annotated[
+        Path | None, typer.Option("--json", help="File to write the figures to, SI.")
+    ] = None,
 ) -> None:
-    """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits, uncertainty, tuning.
+    """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits,
+    uncertainty, tuning.
 
     Exit status: 0, or 2 bad input.
     """
@@ -104,7 +136,9 @@ def compare(
         _require_one_law(names, aims)
     chosen, command = find_scenario(scenario), f"rise-di compare {scenario} --tune"
     if wind is not None:
-        chosen = chosen.vary(aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}})
+        chosen = chosen.vary(
+            aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}}
+        )
         command += f" --wind {wind}"
     effect = chosen.aircraft.uncertainty.wind
     others = {Path(name).stem: find_scenario(name) for name in names if name.endswith(".yaml")}
@@ -120,10 +154,19 @@ def compare(
             _tune(wanted, entries, chosen, path, command, bar, controllers)
         known = tuned_gains.load(path)
         tuned = {name: _tuned(known.get(name, {}), aims, controllers[name]) for name in names}
-        require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
-        benchmark = registered_laws.with_courses(gain_tuning.build_benchmark(chosen, turbulence_seed), controllers)
+        require(
+            any(tuned.values()),
+            "--laws",
+            "tuned gains for none of them",
+            f"gains in {path}, or --tune, which finds them",
+        )
+        benchmark = registered_laws.with_courses(
+            gain_tuning.build_benchmark(chosen, turbulence_seed), controllers
+        )
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
-        for result in law_comparison.compare(benchmark, tuned, aircraft, levels, seed, laws=entries):
+        for result in law_comparison.compare(
+            benchmark, tuned, aircraft, levels, seed, laws=entries
+        ):
             results.append(result)
             bar.advance(task)
     console = Console()
@@ -132,7 +175,9 @@ def compare(
         if shown := [result for result in results if result.objective == aim]:
             console.print(_table(gain_tuning.OBJECTIVES[aim].title, shown, entries, chosen))
     notes = _notes(chosen, benchmark, {name: entries[name] for name in tuned if tuned[name]}, aims)
-    flown = f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
+    flown = (
+        f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
+    )
     turbulence = f"turbulence of seed {turbulence_seed}, that of the tuning {tuning_seed}"
     console.print(f"{notes}\n{flown}; {turbulence}", style="dim", highlight=False)
     lacking = [(name, aim) for name, aim in wanted if controllers[name] is None]
@@ -145,21 +190,40 @@ def compare(
     if to_json is not None:
         rows = [_as_json(result, entries[result.law], chosen) for result in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
-        write_text("--json", to_json, json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1) + "\n")
+        write_text(
+            "--json",
+            to_json,
+            json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1)
+            + "\n",
+        )
 
 
-def _check_options(aims: Sequence[str], levels: Sequence[float], uncertainty: str, turbulence_seed: int) -> None:
+def _check_options(
+    aims: Sequence[str], levels: Sequence[float], uncertainty: str, turbulence_seed: int
+) -> None:
     for aim in aims:
-        require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
+        require(
+            aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES)
+        )
     fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
-    require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
+    require(
+        fits,
+        "--uncertainty",
+        repr(uncertainty),
+        "parts of each entry, each at least 0 and below 1: 0.3,0.5",
+    )
     differs = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
     require(differs, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
 
 
 def _require_one_law(names: Sequence[str], aims: Sequence[str]) -> None:
     single = len(names) == 1 and len(aims) == 1
-    require(single, "--write", f"{len(names)} laws, {len(aims)} tunings", "one of each: --laws pi --tuning margins")
+    require(
+        single,
+        "--write",
+        f"{len(names)} laws, {len(aims)} tunings",
+        "one of each: --laws pi --tuning margins",
+    )
     tuned_controller.require_registered(names[0])
 
 
@@ -168,9 +232,15 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     controller = tuned_controller.tuned_controller(name, result, benchmark)
     airframe, _ = benchmark.scenario.aircraft.load()
     origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
-    margins = loop_assessment(scenario_loop(benchmark.scenario, controller)) if has_margins(LAWS[name]) else None
+    margins = (
+        loop_assessment(scenario_loop(benchmark.scenario, controller))
+        if has_margins(LAWS[name])
+        else None
+    )
     comments = {"delay": "s, beyond sampling: topics have none in the benchmark"}
-    write_text("--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments))
+    write_text(
+        "--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments)
+    )
 
 
 def _tuned(
@@ -197,16 +267,22 @@ def _tune(
     for name, aim in wanted:
         task = bar.add_task("", total=gain_tuning.generation_count(entries[name], benchmark))
 
-        def show_cost(generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}") -> None:
+        def show_cost(
+            generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}"
+        ) -> None:
             bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
 
-        result = gain_tuning.tune(entries[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
+        result = gain_tuning.tune(
+            entries[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost
+        )
         known = tuned_gains.load(path)
         known.setdefault(name, {})[aim] = result
         tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), command)
 
 
-def _table(tuned_on: str, results: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario) -> Table:
+def _table(
+    tuned_on: str, results: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario
+) -> Table:
     units = display_units(scenario)
     join_names = " / ".join
     levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in results[0].levels))
@@ -219,7 +295,11 @@ def _table(tuned_on: str, results: Sequence[LawResult], entries: Mapping[str, La
         "margins:\ndeg, S",
         "cost",
     )
-    table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left_aligned=("law", "sees", "knows"))
+    table = new_table(
+        f"{scenario.name}, each law tuned on {tuned_on}",
+        heads,
+        left_aligned=("law", "sees", "knows"),
+    )
     for result in results:
         law = entries[result.law]
         lost = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
@@ -230,7 +310,9 @@ def _table(tuned_on: str, results: Sequence[LawResult], entries: Mapping[str, La
             "/".join(f"{100.0 * share:.3g}" for share in lost),
             join_names(f"{value * units[name].factor:.0f}" for name, value in slew),
             "none" if result.margins is None else _format_margins(result.margins),
-            f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}" if result.costs else "own gains",
+            f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}"
+            if result.costs
+            else "own gains",
         )
     return table
 
@@ -241,7 +323,9 @@ def _format_margins(margins: Margins) -> str:
     return f"{np.degrees(margins.phase.min()):.0f}, {margins.sensitivity.max():.2f}"
 
 
-def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]) -> str:
+def _notes(
+    scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]
+) -> str:
     """What the words of the table mean."""
     units = display_units(scenario)
     controller = scenario.controller
@@ -258,8 +342,12 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
         costs.append(f"{aim}: {winds}; u late by {objective.delay * delay:g} ms on {whose}")
     return NOTES.strip().format(
         titles="\n".join(f"{name}: {law.title}" for name, law in laws.items()),
-        unit=", ".join(f"{error * units[name].factor:g} {units[name].unit} of {name}" for name, error in errors),
-        slew=", ".join(f"{slew * units[name].factor:g} {units[name].unit}/s of {name}" for name, slew in slews),
+        unit=", ".join(
+            f"{error * units[name].factor:g} {units[name].unit} of {name}" for name, error in errors
+        ),
+        slew=", ".join(
+            f"{slew * units[name].factor:g} {units[name].unit}/s of {name}" for name, slew in slews
+        ),
         costs="\n".join(f"  {cost}" for cost in costs),
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
         level=100.0 * gain_tuning.UNCERTAINTY,
@@ -270,13 +358,20 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
 
 
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
-    """Figures of a law for JSON: SI, null for an infinite figure, and for the cost of gains that no search found."""
+    """Figures of a law for JSON: SI, null for an infinite figure, and for the cost of gains that no
+    search found.
+    """
     controller = scenario.controller
     levels = []
     for level in result.levels:
         by_wind = {wind: scores._asdict() for wind, scores in level.scores.items()}
         levels.append({"uncertainty": level.uncertainty} | by_wind)
-    row = {"law": result.law, "sees": law.measurements, "knows": law.model_data, "tuned_on": result.objective}
+    row = {
+        "law": result.law,
+        "sees": law.measurements,
+        "knows": law.model_data,
+        "tuned_on": result.objective,
+    }
     return row | {
         "cost": min(result.costs, default=None),
         "spread": max(result.costs) - min(result.costs) if result.costs else None,
@@ -291,7 +386,11 @@ def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
 
 def _margins_as_json(margins: Margins) -> dict[str, Any]:
     """The least margins of a stable loop, SI: phase in rad, gain as a factor."""
-    least = {"phase": margins.phase.min(), "gain": margins.gain.min(), "sensitivity": margins.sensitivity.max()}
+    least = {
+        "phase": margins.phase.min(),
+        "gain": margins.gain.min(),
+        "sensitivity": margins.sensitivity.max(),
+    }
     least |= {"damping": margins.damping}
     values = {name: float(value) for name, value in least.items()}
     return {"stable": bool(margins.stable)} | dict(finite_or_null(values))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge, and disengagement."""
+"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge, and
+disengagement.
+"""
 
 import sys
 from typing import Annotated
@@ -14,24 +16,36 @@ REFUSED = 1
 
 
 def engage(
-    off: Annotated[bool, typer.Option("--off", help="Disengage: give the channels back to the autopilot.")] = False,
+    off: Annotated[
+        bool, typer.Option("--off", help="Disengage: give the channels back to the autopilot.")
+    ] = False,
     blind: Annotated[
-        bool, typer.Option("--blind", help="Engage without regard to the pilot's transmitter, and without end by max_engaged.")
+        bool,
+        typer.Option(
+            "--blind",
+            help="Engage without regard to the pilot's transmitter, and without end by "
+            "max_engaged.",
+        ),
     ] = False,
     namespace: Namespace = "",
 ) -> None:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
-    The command waits until u is at trim, and for a change of mode where the map asks for one. The bridge activates the
-    controller until the end of the engagement. The loss of the pilot's transmitter ends the engagement
-    where the map has a condition for it; elsewhere max_engaged of the map ends the engagement, unless you engage again before.
-    Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
+    The command waits until u is at trim, and for a change of mode where the map asks for one. The
+    bridge activates the controller until the end of the engagement. The loss of the pilot's
+    transmitter ends the engagement where the map has a condition for it; elsewhere max_engaged of
+    the map ends the engagement, unless you engage again before. Exit status: 0 done, 1 refused with
+    the bridge's reason, 2 service not available.
     """
     require_ros_environment()
     from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
-        refusal = client.disengage() if off else client.engage(lambda line: print(line, file=sys.stderr), blind=blind)
+        refusal = (
+            client.disengage()
+            if off
+            else client.engage(lambda line: print(line, file=sys.stderr), blind=blind)
+        )
     if refusal:
         print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: the controller of a scenario as C99, with a proof that C and Python give the same bits."""
+"""`rise-di export`: the controller of a scenario as C99, with a proof that C and Python give the
+same bits.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,31 +20,56 @@ DIFFERS = 1
 
 
 def export(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")],
-    folder: Annotated[Path, typer.Option("--c", help="Folder to write the C code and the report of the proof to.")],
-    run: Annotated[Path | None, typer.Option(help="Prove with the ticks of a recorded run, in place of flights.")] = None,
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")
+    ],
+    folder: Annotated[
+        Path, typer.Option("--c", help="Folder to write the C code and the report of the proof to.")
+    ],
+    run: Annotated[
+        Path | None,
+        typer.Option(help="Prove with the ticks of a recorded run, in place of flights."),
+    ] = None,
     float32: Annotated[
-        bool, typer.Option("--float32", help="Compute in float. The proof then bounds the difference of u.")
+        bool,
+        typer.Option(
+            "--float32", help="Compute in float. The proof then bounds the difference of u."
+        ),
     ] = False,
     duration: Annotated[
-        float | None, typer.Option(min=1.0, help="Duration of a flight of the proof, s; else the scenario's, at most 20 s.")
+        float | None,
+        typer.Option(
+            min=1.0, help="Duration of a flight of the proof, s; else the scenario's, at most 20 s."
+        ),
     ] = None,
-    drawn: Annotated[int, typer.Option(min=1, max=10_000_000, help="Number of drawn steps of the proof.")] = 50_000,
+    drawn: Annotated[
+        int, typer.Option(min=1, max=10_000_000, help="Number of drawn steps of the proof.")
+    ] = 50_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn inputs.")] = 1,
     compiler: Annotated[
         list[str] | None,
-        typer.Option(help="Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc and clang, if there."),
+        typer.Option(
+            help="Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
+            "and clang, if there."
+        ),
     ] = None,
     fmu: Annotated[
-        bool, typer.Option("--fmu", help="Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.")
+        bool,
+        typer.Option(
+            "--fmu", help="Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code."
+        ),
     ] = False,
-    without_proof: Annotated[bool, typer.Option("--no-proof", help="Write the code without a proof.")] = False,
+    without_proof: Annotated[
+        bool, typer.Option("--no-proof", help="Write the code without a proof.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the same bits.
+    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
+    same bits.
 
-    The proof feeds the code with flights in one process (with lost samples, faults, new parameters, engagement, limits), with
-    drawn calls and with drawn steps. It compares every u and every state. Exit status: 0 proved, 1 a bit differs, 2 bad input.
+    The proof feeds the code with flights in one process (with lost samples, faults, new parameters,
+    engagement, limits), with drawn calls and with drawn steps. It compares every u and every state.
+    Exit status: 0 proved, 1 a bit differs, 2 bad input.
     """
     recorded = None if run is None else read_run(run)
     if recorded is not None:

@@ -20,16 +20,31 @@ from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, NEVER_FLEW, STATUS_ENDED_EARLY, STATUS_INCOMPLETE, STATUS_INTERRUPTED, exit_status
+from flight_core.outcome import (
+    COMPLETED,
+    NEVER_FLEW,
+    STATUS_ENDED_EARLY,
+    STATUS_INCOMPLETE,
+    STATUS_INTERRUPTED,
+    exit_status,
+)
 from flight_core.parameters import ParameterError
 
 SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 
 
 def fly_fleet_file(
-    context: typer.Context, file: str, duration: float | None, runs: Path, *, watch: bool, as_json: bool
+    context: typer.Context,
+    file: str,
+    duration: float | None,
+    runs: Path,
+    *,
+    watch: bool,
+    as_json: bool,
 ) -> None:
-    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Exits with the severest status."""
+    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Exits with the
+    severest status.
+    """
     require_package("rclpy", "")
     require_ros_environment()
     chosen = read_fleet(file, duration)
@@ -41,7 +56,10 @@ def fly_fleet_file(
         print(*context.with_resource(watched(*chosen_runs, fleet=True)), sep="\n", file=sys.stderr)
     totals = {member.name: member.scenario.flight.duration for member in chosen.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
-        tasks = {name: bar.add_task(name, total=total, clock="", shown="") for name, total in totals.items()}
+        tasks = {
+            name: bar.add_task(name, total=total, clock="", shown="")
+            for name, total in totals.items()
+        }
 
         def progress(name: str, t: float, shown: str) -> None:
             bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=shown)
@@ -64,7 +82,9 @@ def fly_fleet_file(
 
 
 class _Result(NamedTuple):
-    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED; None without ticks."""
+    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED; None
+    without ticks.
+    """
 
     summary: dict[str, Any]
     engaged: float | None
@@ -84,7 +104,10 @@ def _report(flown: Flown) -> _Result:
         outcome = f"{NEVER_FLEW}: {error}" if flown.outcome == COMPLETED else flown.outcome
         return _Result(write_empty_summary(flown.run, flown.member.scenario, outcome), None)
     internals = flight.tape.signals.get("internals")
-    return _Result(flight.summary, None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)))
+    return _Result(
+        flight.summary,
+        None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)),
+    )
 
 
 def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> None:
@@ -106,7 +129,11 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
         if sentence := (summary["account"] or {}).get("busy"):
             lines.append(f"  {sentence}")
     Console().print(table)
-    print(*lines, *foreign_samples({name: result.summary for name, result in results.items()}), sep="\n")
+    print(
+        *lines,
+        *foreign_samples({name: result.summary for name, result in results.items()}),
+        sep="\n",
+    )
 
 
 def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -119,6 +146,10 @@ def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for name, summary in summaries.items():
         processes = (summary["account"] or {}).get("processes", {})
         total += sum(process["samples"] for process in processes.values())
-        foreign = sum(process["samples"] for node, process in processes.items() if node.rpartition("/")[0] != f"/{name}")
+        foreign = sum(
+            process["samples"]
+            for node, process in processes.items()
+            if node.rpartition("/")[0] != f"/{name}"
+        )
         sentences += [f"{name}: {foreign} samples from outside of /{name}"] if foreign else []
     return sentences or ([f"samples from outside of the aircraft: 0 of {total}"] if total else [])

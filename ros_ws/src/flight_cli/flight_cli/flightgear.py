@@ -15,7 +15,8 @@ from flight_core.parameters import ParameterError, require
 def show_in_flightgear(to: str, origin: str, altitude: float, namespace: str, rate: float) -> None:
     """Send the pose of a running flight to FlightGear at HOST:PORT, until the flight ends.
 
-    `origin`: LAT,LON in degrees of north = east = 0; `altitude` above sea of altitude 0, m; `rate` of packets, Hz.
+    `origin`: LAT,LON in degrees of north = east = 0; `altitude` above sea of altitude 0, m; `rate`
+    of packets, Hz.
     """
     place = parse_origin(origin)
     require(math.isfinite(altitude), "altitude", altitude, "a number")
@@ -29,7 +30,11 @@ def show_in_flightgear(to: str, origin: str, altitude: float, namespace: str, ra
 
     with FlightGearClient(namespace) as client:
         client.wait()
-        print(f"sending to {to}; start FlightGear: fgfs --fdm=null --native-fdm=socket,in,{rate:g},,{port},udp", flush=True)
+        print(
+            f"sending to {to}; start FlightGear: fgfs --fdm=null "
+            f"--native-fdm=socket,in,{rate:g},,{port},udp",
+            flush=True,
+        )
         client.send(address, place, altitude, rate)
 
 
@@ -41,5 +46,7 @@ def _reached(to: str, host: str, port: int) -> tuple[str, int]:
             address, _ = trial.getpeername()
     except (OSError, UnicodeError) as error:  # UnicodeError for a name that no host can have
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ParameterError(f"flightgear: found {to!r} ({reason}), expected a host that this one reaches") from None
+        raise ParameterError(
+            f"flightgear: found {to!r} ({reason}), expected a host that this one reaches"
+        ) from None
     return address, port

@@ -13,17 +13,35 @@ from rich.console import Console
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
-from flight_analysis.report.run_folder import new_run, remove_empty, write_empty_summary, write_report
+from flight_analysis.report.run_folder import (
+    new_run,
+    remove_empty,
+    write_empty_summary,
+    write_report,
+)
 from flight_bringup.fleet import is_fleet
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits, second_stage
+from flight_bringup.graph import (
+    Autopilot,
+    absolute_namespace,
+    find_autopilot,
+    require_limits,
+    second_stage,
+)
 from flight_cli.fleet import fly_fleet_file
 from flight_cli.output import (
     flight_progress,
     print_json,
     show_flight,
 )
-from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, parse_origin, read_waypoints
+from flight_cli.route_options import (
+    Altitude,
+    Line,
+    OriginOfRoute,
+    Simplify,
+    parse_origin,
+    read_waypoints,
+)
 from flight_cli.settings import Settings, with_settings
 from flight_cli.words import AsJson
 from flight_core.environment import require_ros_environment
@@ -38,50 +56,83 @@ from flight_guidance.route_formats import FENCES
 def fly(
     context: typer.Context,
     scenario: Annotated[
-        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.")
+        str,
+        typer.Argument(
+            help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
+        ),
     ] = "osprey_servo",
-    duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Duration in s; by default that of the scenario.")
+    ] = None,
     settings: Settings = None,
     in_process: Annotated[
-        bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
+        bool,
+        typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes."),
     ] = False,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.")
+        bool,
+        typer.Option(
+            "--lockstep",
+            help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.",
+        ),
     ] = False,
     composed: Annotated[
-        bool, typer.Option("--set composed", help="Fly with all nodes in one process: a third of the processor time.")
+        bool,
+        typer.Option(
+            "--set composed",
+            help="Fly with all nodes in one process: a third of the processor time.",
+        ),
     ] = False,
     bridge: Annotated[
         str | None,
         typer.Option(
-            metavar="MAP", help="Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send."
+            metavar="MAP",
+            help="Fly an autopilot in place of the aircraft, by a channel map; a dry run "
+            "without --send.",
         ),
     ] = None,
     route: Annotated[
-        Path | None, typer.Option(metavar="FILE", help=f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help=f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it."
+        ),
     ] = None,
     origin: OriginOfRoute = None,
     fence: Annotated[
         Path | None,
         typer.Option(
-            "--set route.fence", metavar="FILE", help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home."
+            "--set route.fence",
+            metavar="FILE",
+            help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
         ),
     ] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
     line: Line = None,
-    send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")] = False,
+    send: Annotated[
+        bool,
+        typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged."),
+    ] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")
+    ] = False,
     namespace: Annotated[
-        str, typer.Option(help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.")
+        str,
+        typer.Option(
+            help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain."
+        ),
     ] = "",
-    runs: Annotated[Path, typer.Option("--set runs", help="Folder that the run's folder is made in.")] = Path("runs"),
+    runs: Annotated[
+        Path, typer.Option("--set runs", help="Folder that the run's folder is made in.")
+    ] = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
-    """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real time.
+    """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real
+    time.
 
-    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a leg
-    missed or not flown, 130 interrupted; of a fleet the severest of its aircraft.
+    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with
+    an incomplete log or a leg missed or not flown, 130 interrupted; of a fleet the severest of its
+    aircraft.
     """
     if is_fleet(scenario):
         rest: dict[str, object] = {
@@ -93,22 +144,61 @@ def fly(
         }
         rest |= {"send": send, "route": route, "fence": fence, "namespace": namespace}
         for key, chosen_value in rest.items():
-            require(not chosen_value, key, "it beside a fleet", "a scenario, or the key in the file of the fleet")
+            require(
+                not chosen_value,
+                key,
+                "it beside a fleet",
+                "a scenario, or the key in the file of the fleet",
+            )
         fly_fleet_file(context, scenario, duration, runs, watch=watch, as_json=as_json)
     chosen = with_settings(find_scenario(scenario, duration, with_route=route is None), settings)
-    require(not (in_process and (lockstep or composed)), "in_process", "a flight over topics, in lockstep", "one of the two")
-    require(not (in_process and namespace), "--namespace", "a flight in one process", "a flight over topics, which has nodes")
+    require(
+        not (in_process and (lockstep or composed)),
+        "in_process",
+        "a flight over topics, in lockstep",
+        "one of the two",
+    )
+    require(
+        not (in_process and namespace),
+        "--namespace",
+        "a flight in one process",
+        "a flight over topics, which has nodes",
+    )
     namespace = absolute_namespace(namespace)
     stepping = lockstep or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
-    require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
+    require(
+        not (send and bridge is None),
+        "--send",
+        "no --bridge",
+        "the channel map of an autopilot: --bridge MAP",
+    )
     real_time = "a flight in real time over topics: an autopilot does not wait"
-    require(autopilot is None or not composed, "composed", "a flight with a bridge", "one process a node")
-    require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
+    require(
+        autopilot is None or not composed,
+        "composed",
+        "a flight with a bridge",
+        "one process a node",
+    )
+    require(
+        autopilot is None or not (in_process or stepping),
+        "--bridge",
+        "a flight in lockstep or in one process",
+        real_time,
+    )
     files = route or fence
     for_route = (("route.simplify", simplify or None, route), ("route.line", line, route))
-    for option, value, file in (("route.origin", origin, files), ("route.altitude", altitude, files), *for_route):
-        require(value is None or file is not None, option, "no --route", "the file of a route: --route FILE")
+    for option, value, file in (
+        ("route.origin", origin, files),
+        ("route.altitude", altitude, files),
+        *for_route,
+    ):
+        require(
+            value is None or file is not None,
+            option,
+            "no --route",
+            "the file of a route: --route FILE",
+        )
     if files is not None:
         chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)
     _require_flyable(chosen, autopilot, in_process=in_process)
@@ -151,14 +241,19 @@ def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> in
         if status == 0:
             raise
         write_empty_summary(run, scenario, outcome)
-        print(f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr)
+        print(
+            f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr
+        )
         return status
     outcome = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
-        print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
+        print(
+            f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  "
+            f"{display_path(result.report)}"
+        )
     return exit_status(outcome)
 
 
@@ -173,10 +268,23 @@ def _with_files(
 ) -> Scenario:
     """The scenario with the route and the fence of files. Raises ParameterError."""
     above_sea = scenario.aircraft.is_jsbsim
-    sections = {} if fence is None else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
-    require(not sections or scenario.guidance is not None, "route.fence", "a scenario without guidance", "one with guidance")
+    sections = (
+        {}
+        if fence is None
+        else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
+    )
+    require(
+        not sections or scenario.guidance is not None,
+        "route.fence",
+        "a scenario without guidance",
+        "one with guidance",
+    )
     if route is not None:
-        return with_route(scenario, read_waypoints(route, origin, altitude, simplify, line, above_sea=above_sea), sections)
+        return with_route(
+            scenario,
+            read_waypoints(route, origin, altitude, simplify, line, above_sea=above_sea),
+            sections,
+        )
     return scenario.vary(guidance=sections)
 
 
@@ -194,7 +302,9 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
 
 def _learner(scenario: Scenario) -> Learn | None:
-    """The learner of a scenario, for a flight in one process. Raises ParameterError for one that cannot learn."""
+    """The learner of a scenario, for a flight in one process. Raises ParameterError for one that
+    cannot learn.
+    """
     if not scenario.learns():
         return None
     from flight_design.learning.scenario_learner import learner  # noqa: PLC0415 - loads SciPy, which few flights need

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a scenario."""
+"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a
+scenario.
+"""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +17,13 @@ from rich.table import Table
 
 from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.report.html import write_loop_page
-from flight_analysis.report.margin_figures import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
+from flight_analysis.report.margin_figures import (
+    MARGIN_COLUMNS,
+    MARGIN_LEGEND,
+    margin_rows,
+    margins_as_json,
+    modes_text,
+)
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
@@ -36,103 +44,185 @@ from rise_di_controller.params import ControllerConfig
 CONDITION_FAILS = 1
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
-    "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
-    " it is the phase in deg that the lag costs at the crossover",
-    "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
-    "beta": "for inputs scaled by 1 / abs(Omega_ii) in every table; a file has a smaller scale where (22) asks for a larger K",
+    "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 "
+    "periods, delay), rad: times 57.3 it is the phase in deg that the lag costs at the crossover",
+    "softening": "width of the softened sign in time, beside the lag of the loop: narrower than "
+    "that the loop is unstable",
+    "beta": "for inputs scaled by 1 / abs(Omega_ii) in every table; a file has a smaller scale "
+    "where (22) asks for a larger K",
 }
 """Terms of the table and their meaning."""
 Assessment = GainAssessment[Any]
 
 
 def gains(
-    airframe: Annotated[str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")],
-    uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B.")] = 0.3,
-    scenario: Annotated[str, typer.Option(help="Scenario with the commands, the gusts and the loop.")] = "osprey_servo",
+    airframe: Annotated[
+        str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")
+    ],
+    uncertainty: Annotated[
+        float, typer.Option(help="Largest relative deviation of each entry of A and B.")
+    ] = 0.3,
+    scenario: Annotated[
+        str, typer.Option(help="Scenario with the commands, the gusts and the loop.")
+    ] = "osprey_servo",
     rate: Annotated[
-        float | None, typer.Option("--set rate", help="Rate of the law in Hz; by default that of the scenario.")
+        float | None,
+        typer.Option("--set rate", help="Rate of the law in Hz; by default that of the scenario."),
     ] = None,
     y_rate: Annotated[
         float | None,
         typer.Option(
-            "--set y_rate", help="Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three."
+            "--set y_rate",
+            help="Rate of y in Hz: a period above that of the law counts as delay, and y is "
+            "stale after three.",
         ),
     ] = None,
-    lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
-    delay: Annotated[float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")] = None,
+    lag: Annotated[
+        str | None,
+        typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1"),
+    ] = None,
+    delay: Annotated[
+        float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")
+    ] = None,
     inputs: Annotated[
-        str | None, typer.Option("--set inputs", help="Input of each output, in the airframe's order: rudder,aileron")
+        str | None,
+        typer.Option(
+            "--set inputs", help="Input of each output, in the airframe's order: rudder,aileron"
+        ),
     ] = None,
     gamma_2: Annotated[
-        float, typer.Option("--set gamma_2", help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.")
+        float,
+        typer.Option(
+            "--set gamma_2",
+            help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.",
+        ),
     ] = 0.0,
     samples: Annotated[
         int,
-        typer.Option("--set samples", min=0, max=10_000, help="Number of uncertain airframes for the bounds of the theorem."),
+        typer.Option(
+            "--set samples",
+            min=0,
+            max=10_000,
+            help="Number of uncertain airframes for the bounds of the theorem.",
+        ),
     ] = 100,
-    seed: Annotated[int, typer.Option("--set seed", min=0, help="Seed of the uncertain airframes.")] = 1,
-    write: Annotated[Path | None, typer.Option(help="File for the engineering gains, as a section of a scenario.")] = None,
+    seed: Annotated[
+        int, typer.Option("--set seed", min=0, help="Seed of the uncertain airframes.")
+    ] = 1,
+    write: Annotated[
+        Path | None,
+        typer.Option(help="File for the engineering gains, as a section of a scenario."),
+    ] = None,
     feedforward: Annotated[
-        bool, typer.Option("--set feedforward", help="Write the airframe too, as the model of the feedforward (an extension).")
+        bool,
+        typer.Option(
+            "--set feedforward",
+            help="Write the airframe too, as the model of the feedforward (an extension).",
+        ),
     ] = False,
     observer: Annotated[
-        bool, typer.Option("--observer", help="Write feedforward and observer, and the gains beside them (an extension).")
+        bool,
+        typer.Option(
+            "--observer",
+            help="Write feedforward and observer, and the gains beside them (an extension).",
+        ),
     ] = False,
     model: Annotated[
         str | None,
-        typer.Option("--set model", help="Airframe that the observer takes as its model, as rise-di identify RUN writes it."),
+        typer.Option(
+            "--set model",
+            help="Airframe that the observer takes as its model, as rise-di identify RUN writes "
+            "it.",
+        ),
     ] = None,
     margin: Annotated[
-        float, typer.Option("--set margin", help="Least delay margin of the nominal loop with the observer, s.")
+        float,
+        typer.Option(
+            "--set margin", help="Least delay margin of the nominal loop with the observer, s."
+        ),
     ] = 0.03,
     speeds: Annotated[
         str | None,
         typer.Option(
             "--set speeds",
-            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a schedule that flies them.",
+            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
+            "schedule that flies them.",
         ),
     ] = None,
     phase_margin: Annotated[
         float,
         typer.Option(
-            "--set phase_margin", help="Least phase margin of the loop behind servos, deg; 35 or less with the observer."
+            "--set phase_margin",
+            help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.",
         ),
     ] = PHASE_MARGIN,
     theorem: Annotated[
-        bool, typer.Option("--set theorem", help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.")
+        bool,
+        typer.Option(
+            "--set theorem",
+            help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.",
+        ),
     ] = False,
     mixing: Annotated[
         str,
         typer.Option(
-            "--set mixing", help="diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B."
+            "--set mixing",
+            help="diagonal: an input an output; full: inputs of the law, distributed by the "
+            "inverse of C B.",
         ),
     ] = "diagonal",
     accept: Annotated[
-        bool, typer.Option("--set accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+        bool,
+        typer.Option(
+            "--set accept",
+            help="Accept a phase margin below 40 deg, and write gains whose margins fall short.",
+        ),
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
+        bool,
+        typer.Option(
+            "--check", help="Check the gain set of the scenario instead of selecting one."
+        ),
     ] = False,
     page: Annotated[
         Path | None,
-        typer.Option(help="HTML file for the margins with Bode and Nyquist plots: of the engineering gains, or with --check."),
+        typer.Option(
+            help="HTML file for the margins with Bode and Nyquist plots: of the engineering "
+            "gains, or with --check."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every condition on both.
+    """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every
+    condition on both.
 
-    With --check, show the conditions and margins of the scenario's controller instead: of any law, with the law's own gains.
+    With --check, show the conditions and margins of the scenario's controller instead: of any law,
+    with the law's own gains.
 
     Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
     console = Console(quiet=as_json)
-    require(not theorem or (write is not None and not observer), "theorem", "it alone", "--write beside it, without --observer")
+    require(
+        not theorem or (write is not None and not observer),
+        "theorem",
+        "it alone",
+        "--write beside it, without --observer",
+    )
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     answers: dict[str, Assessment]
     with console.status("selecting gains on uncertain airframes") as status:
         if check:
-            _require_check_alone({"--write": write, "--feedforward": feedforward, "--observer": observer}, loop)
-            answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
+            _require_check_alone(
+                {"--write": write, "--feedforward": feedforward, "--observer": observer}, loop
+            )
+            answer = check_gains(
+                airframe,
+                scenario,
+                uncertainty=uncertainty,
+                gamma_2=gamma_2,
+                samples=samples,
+                seed=seed,
+            )
             answers = {"scenario": answer}
             origin = ""
         else:
@@ -160,10 +250,16 @@ def gains(
             )
             engineering = selection.engineering
             origin = selection.origin
-            answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}
+            answers = (
+                {"observer": engineering}
+                if observer
+                else {"theorem": selection.theorem, "engineering": engineering}
+            )
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
-                write_text("--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem))
+                write_text(
+                    "--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem)
+                )
     study = next(iter(answers.values())).study
     if page is not None:
         _write_page(page, [*answers.values()][-1])
@@ -185,13 +281,25 @@ def gains(
 def _require_check_alone(selections: Mapping[str, object], loop: Mapping[str, object]) -> None:
     """Raise ParameterError for options beside --check that select gains or another loop."""
     for option, value in selections.items():
-        require(value in (None, False), option, "it beside --check", "one of them: --check selects nothing to write")
+        require(
+            value in (None, False),
+            option,
+            "it beside --check",
+            "one of them: --check selects nothing to write",
+        )
     own_loop = all(value is None for value in loop.values())
-    require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+    require(
+        own_loop,
+        "--check",
+        "it beside another loop",
+        "the scenario's own rate, lag, delay and inputs",
+    )
 
 
 def _write_page(path: Path, answer: Assessment) -> None:
-    """The margins of a gain set on a page. Raises ParameterError for the literal sign, which has no linear loop."""
+    """The margins of a gain set on a page. Raises ParameterError for the literal sign, which has no
+    linear loop.
+    """
     study = answer.study
     loop = linear_loop(answer.controller, study.airframe, study.A, study.B)
     with writing("--page", path, "a page that can"):
@@ -199,9 +307,13 @@ def _write_page(path: Path, answer: Assessment) -> None:
 
 
 def _require_margins(assessment: Assessment, accept: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement, unless accepted."""
+    """Raises ParameterError for gains whose margins fall short of the requirement, unless
+    accepted.
+    """
     if assessment.unmet and not accept:
-        lacking = "; ".join(condition.sentence(assessment.controller.outputs) for condition in assessment.unmet)
+        lacking = "; ".join(
+            condition.sentence(assessment.controller.outputs) for condition in assessment.unmet
+        )
         raise ParameterError(f"--write: {lacking}; --set accept writes them all the same")
 
 
@@ -212,13 +324,19 @@ def _show_trade(console: Console, selection: Selection) -> None:
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
     shown = [display_unit(output_units[name]) for name in outputs]
-    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())  # no score of a height
+    counted = all(
+        quantity(unit).dimension in SCORE_UNIT for unit in output_units.values()
+    )  # no score of a height
     units = score_units(outputs, output_units) if counted else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
     heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]
-    table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left_aligned=())
+    table = new_table(
+        "\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left_aligned=()
+    )
     for row in trade(selection):
-        errors = (f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True))
+        errors = (
+            f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True)
+        )
         margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
     console.print(table)
@@ -236,16 +354,22 @@ def _show(console: Console, study: Study, answers: dict[str, Assessment]) -> Non
     outputs = first.controller.outputs
     samples = len(study.A) - 1
     aircraft = f"{study.airframe.name}, A and B +-{100 * study.uncertainty:g} % ({samples} samples)"
-    console.print(_gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft))
+    console.print(
+        _gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft)
+    )
     for name, answer in answers.items():
         if answer.margins is not None and answer.margins.nominal.stable:
             heads = ("input", *(f"{column.group}\n{column.head}" for column in MARGIN_COLUMNS))
-            table = new_table(f"\nMargins, {name}: nominal (worst sample)", heads, left_aligned=("input",))
+            table = new_table(
+                f"\nMargins, {name}: nominal (worst sample)", heads, left_aligned=("input",)
+            )
             for row in margin_rows(answer.margins):
                 table.add_row(*row)
             console.print(table)
             console.print(modes_text(answer.margins), highlight=False, soft_wrap=True)
-        console.print(f"{name}: {_format_delay_margin(study, answer)}", highlight=False, soft_wrap=True)
+        console.print(
+            f"{name}: {_format_delay_margin(study, answer)}", highlight=False, soft_wrap=True
+        )
     console.print(MARGIN_LEGEND, style="dim", highlight=False, soft_wrap=True)
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
@@ -254,13 +378,23 @@ def _show(console: Console, study: Study, answers: dict[str, Assessment]) -> Non
         console.print(_condition_table(answers, part, heading))
     if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
         console.print(marginal, highlight=False, soft_wrap=True)
-    estimate = "" if first.bounds is None else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
-    console.print(f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True)
+    estimate = (
+        ""
+        if first.bounds is None
+        else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
+    )
+    console.print(
+        f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True
+    )
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():
         console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
     for name, answer in answers.items():
         failed = answer.failing
-        console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}", highlight=False)
+        console.print(
+            f"{name}: "
+            f"{'every condition holds' if not failed else f'{len(failed)} conditions fail'}",
+            highlight=False,
+        )
         for condition in failed if len(answers) == 1 else ():
             console.print(f"  {condition.sentence(outputs)}", highlight=False)
 
@@ -283,7 +417,10 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
     headings = []
     for name in answers:
         headings += [f"{name}\nK", "\nLambda", "\nbeta"]
-    title = f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2, for inputs scaled by 1 / abs(Omega_ii)"
+    title = (
+        f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2, for inputs "
+        "scaled by 1 / abs(Omega_ii)"
+    )
     table = new_table(title, ["channel", "D", *headings], left_aligned=("channel",))
     first = next(iter(answers.values())).controller
     for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
@@ -291,7 +428,11 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
         for answer in answers.values():
             params = answer.controller.law_params()
             response = gain_selection.response(answer.study, answer.controller)[i]
-            row += [f"{params.K[i] * response:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i] * response:.4g}"]
+            row += [
+                f"{params.K[i] * response:.4g}",
+                f"{params.Lambda[i]:.3g}",
+                f"{params.beta[i] * response:.4g}",
+            ]
         table.add_row(*row)
     return table
 
@@ -299,7 +440,10 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
 def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
     """The parameters of a law other than RISE-DI."""
     table = new_table(
-        f"Law {controller.law} for {aircraft}", ("parameter", "value"), left_aligned=("parameter", "value"), wrapped=("value",)
+        f"Law {controller.law} for {aircraft}",
+        ("parameter", "value"),
+        left_aligned=("parameter", "value"),
+        wrapped=("value",),
     )
     for name in type(controller).model_fields:
         if name not in ControllerConfig.model_fields:
@@ -321,7 +465,10 @@ def _format_delay_margin(study: Study, answer: Assessment) -> str:
         return "predicted delay margin none: the linear loop is unstable with this lag"
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
     alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
-    margin = f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+    margin = (
+        f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel "
+        f"alone: {alone}"
+    )
     return f"{margin}; {speed_of_margin(study, answer)}"
 
 
@@ -332,7 +479,10 @@ def speed_of_margin(study: Study, answer: Assessment) -> str:
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)
     if math.isinf(ratio):
         return f"it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"
-    return f"it lasts up to {ratio * study.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
+    return (
+        f"it lasts up to {ratio * study.airframe.speed:.3g} m/s, {ratio:.3g} of the trim "
+        "speed, without a schedule"
+    )
 
 
 def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
@@ -350,7 +500,10 @@ def _milliseconds(margin: float) -> str:
 def _cells(condition: Condition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
-    return f"{condition.value:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
+    return (
+        f"{condition.value:.4g} {side} {condition.bound:.4g}",
+        margin if condition.holds else f"[red]{margin} ![/red]",
+    )
 
 
 def _as_json(study: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
@@ -369,7 +522,9 @@ def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:
     outputs = answer.controller.outputs
     bounds = None
     if answer.bounds is not None:
-        bounds = {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {"rho": answer.bounds.rho}
+        bounds = {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {
+            "rho": answer.bounds.rho
+        }
     conditions = [_condition_as_json("theorem", condition, outputs) for condition in answer.theorem]
     conditions += [_condition_as_json("loop", condition, outputs) for condition in answer.loop]
     return {

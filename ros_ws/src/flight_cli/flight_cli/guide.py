@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di guide`: what a guided flight holds from now on, the services of guidance, the operator's link, a route."""
+"""`rise-di guide`: what a guided flight holds from now on, the services of guidance, the operator's
+link, a route.
+"""
 
 import math
 import sys
@@ -32,10 +34,14 @@ def guide(
         list[str],
         typer.Argument(
             metavar="COMMAND...",
-            help="NAME=VALUE: one of phi, heading, course, leg, or north, east and radius of an orbit; one of theta, climb,"
-            " altitude; V. phi, theta, heading and course in degrees, r (beside phi) in degrees a second; else m and m/s."
-            " Or hold: the heading, altitude and airspeed of now. skip: the waypoint ahead. resume: the last leg. home: fly"
-            " home and orbit. link: keep the operator's link until Ctrl-C. Or a route file, without airspeeds.",
+            help="NAME=VALUE: one of phi, heading, course, leg, or north, east and radius of an "
+            "orbit; one of theta, climb,"
+            " altitude; V. phi, theta, heading and course in degrees, r (beside phi) in degrees "
+            "a second; else m and m/s."
+            " Or hold: the heading, altitude and airspeed of now. skip: the waypoint ahead. "
+            "resume: the last leg. home: fly"
+            " home and orbit. link: keep the operator's link until Ctrl-C. Or a route file, "
+            "without airspeeds.",
         ),
     ],
     origin: OriginOfRoute = None,
@@ -44,7 +50,8 @@ def guide(
     line: Line = None,
     namespace: Namespace = "",
 ) -> None:
-    """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300. What is not named stays.
+    """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300. What is not
+    named stays.
 
     Exit status: 0 done, 1 refused, 2 bad input or no guidance.
     """
@@ -53,7 +60,10 @@ def guide(
     values = {}
     if len(commands) == 1 and "=" not in command and command not in {*SERVICES, LINK}:
         require(
-            Path(command).suffix != "", "guide", repr(command), f"NAME=VALUE, {', '.join((*SERVICES, LINK))} or a route file"
+            Path(command).suffix != "",
+            "guide",
+            repr(command),
+            f"NAME=VALUE, {', '.join((*SERVICES, LINK))} or a route file",
         )
         points = _points(Path(command), origin, altitude, simplify, line)
     elif command not in {*SERVICES, LINK}:
@@ -75,20 +85,32 @@ def guide(
         print(f"error: refused: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
     print(
-        SERVICES.get(command, f"flies the route of {len(points)} waypoints" if points else f"in force: {', '.join(commands)}")
+        SERVICES.get(
+            command,
+            f"flies the route of {len(points)} waypoints"
+            if points
+            else f"in force: {', '.join(commands)}",
+        )
     )
 
 
 def _points(
     file: Path, origin: str | None, altitude: float | None, simplify: float, line: str | None
 ) -> list[tuple[float, float, float]]:
-    """The waypoints of a route file for a flight: north, east, altitude in m. Raises ParameterError."""
+    """The waypoints of a route file for a flight: north, east, altitude in m. Raises
+    ParameterError.
+    """
     waypoints = read_waypoints(file, origin, altitude, simplify, line, above_sea=None)
     for k, waypoint in enumerate(waypoints):
         if waypoint.speed is not None:
-            raise ParameterError(f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di guide V=VALUE")
+            raise ParameterError(
+                f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di "
+                "guide V=VALUE"
+            )
         if waypoint.loiters:
-            raise ParameterError(f"route[{k}]: found a circle round the waypoint, expected none in flight")
+            raise ParameterError(
+                f"route[{k}]: found a circle round the waypoint, expected none in flight"
+            )
     return [(waypoint.north, waypoint.east, waypoint.altitude) for waypoint in waypoints]
 
 

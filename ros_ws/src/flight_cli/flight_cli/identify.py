@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: an aircraft of JSBSim by step tests, with its scenario, or A and B of an airframe from a flight's log."""
+"""`rise-di identify`: an aircraft of JSBSim by step tests, with its scenario, or A and B of an
+airframe from a flight's log.
+"""
 
 import math
 import sys
@@ -32,7 +34,13 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
-from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
+from flight_analysis.report.plotting import (
+    Curve,
+    Interval,
+    PlotContext,
+    SampleStore,
+    time_series_figure,
+)
 from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
@@ -68,91 +76,138 @@ from rise_di_controller.params import ControllerConfig
 CANNOT_FLY = 3
 REFLY_MARGIN = 0.03  # s. Without A the model of the loop has no damping
 STEP_MARGIN = 0.015  # and less margin than the aircraft.
-LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
+LINEAR = (
+    0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
+)
 
 
 def identify(
     source: Annotated[
         str | None,
         typer.Argument(
-            help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a run, or an MCAP file. None with"
-            " --bridge alone."
+            help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
+            "run, or an MCAP file. None with --bridge alone."
         ),
     ] = None,
-    speed: Annotated[float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")] = None,
-    altitude: Annotated[float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")] = None,
-    airframe: Annotated[str | None, typer.Option(help="With a log: the nominal airframe, a name or a file (.yaml).")] = None,
+    speed: Annotated[
+        float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")
+    ] = None,
+    altitude: Annotated[
+        float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")
+    ] = None,
+    airframe: Annotated[
+        str | None, typer.Option(help="With a log: the nominal airframe, a name or a file (.yaml).")
+    ] = None,
     write: Annotated[
         Path | None,
         typer.Option(
-            help="Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: airframe file for the model,"
-            " with a page. With --bridge: folder for what flies it."
+            help="Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
+            "airframe file for the model, with a page. With --bridge: folder for what flies it."
         ),
     ] = None,
     scenario: Annotated[
         str | None,
         typer.Option(
-            "--set scenario", help="With a log: scenario with lags and delay of the controller; by default that in the log."
+            "--set scenario",
+            help="With a log: scenario with lags and delay of the controller; by default that "
+            "in the log.",
         ),
     ] = None,
     delay: Annotated[
         float | None,
-        typer.Option("--set delay", help="With a log: delay of u, s; by default that of the scenario. One process has none."),
+        typer.Option(
+            "--set delay",
+            help="With a log: delay of u, s; by default that of the scenario. One process has "
+            "none.",
+        ),
     ] = None,
     namespace: Annotated[
-        str | None, typer.Option("--set namespace", help="With a log: namespace of the aircraft, if it holds several.")
+        str | None,
+        typer.Option(
+            "--set namespace", help="With a log: namespace of the aircraft, if it holds several."
+        ),
     ] = None,
     refly: Annotated[
         bool,
         typer.Option(
-            "--set refly", help="With a log: fly its scenario with feedforward and observer of the model, in process."
+            "--set refly",
+            help="With a log: fly its scenario with feedforward and observer of the model, in "
+            "process.",
         ),
     ] = False,
     observer: Annotated[
-        bool, typer.Option("--observer", help="Of JSBSim: add an extended-state observer from Omega and lags.")
+        bool,
+        typer.Option(
+            "--observer", help="Of JSBSim: add an extended-state observer from Omega and lags."
+        ),
     ] = False,
     guidance: Annotated[
-        bool, typer.Option("--guidance", help="Of JSBSim: fly and write guidance by rule in place of the pulses.")
+        bool,
+        typer.Option(
+            "--guidance", help="Of JSBSim: fly and write guidance by rule in place of the pulses."
+        ),
     ] = False,
-    learn: Annotated[bool, typer.Option("--learn", help="Of JSBSim: write a scenario that learns A and B in flight.")] = False,
+    learn: Annotated[
+        bool,
+        typer.Option("--learn", help="Of JSBSim: write a scenario that learns A and B in flight."),
+    ] = False,
     margin: Annotated[
         float | None,
         typer.Option(
-            "--set margin", help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests."
+            "--set margin",
+            help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step "
+            "tests.",
         ),
     ] = None,
     bridge: Annotated[
         str | None,
-        typer.Option(metavar="MAP", help="Excite the aircraft behind a channel map, or read the log of such a flight."),
+        typer.Option(
+            metavar="MAP",
+            help="Excite the aircraft behind a channel map, or read the log of such a flight.",
+        ),
     ] = None,
     amplitude: Annotated[
         float | None,
-        typer.Option("--set amplitude", help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."),
+        typer.Option(
+            "--set amplitude",
+            help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.",
+        ),
     ] = None,
     phase_margin: Annotated[
         float | None,
-        typer.Option("--set phase_margin", help="Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."),
+        typer.Option(
+            "--set phase_margin",
+            help="Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45.",
+        ),
     ] = None,
     accept: Annotated[
-        bool, typer.Option("--set accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+        bool,
+        typer.Option(
+            "--set accept",
+            help="Accept a phase margin below 40 deg, and write gains whose margins fall short.",
+        ),
     ] = False,
     commands: Annotated[
         list[str] | None,
         typer.Option(
             "--set command",
             metavar="INPUT:PROPERTY=VALUE",
-            help="Of JSBSim: a model's own property for an input, and its value at full command; repeat for more.",
+            help="Of JSBSim: a model's own property for an input, and its value at full "
+            "command; repeat for more.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a flight.
+    """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a
+    flight.
 
-    The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A model from a log is accepted if
-    it predicts the part of the flight that it was not fitted to better than the nominal airframe. With --bridge, each input of
-    the aircraft behind a channel map is excited by itself, open loop, and --write is the folder for a scenario that flies it.
+    The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A
+    model from a log is accepted if it predicts the part of the flight that it was not fitted to
+    better than the nominal airframe. With --bridge, each input of the aircraft behind a channel map
+    is excited by itself, open loop, and --write is the folder for a scenario that flies it.
 
-    Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
+    Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not
+    fly.
     """
     needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
     log = None if source is None or source.startswith(PREFIX) else Path(source)
@@ -165,17 +220,37 @@ def identify(
             "margin": margin,
             "scenario": scenario,
         }
-        unused |= {"delay": delay, "refly": refly, "observer": observer, "guidance": guidance, "learn": learn}
-        _require_none(unused | {"namespace": namespace, "command": commands}, "none beside --bridge")
+        unused |= {
+            "delay": delay,
+            "refly": refly,
+            "observer": observer,
+            "guidance": guidance,
+            "learn": learn,
+        }
+        _require_none(
+            unused | {"namespace": namespace, "command": commands}, "none beside --bridge"
+        )
         if write is None:
-            raise ParameterError("identify: found too few arguments, expected --write beside --bridge")
+            raise ParameterError(
+                "identify: found too few arguments, expected --write beside --bridge"
+            )
         require(speed is None or 0.0 < speed < math.inf, "speed", f"{speed}", "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
         identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
         return
     require(amplitude is None, "amplitude", amplitude, "--bridge beside it")
-    require(margin is None or refly or observer or learn, "margin", margin, "--set refly, --observer or --learn beside it")
-    require(not (observer and learn), "observer", "--learn beside it", "one of the two: a learner designs its own observer")
+    require(
+        margin is None or refly or observer or learn,
+        "margin",
+        margin,
+        "--set refly, --observer or --learn beside it",
+    )
+    require(
+        not (observer and learn),
+        "observer",
+        "--learn beside it",
+        "one of the two: a learner designs its own observer",
+    )
     if log is not None:
         steps_only: dict[str, object] = {
             "speed": speed,
@@ -184,15 +259,34 @@ def identify(
             "guidance": guidance,
             "learn": learn,
         }
-        _require_none(steps_only | {"phase_margin": phase_margin, "accept": accept, "command": commands}, "none beside a log")
-        require(airframe is not None, "airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
+        _require_none(
+            steps_only | {"phase_margin": phase_margin, "accept": accept, "command": commands},
+            "none beside a log",
+        )
+        require(
+            airframe is not None,
+            "airframe",
+            "none",
+            "the nominal airframe of the log, a name or a file (.yaml)",
+        )
         nominal = load_airframe(airframe or "")
         refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None
-        _identify_log(_Source(log, scenario, delay, namespace), nominal, write, refly_margin, as_json)
+        _identify_log(
+            _Source(log, scenario, delay, namespace), nominal, write, refly_margin, as_json
+        )
     elif aircraft is None or speed is None or altitude is None:
-        raise ParameterError("identify: found too few arguments, expected a log, or an aircraft with --speed and --altitude")
+        raise ParameterError(
+            "identify: found too few arguments, expected a log, or an aircraft with --speed and "
+            "--altitude"
+        )
     else:
-        log_only = {"airframe": airframe, "scenario": scenario, "delay": delay, "namespace": namespace, "refly": refly}
+        log_only = {
+            "airframe": airframe,
+            "scenario": scenario,
+            "delay": delay,
+            "namespace": namespace,
+            "refly": refly,
+        }
         _require_none(log_only, "a log in place of the aircraft")
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
         texts: dict[str, str] = {}
@@ -228,13 +322,25 @@ def _identify_by_steps(
     needed: Requirement,
     accept: bool,
 ) -> None:
-    require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME or {PREFIX}PATH")
+    require(
+        airframe.startswith(PREFIX),
+        "airframe",
+        f"{airframe!r}",
+        f"an aircraft of JSBSim, {PREFIX}NAME or {PREFIX}PATH",
+    )
     name = require_aircraft(airframe)
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
     require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
     path = output or Path(f"jsbsim_{Path(name).stem}.yaml")
-    require(output is not None or not path.exists(), "write", f"none, and {path} exists", "a file to write over, or another")
-    require(path.suffix == ".yaml", "write", path, "a name that ends in .yaml, as scenario files do")
+    require(
+        output is not None or not path.exists(),
+        "write",
+        f"none, and {path} exists",
+        "a file to write over, or another",
+    )
+    require(
+        path.suffix == ".yaml", "write", path, "a name that ends in .yaml, as scenario files do"
+    )
     require(path.parent.is_dir(), "write", path, "a file in a folder that exists")
     console = Console(quiet=as_json)
     try:
@@ -255,7 +361,12 @@ def _identify_by_steps(
         raise typer.Exit(CANNOT_FLY) from None
     chosen = identified.selection.engineering
     lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
-    require(accept or not lacking, "identify", lacking, "the margins, or --set accept, which writes the gains all the same")
+    require(
+        accept or not lacking,
+        "identify",
+        lacking,
+        "the margins, or --set accept, which writes the gains all the same",
+    )
     write_text("write", path, identified.text)
     if as_json:
         print_json(_as_json(identified, path))
@@ -263,7 +374,10 @@ def _identify_by_steps(
         _show(console, identified)
         console.print(f"scenario: {display_path(path)}", highlight=False)
     if identified.failure:
-        print(f"error: {identified.condition.title} does not fly: {identified.failure}", file=sys.stderr)
+        print(
+            f"error: {identified.condition.title} does not fly: {identified.failure}",
+            file=sys.stderr,
+        )
         raise typer.Exit(CANNOT_FLY)
 
 
@@ -276,20 +390,36 @@ class _Source(NamedTuple):
     namespace: str | None
 
 
-def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_margin: float | None, as_json: bool) -> None:
-    """Identify a model from a log, show it and write it. Raises ParameterError for a model that is refused."""
+def _identify_log(
+    source: _Source,
+    nominal: Airframe,
+    write: Path | None,
+    refly_margin: float | None,
+    as_json: bool,
+) -> None:
+    """Identify a model from a log, show it and write it. Raises ParameterError for a model that is
+    refused.
+    """
     if write is not None:
-        require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
+        require(
+            write.suffix == ".yaml",
+            "--write",
+            write,
+            "a name that ends in .yaml, as airframe files do",
+        )
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
     recorded = read_run(source.log, source.namespace, scenario_file(source.scenario))
     recorded.require()
     warn_of_lacks(recorded)
     if recorded.scenario is None:
         raise ParameterError(
-            f"{source.log}: found a log without its scenario, expected --set scenario=NAME with the controller's lags"
+            f"{source.log}: found a log without its scenario, expected --set scenario=NAME with "
+            "the controller's lags"
         )
     controller = recorded_parameters(recorded.scenario)
-    actuation = _actuation(controller, nominal, controller.delay if source.delay is None else source.delay)
+    actuation = _actuation(
+        controller, nominal, controller.delay if source.delay is None else source.delay
+    )
     samples = recording(recorded.tape, nominal)
     console = Console(quiet=as_json)
     with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
@@ -306,18 +436,30 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         write_text("--write", write, model_yaml(identification, str(source.log)))
         page = write.with_suffix(".html")
         write_text("--write", page, page_html(_innovation_page(identification, source.log.name)))
-        console.print(f"model: {display_path(write)}, innovations: {display_path(page)}", highlight=False)
+        console.print(
+            f"model: {display_path(write)}, innovations: {display_path(page)}", highlight=False
+        )
     again = None
     if refly_margin is not None:
         with console.status("flying with the model"):
-            again = _refly(recorded_scenario(recorded.scenario), recorded.tape, identification.airframe, refly_margin)
+            again = _refly(
+                recorded_scenario(recorded.scenario),
+                recorded.tape,
+                identification.airframe,
+                refly_margin,
+            )
         _show_flights_of_model(console, again, _units(identification))
     if as_json:
-        print_json(_model_as_json(identification, write) | ({} if again is None else {"refly": again._asdict()}))
+        print_json(
+            _model_as_json(identification, write)
+            | ({} if again is None else {"refly": again._asdict()})
+        )
 
 
 class _Reflight(NamedTuple):
-    """Rms errors of a recorded flight and of the same one with feedforward and observer of a model, SI, by output."""
+    """Rms errors of a recorded flight and of the same one with feedforward and observer of a model,
+    SI, by output.
+    """
 
     origin: str  # of the observer's gains
     recorded: dict[str, float]
@@ -332,7 +474,9 @@ def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _R
     return _Reflight(origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, again.outcome)
 
 
-def _show_flights_of_model(console: Console, again: _Reflight, units: dict[str, DisplayUnit]) -> None:
+def _show_flights_of_model(
+    console: Console, again: _Reflight, units: dict[str, DisplayUnit]
+) -> None:
     headings = ["flight", *(f"{name}\n{unit.unit}" for name, unit in units.items())]
     table = new_table("\nRms of the error", headings, left_aligned=("flight",))
     for title, rms in (("recorded", again.recorded), ("with the model", again.again)):
@@ -356,13 +500,25 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
 def _show_model(console: Console, identification: Identification) -> None:
     console.print(entry_table(f"A and B of {identification.airframe.name}", identification.entries))
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
-    table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left_aligned=("output",))
+    table = new_table(
+        "\nInnovations of the held-out samples, one of three seconds",
+        headings,
+        left_aligned=("output",),
+    )
     for i, (name, unit) in enumerate(_units(identification).items()):
-        figures = [(model.rms[i] * unit.factor, model.whiteness[i]) for model in (identification.before, identification.after)]
-        table.add_row(f"{name} ({unit.unit})", *(f"{figure:.3g}" for figure in chain.from_iterable(figures)))
+        figures = [
+            (model.rms[i] * unit.factor, model.whiteness[i])
+            for model in (identification.before, identification.after)
+        ]
+        table.add_row(
+            f"{name} ({unit.unit})", *(f"{figure:.3g}" for figure in chain.from_iterable(figures))
+        )
     console.print(table)
     gain = identification.after.log_likelihood - identification.before.log_likelihood
-    console.print(f"whiteness: 1 for white noise; change of the log-likelihood of a sample: {gain:+.3g}", highlight=False)
+    console.print(
+        f"whiteness: 1 for white noise; change of the log-likelihood of a sample: {gain:+.3g}",
+        highlight=False,
+    )
 
 
 def _units(identification: Identification) -> dict[str, DisplayUnit]:
@@ -371,19 +527,39 @@ def _units(identification: Identification) -> dict[str, DisplayUnit]:
 
 
 def _innovation_page(identification: Identification, name: str) -> Page:
-    """Innovations of the nominal and of the identified model over the flight, the held-out seconds shaded."""
+    """Innovations of the nominal and of the identified model over the flight, the held-out seconds
+    shaded.
+    """
     t = identification.recorded.t - identification.recorded.t[0]
     before, after = (
         Signal(np.round(t * NANOSECONDS).astype(np.int64), identification.airframe.outputs, r)
         for r in identification.innovations
     )
-    held_out = [Interval("held out", start, stop, GUST, False) for start, stop in mask_spans(t, identification.held_out)]
+    held_out = [
+        Interval("held out", start, stop, GUST, False)
+        for start, stop in mask_spans(t, identification.held_out)
+    ]
     context = PlotContext(Tape({}), _units(identification), held_out, float(t[-1]), SampleStore())
-    figure = time_series_figure(context, {"nominal": Curve(before, ERROR), "identified": Curve(after, PLANT)})
-    section = Section("Innovations", "y less its prediction from the samples before; shaded: not in the fit", figure)
-    likelihoods = f"{identification.before.log_likelihood:.4g} nominal, {identification.after.log_likelihood:.4g} identified"
+    figure = time_series_figure(
+        context, {"nominal": Curve(before, ERROR), "identified": Curve(after, PLANT)}
+    )
+    section = Section(
+        "Innovations",
+        "y less its prediction from the samples before; shaded: not in the fit",
+        figure,
+    )
+    likelihoods = (
+        f"{identification.before.log_likelihood:.4g} nominal, "
+        f"{identification.after.log_likelihood:.4g} identified"
+    )
     line = Line(f"log-likelihood of a held-out sample: {likelihoods}")
-    return Page(f"Model of {identification.airframe.name} from {name}", [line], [], [section], context.samples)
+    return Page(
+        f"Model of {identification.airframe.name} from {name}",
+        [line],
+        [],
+        [section],
+        context.samples,
+    )
 
 
 def _model_as_json(identification: Identification, path: Path | None) -> dict[str, Any]:
@@ -397,7 +573,10 @@ def _model_as_json(identification: Identification, path: Path | None) -> dict[st
                 "whiteness": dict(zip(outputs, innovations.whiteness.tolist(), strict=True)),
                 "log_likelihood": innovations.log_likelihood,
             }
-            for model, innovations in (("nominal", identification.before), ("identified", identification.after))
+            for model, innovations in (
+                ("nominal", identification.before),
+                ("identified", identification.after),
+            )
         },
         "model": None if path is None else str(path),
     }
@@ -409,7 +588,8 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     console.print(
-        f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude {states['altitude']:.5g} m, "
+        f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude "
+        f"{states['altitude']:.5g} m, "
         + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
@@ -417,14 +597,25 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
         soft_wrap=True,
     )
     stops = new_table(
-        "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up"), left_aligned=("input",)
+        "\nCommands: trim, and range down and up from trim",
+        ("input", "trim", "down", "up"),
+        left_aligned=("input",),
     )
     columns = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
-    responses = new_table("\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns, left_aligned=("input",))
+    responses = new_table(
+        "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2",
+        columns,
+        left_aligned=("input",),
+    )
     for j, name in enumerate(INPUTS):
-        stops.add_row(name, *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])))
+        stops.add_row(
+            name,
+            *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])),
+        )
         column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
-        responses.add_row(name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{identified.D[j]:+d}")
+        responses.add_row(
+            name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{identified.D[j]:+d}"
+        )
     console.print(stops)
     console.print(responses)
     for name, spread in zip(INPUTS, steps.spread, strict=True):
@@ -438,24 +629,38 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
     controller = answer.controller
     params = answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
-    table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings, left_aligned=("channel",))
+    table = new_table(
+        "\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2",
+        headings,
+        left_aligned=("channel",),
+    )
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
-        response = abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)]) * params.input_scale[i]
+        response = (
+            abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)])
+            * params.input_scale[i]
+        )
         figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
         table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
     console.print(table)
-    margin = "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
+    margin = (
+        "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
+    )
     if answer.delay_margin:
         margin += f", {speed_of_margin(identified.selection.study, answer)}"
     if identified.sideslip_zero > 0.0:
         console.print(
             f"with p and r constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s:"
-            " a zero in the right half plane, outside the theorem; the sideslip feedback of --guidance flies it",
+            " a zero in the right half plane, outside the theorem; the sideslip feedback of "
+            "--guidance flies it",
             highlight=False,
             soft_wrap=True,
         )
     sign = controller.sampled_sign()[0].name.lower()
-    console.print(f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}", highlight=False, soft_wrap=True)
+    console.print(
+        f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}",
+        highlight=False,
+        soft_wrap=True,
+    )
     _show_flights(console, identified)
 
 
@@ -468,9 +673,13 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
         ("flight", "outcome"),
         ("outcome",),
     )
-    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left_aligned=("flight",))
+    largest = new_table(
+        "\nLargest deviation of a command from trim", ["flight", *INPUTS], left_aligned=("flight",)
+    )
     for title, flight in identified.flights.items():
-        errors = [f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
+        errors = [
+            f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()
+        ]
         flights.add_row(title, *errors, flight.text)
         largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
     console.print(flights)

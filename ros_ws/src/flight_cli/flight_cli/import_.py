@@ -25,24 +25,53 @@ from flight_log.vehicle_log import Choice, read_foreign_log
 
 
 def import_(
-    log: Annotated[Path, typer.Argument(help="DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.")],
-    map_name: Annotated[str, typer.Option("--map", metavar="MAP", help="Channel map: its channels of y and u, trims, scales.")],
-    output: Annotated[Path | None, typer.Option(help="Folder to create; by default runs/ with the name of the log.")] = None,
-    start: Annotated[float | None, typer.Option("--from", help="Begin, s since the begin of the log.")] = None,
-    stop: Annotated[float | None, typer.Option("--until", help="End, s since the begin of the log.")] = None,
+    log: Annotated[
+        Path,
+        typer.Argument(
+            help="DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4."
+        ),
+    ],
+    map_name: Annotated[
+        str,
+        typer.Option(
+            "--map", metavar="MAP", help="Channel map: its channels of y and u, trims, scales."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Folder to create; by default runs/ with the name of the log."),
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option("--from", help="Begin, s since the begin of the log.")
+    ] = None,
+    stop: Annotated[
+        float | None, typer.Option("--until", help="End, s since the begin of the log.")
+    ] = None,
     servos: Annotated[
-        bool, typer.Option("--servos", help="u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.")
+        bool,
+        typer.Option(
+            "--servos",
+            help="u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
+        ),
     ] = False,
-    system: Annotated[int | None, typer.Option(help="MAVLink system of a tlog of several; without, the one that flew.")] = None,
+    system: Annotated[
+        int | None,
+        typer.Option(help="MAVLink system of a tlog of several; without, the one that flew."),
+    ] = None,
     instances: Annotated[
         list[str] | None,
-        typer.Option("--instance", metavar="MESSAGE=NUMBER", help="Sensor or instance of several, as IMU=1; repeat for more."),
+        typer.Option(
+            "--instance",
+            metavar="MESSAGE=NUMBER",
+            help="Sensor or instance of several, as IMU=1; repeat for more.",
+        ),
     ] = None,
 ) -> None:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
-    By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`, `identify --bridge`,
-    `report` and `watch` read the bag. u is the deviation from the median of the stretch, `commands` is the whole.
+    By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`,
+    `identify --bridge`, `report` and `watch` read the bag. u is the deviation from the median of
+    the stretch, `commands` is the whole.
 
     Exit status: 0, or 2 bad input.
     """
@@ -55,10 +84,17 @@ def import_(
         headings = ("", "what the log says", "what the map says")
         table = new_table("", headings, headings, headings)
         for row in rows:
-            table.add_row(row.what, row.logged or "not recorded", row.mapped, style="bold red" if row.differs else None)
+            table.add_row(
+                row.what,
+                row.logged or "not recorded",
+                row.mapped,
+                style="bold red" if row.differs else None,
+            )
         console.print(table)
 
-    read = read_foreign_log(log, Choice(system, _numbers(instances or []), kind_of_map(channel_map)))
+    read = read_foreign_log(
+        log, Choice(system, _numbers(instances or []), kind_of_map(channel_map))
+    )
     tape, parameters, notes = imported(channel_map, read, Window(start, stop), show, servos=servos)
     folder = output or Path("runs") / log.stem
     require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
@@ -66,24 +102,43 @@ def import_(
         folder.mkdir(parents=True)
         write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
         records = {
-            IMPORTED: {"log": log.name, "kind": read.kind, "map": channel_map.name, COMPARED: "; ".join(notes)},
-            CHANNEL_UNITS: {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()},
+            IMPORTED: {
+                "log": log.name,
+                "kind": read.kind,
+                "map": channel_map.name,
+                COMPARED: "; ".join(notes),
+            },
+            CHANNEL_UNITS: {
+                name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()
+            },
         }
         write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
-    bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE))
+    bag = write_run(
+        tape,
+        folder,
+        LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE),
+    )
     for sentence in notes:
         print(f"warning: {sentence}", file=sys.stderr)
-    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left_aligned=("topic",))
+    table = new_table(
+        f"{log.name}, {read.kind}",
+        ("topic", "samples", "Hz", "longest gap, s"),
+        left_aligned=("topic",),
+    )
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS
         rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
         longest = float(gaps.max()) if len(gaps) else 0.0
         table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
     console.print(table)
-    begin = (tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])) / NANOSECONDS
+    begin = (
+        tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
+    ) / NANOSECONDS
     length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
     console.print(
-        f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}", highlight=False, soft_wrap=True
+        f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",
+        highlight=False,
+        soft_wrap=True,
     )
 
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di layouts`: layouts of Foxglove, PlotJuggler and RViz for the runs of a scenario or of a fleet."""
+"""`rise-di layouts`: layouts of Foxglove, PlotJuggler and RViz for the runs of a scenario or of a
+fleet.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,11 +17,16 @@ from flight_core.files import write_file, writing
 
 def layouts(
     scenario: Annotated[
-        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.")
+        str,
+        typer.Argument(
+            help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
+        ),
     ] = "osprey_servo",
     folder: Annotated[Path, typer.Option(help="Folder to write the files to.")] = Path(),
 ) -> None:
-    """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz with guidance."""
+    """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz
+    with guidance.
+    """
     if is_fleet(scenario):
         name = Path(scenario).stem
         scenarios = {member.name: member.scenario for member in read_fleet(scenario).members}
@@ -28,9 +35,17 @@ def layouts(
         name = chosen.name
         scenarios = {"": chosen}
     aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
-    files = {f"{name}.foxglove.json": foxglove(aircraft), f"{name}.plotjuggler.xml": plotjuggler(aircraft)}
-    if guided := [namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None]:
-        files |= {f"{name}.rviz": rviz(guided, (folder / "aircraft.urdf").absolute()), "aircraft.urdf": urdf()}
+    files = {
+        f"{name}.foxglove.json": foxglove(aircraft),
+        f"{name}.plotjuggler.xml": plotjuggler(aircraft),
+    }
+    if guided := [
+        namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None
+    ]:
+        files |= {
+            f"{name}.rviz": rviz(guided, (folder / "aircraft.urdf").absolute()),
+            "aircraft.urdf": urdf(),
+        }
     for file, text in files.items():
         with writing("folder", folder, "a folder that can"):
             folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di learn`: repeat the learner on the log of a flight, with other settings, and write the model."""
+"""`rise-di learn`: repeat the learner on the log of a flight, with other settings, and write the
+model.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +14,14 @@ from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
-from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, print_json, write_text
+from flight_cli.output import (
+    LATEST,
+    entries_as_json,
+    entry_table,
+    model_table,
+    print_json,
+    write_text,
+)
 from flight_cli.settings import Settings, with_settings
 from flight_cli.words import AsJson
 from flight_core.files import display_path
@@ -27,19 +36,27 @@ NOTHING_LEARNED = 1
 def learn(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
     settings: Settings = None,
-    write: Annotated[Path | None, typer.Option(help="File for the learned model, an airframe file.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="File for the learned model, an airframe file.")
+    ] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set controller.learn.*, others.
+    """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set
+    controller.learn.*, others.
 
-    y and u are those of the log: a flight without a learner can be learned from too, if its controller has an observer. With
-    --write the model becomes an airframe file, from which `controller.learn.prior` starts the next flight. Exit status: 0 a
-    model, 1 none, 2 bad input.
+    y and u are those of the log: a flight without a learner can be learned from too, if its
+    controller has an observer. With --write the model becomes an airframe file, from which
+    `controller.learn.prior` starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
     """
     if write is not None:
-        require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
+        require(
+            write.suffix == ".yaml",
+            "--write",
+            write,
+            "a name that ends in .yaml, as airframe files do",
+        )
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
     recorded = read_run(run, namespace, scenario_file(scenario))
     recorded.require()
@@ -62,9 +79,18 @@ def learn(
         console.print(model_table(models, display_units(flown)))
     if result.model is not None and write is not None:
         write_text("--write", write, learned_yaml(result, str(run)))
-        console.print(f"model: {display_path(write)}", highlight=False, markup=False, soft_wrap=True)
+        console.print(
+            f"model: {display_path(write)}", highlight=False, markup=False, soft_wrap=True
+        )
     if as_json:
         steps = [step._asdict() for step in result.steps]
         path = None if result.model is None or write is None else str(write)
-        print_json({"steps": steps, "entries": entries_as_json(result.entries), "models": models, "model": path})
+        print_json(
+            {
+                "steps": steps,
+                "entries": entries_as_json(result.entries),
+                "models": models,
+                "model": path,
+            }
+        )
     raise typer.Exit(NOTHING_LEARNED if result.model is None else 0)

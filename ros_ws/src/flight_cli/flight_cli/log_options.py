@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands that read a log share: the scenario of a log without a scenario, the aircraft of several, what it lacks."""
+"""What the commands that read a log share: the scenario of a log without a scenario, the aircraft
+of several, what it lacks.
+"""
 
 import sys
 from contextlib import suppress
@@ -15,14 +17,24 @@ from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
 
-LogNamespace = Annotated[str | None, typer.Option("--namespace", help="Namespace of the aircraft, if the log holds several.")]
+LogNamespace = Annotated[
+    str | None,
+    typer.Option("--namespace", help="Namespace of the aircraft, if the log holds several."),
+]
 LogScenario = Annotated[
-    str | None, typer.Option("--scenario", help="Scenario of the flight, a name or a file; by default that in the log.")
+    str | None,
+    typer.Option(
+        "--scenario", help="Scenario of the flight, a name or a file; by default that in the log."
+    ),
 ]
 
 LogRemaps = Annotated[
     list[str] | None,
-    typer.Option("--remap", metavar="NAME:=TOPIC", help="A topic of remapped nodes, as in y:=/sensors/y; may be repeated."),
+    typer.Option(
+        "--remap",
+        metavar="NAME:=TOPIC",
+        help="A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
+    ),
 ]
 
 
@@ -30,20 +42,33 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
     """Topics of a log by names of the stack. Raises ParameterError."""
     remaps = [word.partition(":=") for word in words or ()]
     for name, _, topic in remaps:
-        require(bool(name) and topic.startswith("/"), "--remap", f"{name}:={topic}", "NAME:=/TOPIC, as in y:=/sensors/y")
+        require(
+            bool(name) and topic.startswith("/"),
+            "--remap",
+            f"{name}:={topic}",
+            "NAME:=/TOPIC, as in y:=/sensors/y",
+        )
     return {name: topic for name, _, topic in remaps}
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """The file of a scenario by name or path; None without a name. Raises ParameterError for an invalid scenario."""
+    """The file of a scenario by name or path; None without a name. Raises ParameterError for an
+    invalid scenario.
+    """
     return None if name is None else find_scenario(name).path
 
 
 def warn_of_lacks(recorded: RecordedRun) -> None:
-    """Print what a log lacks, a warning each on standard error, so that no result stands for more than was recorded."""
+    """Print what a log lacks, a warning each on standard error, so that no result stands for more
+    than was recorded.
+    """
     account = log_account(recorded)
     imported = recorded.metadata.get(IMPORTED, {}).get(COMPARED, "")
-    for sentence in (*recorded.tape.notes, *(() if account is None else account.notes()), *filter(None, [imported])):
+    for sentence in (
+        *recorded.tape.notes,
+        *(() if account is None else account.notes()),
+        *filter(None, [imported]),
+    ):
         print(f"warning: {sentence}", file=sys.stderr)
 
 

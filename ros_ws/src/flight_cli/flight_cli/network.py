@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di network`: the profile of the middleware for nodes on several hosts, and a check of the network between the hosts."""
+"""`rise-di network`: the profile of the middleware for nodes on several hosts, and a check of the
+network between the hosts.
+"""
 
 import os
 from pathlib import Path
@@ -16,25 +18,42 @@ FAILED = 1
 
 def network(
     peers: Annotated[
-        str, typer.Option(metavar="A,B", help="IPv4 addresses of all hosts, this one's among them; the same on each host.")
+        str,
+        typer.Option(
+            metavar="A,B",
+            help="IPv4 addresses of all hosts, this one's among them; the same on each host.",
+        ),
     ],
-    write: Annotated[Path, typer.Option(metavar="FILE", help="File to write the profile to.")] = Path("network.xml"),
+    write: Annotated[
+        Path, typer.Option(metavar="FILE", help="File to write the profile to.")
+    ] = Path("network.xml"),
     check: Annotated[
         bool,
-        typer.Option("--check", help="Then wait for the same command on the other hosts: who receives whom, delays, clocks."),
+        typer.Option(
+            "--check",
+            help="Then wait for the same command on the other hosts: who receives whom, delays, "
+            "clocks.",
+        ),
     ] = False,
-    timeout: Annotated[float, typer.Option(min=1.0, max=3600.0, help="How long to wait for the other hosts, s.")] = 20.0,
+    timeout: Annotated[
+        float, typer.Option(min=1.0, max=3600.0, help="How long to wait for the other hosts, s.")
+    ] = 20.0,
 ) -> None:
-    """Write the profile of the middleware for nodes on several hosts: unicast between their addresses, without multicast.
+    """Write the profile of the middleware for nodes on several hosts: unicast between their
+    addresses, without multicast.
 
-    Exit status: 0 written, and with --check every host receives and is received; 1 a host does not; 2 bad input.
+    Exit status: 0 written, and with --check every host receives and is received; 1 a host does not;
+    2 bad input.
     """
     require_package("rclpy", "")
     require_ros_environment()
     from flight_bringup.client import NetworkClient, domain_ports, write_profile  # noqa: PLC0415 - loads rclpy
 
     own_host, hosts, environment = write_profile(peers, write)
-    print(f"{write}: this host is {own_host}. In each shell that starts a node, a flight or a tool here:")
+    print(
+        f"{write}: this host is {own_host}. In each shell that starts a node, a flight or a "
+        "tool here:"
+    )
     print(f"  export {' '.join(f'{name}={value}' for name, value in environment.items())}")
     if not check:
         return
@@ -47,10 +66,19 @@ def network(
     for address in others:
         if address in clocks:
             clock = clocks[address]
-            print(f"{address}: received, receives this host; delay {1e3 * clock.delay:.1f} ms, its clock is {clock}")
+            print(
+                f"{address}: received, receives this host; delay {1e3 * clock.delay:.1f} ms, "
+                f"its clock is {clock}"
+            )
         elif address in received:
-            print(f"{address}: received, does not receive this host: open UDP ports {first} to {last} there")
+            print(
+                f"{address}: received, does not receive this host: open UDP ports {first} to "
+                f"{last} there"
+            )
         else:
-            print(f"{address}: not received: start the command there; check the address, and UDP ports {first} to {last} here")
+            print(
+                f"{address}: not received: start the command there; check the address, and UDP "
+                f"ports {first} to {last} here"
+            )
     if len(clocks) < len(others):
         raise typer.Exit(FAILED)

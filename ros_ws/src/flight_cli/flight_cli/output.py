@@ -11,7 +11,14 @@ from typing import Any, Literal
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from flight_analysis.closed_loop.learning_loop import Entry
@@ -40,7 +47,10 @@ from flight_core.files import write_file, writing
 # exit statuses; bad input is 2 (`flight_cli.cli`)
 ENDED_EARLY = 3
 INTERRUPTED = 130
-LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"  # of a written file
+# of a written file
+LICENCE = (
+    "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
+)
 LATEST = Path("runs/latest")  # the run of a command that is given none
 
 
@@ -53,23 +63,37 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         return
     if busy := (summary["account"] or {}).get("busy"):
         console.print(busy, style="bold", highlight=False, soft_wrap=True)
-    title = f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
+    title = (
+        f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} "
+        f"flown{taken_over(summary, 'errors')}"
+    )
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
-    console.print(grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)))
+    console.print(
+        grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units))
+    )
     if rows := input_rows(summary, units):
         title = f"Inputs about trim, and mean abs(u_dot) per second{taken_over(summary, 'inputs')}"
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         console.print(grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
-        console.print(_guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")))
+        console.print(
+            _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance"))
+        )
         if legs := leg_results(summary["guidance"]["legs"]):
             console.print(legs, highlight=False, soft_wrap=True)
     if summary["models"]:
         console.print(model_table(summary["models"], units))
     if commands := command_results(summary):
         console.print(commands, highlight=False, soft_wrap=True)
-    console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
-    for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"] if note != busy)):
+    console.print(
+        f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error",
+        style="dim",
+        highlight=False,
+    )
+    for line in (
+        *_timing(summary),
+        *(f"note: {note}" for note in summary["notes"] if note != busy),
+    ):
         console.print(line, highlight=False)
 
 
@@ -79,7 +103,11 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
         caption = f"{title} about trim, {format_seconds(summary['duration'])}"
-        console.print(grouped_table(caption, "channel", columns, table_rows(summary[key], columns, flight.units)))
+        console.print(
+            grouped_table(
+                caption, "channel", columns, table_rows(summary[key], columns, flight.units)
+            )
+        )
     for note in summary["notes"]:
         console.print(f"note: {note}", highlight=False)
 
@@ -87,7 +115,9 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
 def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
     """What guidance held in each segment: rms and largest error."""
     headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
-    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings, left_aligned=("segment",))
+    table = new_table(
+        f"Guidance by segment, in m, m/s and deg{part}", headings, left_aligned=("segment",)
+    )
     for segment in segments:
         held = segment["lateral"], segment["vertical"]
         names = ", ".join(each["quantity"] for each in held)
@@ -96,7 +126,9 @@ def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
             factor = QUANTITY_UNITS[each["quantity"]].factor
             errors += [format_value(each["rms"], factor), format_value(each["max"], factor)]
         leg = "" if segment["leg"] is None else f"leg {segment['leg']}: "
-        table.add_row(leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"]))
+        table.add_row(
+            leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"])
+        )
     return table
 
 
@@ -104,7 +136,9 @@ def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, Display
     """The rms of the error before the first learned model and under each."""
     headings, rows = model_rows(models, units)
     table = new_table(
-        "Rms of the error by model", ["", *(heading.replace(" ", "\n") for heading in headings)], left_aligned=("",)
+        "Rms of the error by model",
+        ["", *(heading.replace(" ", "\n") for heading in headings)],
+        left_aligned=("",),
     )
     for row in rows:
         table.add_row(*row)
@@ -114,7 +148,9 @@ def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, Display
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
     """Entries of A and B, nominal and identified, with the standard deviation of the change."""
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
-    table = new_table(f"{title}, SI; deviation: of the change, standard", headings, left_aligned=("entry",))
+    table = new_table(
+        f"{title}, SI; deviation: of the change, standard", headings, left_aligned=("entry",)
+    )
     for entry in entries:
         values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
         if entry.nominal:
@@ -126,7 +162,9 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
 
 
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
-    """Entries of A and B by name, nominal and identified in SI; change and its deviation in units, that of an entry in SI."""
+    """Entries of A and B by name, nominal and identified in SI; change and its deviation in units,
+    that of an entry in SI.
+    """
     return {
         entry.name: {
             "nominal": entry.nominal,
@@ -139,8 +177,15 @@ def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
     }
 
 
-def new_table(title: str, headings: Iterable[str], left_aligned: Container[str] = (), wrapped: Container[str] = ()) -> Table:
-    """An empty table: columns outside `left_aligned` are aligned right, columns outside `wrapped` keep to one line."""
+def new_table(
+    title: str,
+    headings: Iterable[str],
+    left_aligned: Container[str] = (),
+    wrapped: Container[str] = (),
+) -> Table:
+    """An empty table: columns outside `left_aligned` are aligned right, columns outside `wrapped`
+    keep to one line.
+    """
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in headings:
         justify: Literal["left", "right"] = "left" if heading in left_aligned else "right"
@@ -166,18 +211,27 @@ def clock(t: float, duration: float) -> str:
 
 
 @contextmanager
-def flight_progress(duration: float, *, quiet: bool) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
-    """The progress bar of a flight, s: a function for the flight time and the text beside it, and one for a line above."""
+def flight_progress(
+    duration: float, *, quiet: bool
+) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
+    """The progress bar of a flight, s: a function for the flight time and the text beside it, and
+    one for a line above.
+    """
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")
 
         def progress(t: float, shown: str) -> None:
             bar.update(task, completed=t, clock=clock(t, duration), shown=shown)
 
-        yield progress, lambda line: bar.console.print(line, highlight=False, soft_wrap=True, markup=False)
+        yield (
+            progress,
+            lambda line: bar.console.print(line, highlight=False, soft_wrap=True, markup=False),
+        )
 
 
-def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
+def grouped_table(
+    title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]
+) -> Table:
     """A table whose adjacent columns of one group share a heading."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
     table.add_column(f"\n{first}", no_wrap=True)
@@ -195,13 +249,17 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
     if (ticks := summary["ticks"]) is not None:
         ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
         lines.append(
-            f"ticks{taken_over(summary, 'ticks')}: {ticks['ticks']}, {ticks['without_new_y']} without a new y;"
+            f"ticks{taken_over(summary, 'ticks')}: {ticks['ticks']}, {ticks['without_new_y']} "
+            "without a new y;"
             f" period mean {ms['period_mean']} ms, p99 {ms['period_p99']}, max {ms['period_max']};"
             f" late p99 {ms['late_p99']} ms, max {ms['late_max']}"
         )
     if (latency := summary["latency"]) is not None:
         median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
-        lines.append(f"y sent to u sent{taken_over(summary, 'latency')}: median {median} ms, p99 {p99}, max {largest}")
+        lines.append(
+            f"y sent to u sent{taken_over(summary, 'latency')}: median {median} ms, p99 {p99}, "
+            f"max {largest}"
+        )
     if (age := summary["age_of_u"]) is not None:
         lines.append(
             f"age of u at the aircraft{taken_over(summary, 'age_of_u')}:"

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di play`: publish the topics of a recorded flight again with their timing, for a node under test."""
+"""`rise-di play`: publish the topics of a recorded flight again with their timing, for a node under
+test.
+"""
 
 import math
 import sys
@@ -28,20 +30,27 @@ class Stamps(StrEnum):
 
 def play(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")],
-    topics: Annotated[str, typer.Option(help="Topics, as in y,y_m; by default all but those of every node.")] = "",
+    topics: Annotated[
+        str, typer.Option(help="Topics, as in y,y_m; by default all but those of every node.")
+    ] = "",
     rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Factor to real time.")] = 1.0,
     start: Annotated[float, typer.Option(min=0.0, help="Flight time to start at, s.")] = 0.0,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
     stamps: Annotated[
-        Stamps, typer.Option(help="now: moved to the present, as a controller in real time needs them; recorded: unchanged.")
+        Stamps,
+        typer.Option(
+            help="now: moved to the present, as a controller in real time needs them; recorded: "
+            "unchanged."
+        ),
     ] = Stamps.NOW,
     namespace: LogNamespace = None,
 ) -> None:
-    """Publish the topics of a recorded flight again with their timing, and /clock with the time of the log.
+    """Publish the topics of a recorded flight again with their timing, and /clock with the time of
+    the log.
 
-    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log is refused. A warning names
-    the skipped topics: without CDR, or of a message type that is not installed.
-    Exit status: 0 played to the end, 2 bad input, 130 interrupted.
+    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log
+    is refused. A warning names the skipped topics: without CDR, or of a message type that is not
+    installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
     for option, value in (("--rate", rate), ("--start", start)):
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
@@ -54,19 +63,29 @@ def play(
     end = playback.t(playback.messages[-1].due_ns)
     skipped = {**playback.skipped, **({} if names else unsendable(playback.types))}
     types = {topic: name for topic, name in playback.types.items() if topic not in skipped}
-    require(bool(types), str(run), f"no topic to play among {listed(skipped)}", "a topic whose message type is installed")
+    require(
+        bool(types),
+        str(run),
+        f"no topic to play among {listed(skipped)}",
+        "a topic whose message type is installed",
+    )
     if skipped:
         print(
-            f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type that is not installed",
+            f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type "
+            "that is not installed",
             file=sys.stderr,
         )
     messages = [message for message in playback.messages if message.topic in types]
     with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
-        task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(types)}, stamps {stamps}")
+        task = bar.add_task(
+            "play", total=end - start, clock="", shown=f"{', '.join(types)}, stamps {stamps}"
+        )
 
         def progress(due_ns: int) -> None:
             t = playback.t(due_ns)
-            bar.update(task, completed=t - start, clock=f"t = {t:5.1f} of {end:.1f} s, {rate:g} times")
+            bar.update(
+                task, completed=t - start, clock=f"t = {t:5.1f} of {end:.1f} s, {rate:g} times"
+            )
 
         while True:
             sender.play(messages, rate, stamps_now=stamps is Stamps.NOW, progress=progress)

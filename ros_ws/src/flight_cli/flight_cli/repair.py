@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The repair of `rise-di report`: rebuild a log whose recorder was killed, so that every rosbag2 reader accepts it."""
+"""The repair of `rise-di report`: rebuild a log whose recorder was killed, so that every rosbag2
+reader accepts it.
+"""
 
 from pathlib import Path
 
@@ -15,12 +17,17 @@ from flight_log.tape_reader import read_run
 
 
 def repair_log(run: Path) -> None:
-    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays as it is."""
+    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays
+    as it is.
+    """
     repaired = repair_bag(run)
     for file in repaired.files:
         if file.damaged is not None:
             damaged = f"the damaged file is {printable(file.damaged.name)}"
-            print(f"{printable(file.path.name)} had {file.faults}: {file.messages} messages kept; {damaged}")
+            print(
+                f"{printable(file.path.name)} had {file.faults}: {file.messages} messages kept; "
+                f"{damaged}"
+            )
     if repaired.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
     elif not any(file.damaged for file in repaired.files) and not repaired.missing:
@@ -31,7 +38,9 @@ def repair_log(run: Path) -> None:
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:
-    """Time missing at the end of the log: by what the files say of their end, else by the duration of the scenario."""
+    """Time missing at the end of the log: by what the files say of their end, else by the duration
+    of the scenario.
+    """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"
     if not last.faults:
@@ -42,5 +51,7 @@ def _missing_at_end(run: Path, last: FileRepair) -> str:
         return "it is unknown how much is missing at its end"
     end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
     if recorded.tape.duration is not None:
-        return f"the log ends at t = {end:.3f} s of the {recorded.tape.duration:g} s of the scenario"
+        return (
+            f"the log ends at t = {end:.3f} s of the {recorded.tape.duration:g} s of the scenario"
+        )
     return f"the log ends at t = {end:.3f} s; it is unknown how much is missing"

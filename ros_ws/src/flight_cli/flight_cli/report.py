@@ -23,48 +23,77 @@ from flight_core.outcome import STATUS_INCOMPLETE
 
 def report(
     runs: Annotated[
-        list[Path] | None, typer.Argument(help="Folder of a run, by default runs/latest; several are compared with the first.")
+        list[Path] | None,
+        typer.Argument(
+            help="Folder of a run, by default runs/latest; several are compared with the first."
+        ),
     ] = None,
     html: Annotated[
-        Path | None, typer.Option("--set html", help="Page of a comparison; by default comparison.html beside run 1.")
+        Path | None,
+        typer.Option(
+            "--set html", help="Page of a comparison; by default comparison.html beside run 1."
+        ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--set output", help="Folder for the report of one run, by default that of its log: for archives."),
+        typer.Option(
+            "--set output",
+            help="Folder for the report of one run, by default that of its log: for archives.",
+        ),
     ] = None,
-    png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")
+    ] = None,
     csv: Annotated[
-        Path | None, typer.Option(help="Write all signals as CSV, one row an instant, one column a channel.")
+        Path | None,
+        typer.Option(help="Write all signals as CSV, one row an instant, one column a channel."),
     ] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
     repair: Annotated[
         bool,
-        typer.Option("--repair", help="Rebuild each log whose recorder was killed, or that is damaged, and write no report."),
+        typer.Option(
+            "--repair",
+            help="Rebuild each log whose recorder was killed, or that is damaged, and write no "
+            "report.",
+        ),
     ] = False,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
+        Path | None,
+        typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png."),
     ] = None,
-    width: Annotated[str, typer.Option("--set width", help="Width of the figure: 88mm, 3.5in.")] = WIDTH,
+    width: Annotated[
+        str, typer.Option("--set width", help="Width of the figure: 88mm, 3.5in.")
+    ] = WIDTH,
     channels: Annotated[
         str,
         typer.Option(
             "--set channels",
-            help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by default each output.",
+            help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
+            "default each output.",
         ),
     ] = "",
-    mat: Annotated[Path | None, typer.Option("--set mat", help="Write all signals as a MAT-file, a structure a topic.")] = None,
-    tables: Annotated[Path | None, typer.Option("--set tables", help="Folder for a CSV a topic.")] = None,
-    latex: Annotated[Path | None, typer.Option("--set latex", help="Write the tables of errors and inputs as LaTeX.")] = None,
+    mat: Annotated[
+        Path | None,
+        typer.Option("--set mat", help="Write all signals as a MAT-file, a structure a topic."),
+    ] = None,
+    tables: Annotated[
+        Path | None, typer.Option("--set tables", help="Folder for a CSV a topic.")
+    ] = None,
+    latex: Annotated[
+        Path | None,
+        typer.Option("--set latex", help="Write the tables of errors and inputs as LaTeX."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the report page of a recorded run again, or one that compares several, and print its tables.
+    """Write the report page of a recorded run again, or one that compares several, and print its
+    tables.
 
-    A log of --repair holds every message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged
-    file stays as *.damaged, an intact log as it is, and metadata.yaml of another program is never replaced.
-    Exit status: 0, 2 bad input, 4 a log is incomplete.
+    A log of --repair holds every message that could be read, an index and, in the folder of a run,
+    metadata.yaml. The damaged file stays as *.damaged, an intact log as it is, and metadata.yaml of
+    another program is never replaced. Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
     if repair:
         for run in runs or [LATEST]:
@@ -104,13 +133,25 @@ def report(
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
     """Print the errors of several flights with their ratios to the first."""
-    for k, (label, flight) in enumerate(zip(comparison.labels(flights), flights, strict=True), start=1):
+    for k, (label, flight) in enumerate(
+        zip(comparison.labels(flights), flights, strict=True), start=1
+    ):
         console.print(f"{k}: {label}, {flight.summary['outcome']}", highlight=False, soft_wrap=True)
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
-    table = new_table("Tracking error, and its ratio to the first", headings, left_aligned=("channel", ""))
+    table = new_table(
+        "Tracking error, and its ratio to the first", headings, left_aligned=("channel", "")
+    )
     for channel in comparison.metric_tables(flights, "errors", ERROR_COLUMNS, lower_is_better=True):
         for k, row in enumerate(channel.rows):
-            ratios = ("" if j == 0 or ratio is None else f" x{ratio:.3g}" for j, ratio in enumerate(row.ratios))
+            ratios = (
+                "" if j == 0 or ratio is None else f" x{ratio:.3g}"
+                for j, ratio in enumerate(row.ratios)
+            )
             cells = (f"{text}{ratio}" for text, ratio in zip(row.texts, ratios, strict=True))
-            table.add_row(channel.caption if k == 0 else "", row.name, *cells, end_section=k == len(channel.rows) - 1)
+            table.add_row(
+                channel.caption if k == 0 else "",
+                row.name,
+                *cells,
+                end_section=k == len(channel.rows) - 1,
+            )
     console.print(table)

@@ -15,7 +15,10 @@ from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
 Altitude = Annotated[
     float | None,
-    typer.Option("--set route.altitude", help="Altitude of a route without, or of the ground or home that it counts from, m."),
+    typer.Option(
+        "--set route.altitude",
+        help="Altitude of a route without, or of the ground or home that it counts from, m.",
+    ),
 ]
 OriginOfRoute = Annotated[
     str | None,
@@ -28,22 +31,38 @@ OriginOfRoute = Annotated[
 Simplify = Annotated[
     float,
     typer.Option(
-        "--set route.simplify", min=0.0, help="Leave out positions of a route within this distance of the line without them, m."
+        "--set route.simplify",
+        min=0.0,
+        help="Leave out positions of a route within this distance of the line without them, m.",
     ),
 ]
 Line = Annotated[
     str | None,
-    typer.Option("--set route.line", metavar="LINE", help="Which line of a file with several: a number from 1 on, or a name."),
+    typer.Option(
+        "--set route.line",
+        metavar="LINE",
+        help="Which line of a file with several: a number from 1 on, or a name.",
+    ),
 ]
 
 
 def read_waypoints(
-    file: Path, origin: str | None, altitude: float | None, simplify: float, line: str | None, *, above_sea: bool | None
+    file: Path,
+    origin: str | None,
+    altitude: float | None,
+    simplify: float,
+    line: str | None,
+    *,
+    above_sea: bool | None,
 ) -> tuple[Waypoint, ...]:
-    """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as `read_route_file`."""
+    """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as
+    `read_route_file`.
+    """
     require(altitude is None or math.isfinite(altitude), "route.altitude", altitude, "a number")
     require(math.isfinite(simplify), "route.simplify", simplify, "a number")
-    route = read_route_file(file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line)
+    route = read_route_file(
+        file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line
+    )
     for note in route.notes:
         print(f"note: {note}", file=sys.stderr)
     return route.waypoints
@@ -59,5 +78,7 @@ def parse_origin(text: str | None) -> Origin | None:
         return None
     numbers = parse_numbers(text)
     fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
-    require(fits, "route.origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
+    require(
+        fits, "route.origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54"
+    )
     return Origin(*numbers)

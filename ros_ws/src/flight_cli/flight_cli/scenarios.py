@@ -15,7 +15,10 @@ from flight_cli.words import AsJson
 def scenarios(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[SCENARIO]...", help="Names, or scenario files (.yaml); by default all that ship."),
+        typer.Argument(
+            metavar="[SCENARIO]...",
+            help="Names, or scenario files (.yaml); by default all that ship.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -26,7 +29,10 @@ def scenarios(
     rows = []
     for name in names or sorted(path.stem for path in LIBRARY.glob("*.yaml")):
         scenario = find_scenario(name)
-        comment = (line.removeprefix("#").strip() for line in scenario.path.read_text(encoding="utf-8").splitlines())
+        comment = (
+            line.removeprefix("#").strip()
+            for line in scenario.path.read_text(encoding="utf-8").splitlines()
+        )
         sentence = next((line for line in comment if line and not line.startswith("SPDX")), "")
         row = {"name": scenario.name, "flies": sentence, "aircraft": scenario.aircraft.airframe}
         rows.append(row | {"law": scenario.controller.law})

@@ -14,19 +14,34 @@ from flight_core.parameters import Config, nest, require
 
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="A parameter to change, as in controller.k_g=2.0; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="A parameter to change, as in controller.k_g=2.0; may be repeated.",
+    ),
 ]
 
 
 def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> dict[str, Any]:
-    """The values by key, as controller.k_g; `owner` is the only section, or the scenario. Raises ParameterError."""
+    """The values by key, as controller.k_g; `owner` is the only section, or the scenario. Raises
+    ParameterError.
+    """
     changes: dict[str, Any] = {}
     for text in settings or ():
         name, equals, value = text.partition("=")
         key = name.strip()
         section = key.partition(".")[0]
-        fits = bool(equals) and section != key and section in (SCHEMAS if owner == "scenario" else {owner})
-        require(fits, "--set", repr(text), f"a parameter of the {owner} and its value, as in controller.k_g=2.0")
+        fits = (
+            bool(equals)
+            and section != key
+            and section in (SCHEMAS if owner == "scenario" else {owner})
+        )
+        require(
+            fits,
+            "--set",
+            repr(text),
+            f"a parameter of the {owner} and its value, as in controller.k_g=2.0",
+        )
         require(key not in changes, "--set", "a parameter twice", "each once")
         changes[key] = parse_yaml(value, f"--set {text!r}", "a value")
     return changes
@@ -38,7 +53,12 @@ def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenari
     for name, value in parse_settings(settings).items():
         section, _, key = name.partition(".")
         sections[section][key] = value
-    return scenario.vary(**{name: _changed(getattr(scenario, name, None), changes) for name, changes in sections.items()})
+    return scenario.vary(
+        **{
+            name: _changed(getattr(scenario, name, None), changes)
+            for name, changes in sections.items()
+        }
+    )
 
 
 def _changed(section: object, changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,14 @@ from flight_log.tape_reader import stored_scenario
 from flight_view.background import read_background
 from flight_view.flight import Flight
 from flight_view.text import show
-from flight_view.watch import DEFAULT_PORT, namespaces, newest_run, require_log, runs_in_recording, serve
+from flight_view.watch import (
+    DEFAULT_PORT,
+    namespaces,
+    newest_run,
+    require_log,
+    runs_in_recording,
+    serve,
+)
 
 
 def watch(
@@ -31,93 +38,162 @@ def watch(
         list[Path] | None,
         typer.Argument(
             metavar="[RUN]...",
-            help="Folder of a run, or an MCAP file; by default the run in progress, else the last one. The second is a ghost.",
+            help="Folder of a run, or an MCAP file; by default the run in progress, else the "
+            "last one. The second is a ghost.",
         ),
     ] = None,
     fleet: Annotated[
         bool,
         typer.Option(
-            "--fleet", help="Show the aircraft of each RUN on one map, and a choice of them; by default the runs in progress."
+            "--fleet",
+            help="Show the aircraft of each RUN on one map, and a choice of them; by default "
+            "the runs in progress.",
         ),
     ] = False,
     port: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, help="Port on this host; 0 takes any free one.", show_default=f"{DEFAULT_PORT}"),
+        typer.Option(
+            min=0,
+            max=65535,
+            help="Port on this host; 0 takes any free one.",
+            show_default=f"{DEFAULT_PORT}",
+        ),
     ] = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")] = False,
-    text: Annotated[bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")
+    ] = False,
+    text: Annotated[
+        bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")
+    ] = False,
     foxglove: Annotated[
-        bool, typer.Option("--foxglove", help="Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.")
+        bool,
+        typer.Option(
+            "--foxglove",
+            help="Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.",
+        ),
     ] = False,
     flightgear: Annotated[
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help="Send the pose of a flight in progress to FlightGear instead, as to 127.0.0.1:5500, with --set origin.",
+            help="Send the pose of a flight in progress to FlightGear instead, as to "
+            "127.0.0.1:5500, with --set origin.",
         ),
     ] = None,
     control: Annotated[
-        bool, typer.Option("--control", help="Let the page command the flight, with a key that this command prints.")
+        bool,
+        typer.Option(
+            "--control",
+            help="Let the page command the flight, with a key that this command prints.",
+        ),
     ] = False,
     control_real: Annotated[
-        bool, typer.Option("--set real", help="As --control, and gains also while a bridge sends to an autopilot.")
+        bool,
+        typer.Option(
+            "--set real", help="As --control, and gains also while a bridge sends to an autopilot."
+        ),
     ] = False,
     scenario: LogScenario = None,
     namespace: Annotated[
         str | None,
-        typer.Option(help="Namespace of the aircraft: by default the first in the log, with --control the root."),
+        typer.Option(
+            help="Namespace of the aircraft: by default the first in the log, with --control "
+            "the root."
+        ),
     ] = None,
     background: Annotated[
         Path | None,
         typer.Option(
-            "--set background", metavar="FILE", help="GeoJSON of lines, polygons and points for the map, with --set origin."
+            "--set background",
+            metavar="FILE",
+            help="GeoJSON of lines, polygons and points for the map, with --set origin.",
         ),
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option("--set origin", metavar="LAT,LON", help="Where north and east are 0, for the background and FlightGear."),
+        typer.Option(
+            "--set origin",
+            metavar="LAT,LON",
+            help="Where north and east are 0, for the background and FlightGear.",
+        ),
     ] = None,
     altitude: Annotated[
         float,
-        typer.Option("--set altitude", help="Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim."),
+        typer.Option(
+            "--set altitude",
+            help="Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
+        ),
     ] = 0.0,
-    rate: Annotated[float, typer.Option("--set rate", min=1.0, max=100.0, help="Packets a second to FlightGear.")] = 30.0,
+    rate: Annotated[
+        float,
+        typer.Option("--set rate", min=1.0, max=100.0, help="Packets a second to FlightGear."),
+    ] = 30.0,
     runs: Annotated[Path, typer.Option("--set runs", help="Folder of the runs.")] = Path("runs"),
 ) -> None:
-    """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.
+    """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or
+    again later.
 
-    The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
+    The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130
+    interrupted in the terminal.
     """
     if flightgear is not None:
-        require(origin is not None, "flightgear", "no origin", "--set origin=LAT,LON beside it, where north and east are 0")
+        require(
+            origin is not None,
+            "flightgear",
+            "no origin",
+            "--set origin=LAT,LON beside it, where north and east are 0",
+        )
         show_in_flightgear(flightgear, origin or "", altitude, namespace or "", rate)
         return
     require(not wait or bool(run), "--wait", "no RUN", "the folder of a run that will be recorded")
-    require(fleet or len(run or ()) < 3, "RUN", f"{len(run or ())} runs", "a run and a ghost, or --fleet")
+    require(
+        fleet or len(run or ()) < 3,
+        "RUN",
+        f"{len(run or ())} runs",
+        "a run and a ghost, or --fleet",
+    )
     controlled = control or control_real
     require(
-        not (fleet and (text or foxglove or controlled)), "--fleet", "--text, --foxglove or --control beside it", "the page"
+        not (fleet and (text or foxglove or controlled)),
+        "--fleet",
+        "--text, --foxglove or --control beside it",
+        "the page",
     )
-    require(not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two")
+    require(
+        not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two"
+    )
     shown_scenario = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
     chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
     for folder in chosen:
         if not wait:
             require_log(folder, namespace)
-    require(background is None or not (text or foxglove), "background", "--text or --foxglove beside it", "the page")
+    require(
+        background is None or not (text or foxglove),
+        "background",
+        "--text or --foxglove beside it",
+        "the page",
+    )
     lines = [] if background is None else read_background(background, parse_origin(origin))
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
         require(len(chosen) == 1, "--text", "two runs", "one run")
         require(not controlled, "--text", "--control beside it", "one of the two")
     if foxglove:
-        require(len(chosen) == 1 and not controlled, "--foxglove", "a ghost or --control beside it", "RUN alone")
+        require(
+            len(chosen) == 1 and not controlled,
+            "--foxglove",
+            "a ghost or --control beside it",
+            "RUN alone",
+        )
         _serve_foxglove(chosen[0], port)
         return
     aircraft: list[tuple[Path, str | None]] = []
     for folder in chosen:
         aircraft += [(folder, name) for name in (namespaces(folder) if fleet else (namespace,))]
-    flights = [Flight(folder, namespace=name, scenario=shown_scenario, background=lines) for folder, name in aircraft]
+    flights = [
+        Flight(folder, namespace=name, scenario=shown_scenario, background=lines)
+        for folder, name in aircraft
+    ]
     if text:
         show(flights[0])
     elif controlled:
@@ -139,7 +215,8 @@ def _newest(runs: Path, namespace: str | None) -> Path:
     others = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
     if others and namespace is None:
         print(
-            f"note: shows {display_path(chosen)}; also in flight: {', '.join(others)}: name one, or --namespace, or --fleet",
+            f"note: shows {display_path(chosen)}; also in flight: {', '.join(others)}: name "
+            "one, or --namespace, or --fleet",
             file=sys.stderr,
         )
     return chosen
@@ -159,7 +236,9 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
     foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
-def _serve_with_control(flights: Sequence[Flight], ports: Sequence[int], namespace: str, *, real: bool) -> None:
+def _serve_with_control(
+    flights: Sequence[Flight], ports: Sequence[int], namespace: str, *, real: bool
+) -> None:
     from flight_analysis.closed_loop.loop_margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
@@ -178,12 +257,30 @@ def _serve_with_control(flights: Sequence[Flight], ports: Sequence[int], namespa
 
 @contextmanager
 def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
-    """Serve the page of runs that will be recorded, by another process during the block. Yields its lines for the user."""
+    """Serve the page of runs that will be recorded, by another process during the block. Yields its
+    lines for the user.
+    """
     options = ["--wait", *(["--fleet"] if fleet else [])]
-    command = [*end_with_parent(), sys.executable, "-P", "-m", "flight_cli.cli", "watch", *map(str, runs), *options]
-    # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still shows.
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0) as server:  # noqa: S603
+    command = [
+        *end_with_parent(),
+        sys.executable,
+        "-P",
+        "-m",
+        "flight_cli.cli",
+        "watch",
+        *map(str, runs),
+        *options,
+    ]
+    # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still
+    # shows.
+    with subprocess.Popen(  # noqa: S603
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0
+    ) as server:
         try:
-            yield [line.rstrip() for line in (server.stdout.readline(), server.stdout.readline())] if server.stdout else []
+            yield (
+                [line.rstrip() for line in (server.stdout.readline(), server.stdout.readline())]
+                if server.stdout
+                else []
+            )
         finally:
             server.terminate()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of a command line: settings of a command by --set, and the new name of a removed command or option."""
+"""The words of a command line: settings of a command by --set, and the new name of a removed
+command or option.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -42,7 +44,9 @@ class Command(TyperCommand):
     """A command with settings beside options, and a sentence for a removed option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name. Raises ParameterError for a removed option and an unknown setting."""
+        """Parse the words after the name. Raises ParameterError for a removed option and an unknown
+        setting.
+        """
         return super().parse_args(ctx, [*_joined(self.name or "", args, self._spellings())])
 
     def invoke(self, ctx: Any) -> Any:
@@ -60,7 +64,11 @@ class Command(TyperCommand):
         """The spelling of the options by name without --: `--set rate` for a setting."""
         options = (parameter for parameter in self.params if parameter.param_type_name == "option")
         return {
-            option.opts[0].removeprefix(f"{SET} ").removeprefix("--").replace("-", "_"): option.opts[0] for option in options
+            option.opts[0]
+            .removeprefix(f"{SET} ")
+            .removeprefix("--")
+            .replace("-", "_"): option.opts[0]
+            for option in options
         }
 
 
@@ -74,7 +82,9 @@ class Commands(TyperGroup):
 
 
 def _joined(command: str, args: Sequence[str], spellings: Mapping[str, str]) -> Iterator[str]:
-    """The words, a setting joined to a single word; further words of --set stay where the command has this option."""
+    """The words, a setting joined to a single word; further words of --set stay where the command
+    has this option.
+    """
     settings = {name for name, spelling in spellings.items() if spelling.startswith(f"{SET} ")}
     words = iter(args)
     for word in words:
@@ -93,5 +103,10 @@ def _joined(command: str, args: Sequence[str], spellings: Mapping[str, str]) -> 
             name = option.removeprefix("--").replace("-", "_")
             for key in settings & {name, f"route.{name}"} if option.startswith("--") else ():
                 require(False, option, "an option that is gone", f"{SET} {key}")
-            require(f"{command} {option}" not in GONE, option, "an option that is gone", GONE.get(f"{command} {option}", ""))
+            require(
+                f"{command} {option}" not in GONE,
+                option,
+                "an option that is gone",
+                GONE.get(f"{command} {option}", ""),
+            )
             yield word

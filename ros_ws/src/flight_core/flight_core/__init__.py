@@ -1,3 +1,5 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators, scenario files, the tape."""
+"""Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators,
+scenario files, the tape.
+"""

@@ -6,14 +6,16 @@ RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
 ATTITUDE = ("phi", "theta")
-"""Channels of u_m beside the commands: bank, and pitch above the pitch of level flight, rad; for the end of u_m alone."""
+"""Channels of u_m beside the commands: bank, and pitch above the pitch of level flight, rad; for
+the end of u_m alone."""
 
 SIDES = ("down", "up")
-"""Channels of `authority` begin so: down.V and up.V are how fast an input changes V at least, either way, units/s."""
+"""Channels of `authority` begin so: down.V and up.V are how fast an input changes V at least,
+either way, units/s."""
 
 UNKNOWN = 1e9
 """Value of `authority` for an output without a model learned in flight."""
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
-"""Channels of `pose`: attitude, rad (body FRD in NED, psi from true north in (-pi, pi]); position, m; velocity over ground,
-m/s; sideslip, rad, which counts as 0 where sideslip is not measured."""
+"""Channels of `pose`: attitude, rad (body FRD in NED, psi from true north in (-pi, pi]); position,
+m; velocity over ground, m/s; sideslip, rad, which counts as 0 where sideslip is not measured."""

@@ -21,7 +21,9 @@ VERSION_FLAG = 1
 NO_NEW_PRIVS = 38  # of prctl(2)
 WRITE_FILE = 1 << 1
 TRUNCATE = 1 << 14
-CHANGES = WRITE_FILE | sum(1 << bit for bit in range(4, 13))  # write a file; remove and make files, folders, links, sockets
+CHANGES = WRITE_FILE | sum(
+    1 << bit for bit in range(4, 13)
+)  # write a file; remove and make files, folders, links, sockets
 REFER_VERSION = 2  # of landlock
 TRUNCATE_VERSION = 3  # with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
 REFER = 1 << 13
@@ -30,15 +32,22 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def confine(folder: Path) -> list[str]:
-    """Take this process off the network, and let it change files beneath `folder` alone; it must have one thread.
+    """Take this process off the network, and let it change files beneath `folder` alone; it must
+    have one thread.
 
     Returns a sentence for each of the two that the kernel does not permit.
     """
     ways = []
     if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):
-        ways.append(f"foreign files are read with access to the network: the kernel refuses a namespace ({_reason()})")
+        ways.append(
+            "foreign files are read with access to the network: the kernel refuses a namespace "
+            f"({_reason()})"
+        )
     if not _write_beneath(folder):
-        ways.append(f"foreign files are read with the right to write files: the kernel refuses landlock ({_reason()})")
+        ways.append(
+            "foreign files are read with the right to write files: the kernel refuses landlock "
+            f"({_reason()})"
+        )
     return ways
 
 
@@ -47,17 +56,23 @@ def _write_beneath(folder: Path) -> bool:
     version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
     if version < 1:
         return False
-    changes = CHANGES | REFER * (version >= REFER_VERSION) | TRUNCATE * (version >= TRUNCATE_VERSION)
+    changes = (
+        CHANGES | REFER * (version >= REFER_VERSION) | TRUNCATE * (version >= TRUNCATE_VERSION)
+    )
     ruleset = _LIBC.syscall(CREATE_RULESET, struct.pack("=Q", changes), 8, 0)
     if ruleset < 0:
         return False
     for path, rights in ((folder, changes), (Path(os.devnull), changes & (WRITE_FILE | TRUNCATE))):
         opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
-        refused = _LIBC.syscall(ADD_RULE, ruleset, PATH_BENEATH, struct.pack("=Qi", rights, opened), 0)
+        refused = _LIBC.syscall(
+            ADD_RULE, ruleset, PATH_BENEATH, struct.pack("=Qi", rights, opened), 0
+        )
         os.close(opened)
         if refused:
             return False
-    restricted = not _LIBC.prctl(NO_NEW_PRIVS, 1, 0, 0, 0) and not _LIBC.syscall(RESTRICT_SELF, ruleset, 0)
+    restricted = not _LIBC.prctl(NO_NEW_PRIVS, 1, 0, 0, 0) and not _LIBC.syscall(
+        RESTRICT_SELF, ruleset, 0
+    )
     os.close(ruleset)
     return restricted
 

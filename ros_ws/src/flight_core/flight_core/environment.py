@@ -18,16 +18,21 @@ from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
-SHARED_MEMORY, LEAST_SHARED_MEMORY = Path("/dev/shm"), 1 << 16  # bytes; rclpy and a flight use 12 kB # noqa: S108
+SHARED_MEMORY, LEAST_SHARED_MEMORY = (
+    Path("/dev/shm"),  # noqa: S108
+    1 << 16,
+)  # bytes; rclpy and a flight use 12 kB
 LEAST_FILES = 128  # open at once in a process
 LAST_START = 2**31 - 86_400
-"""s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19 (builtin_interfaces/Time). Nodes start
-until a day before."""
+"""s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19
+(builtin_interfaces/Time). Nodes start until a day before."""
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 
 
 def require_ros_environment() -> None:
-    """Raise ParameterError with the mend where no node can start: clock, logs, shared memory, loopback, domain, middleware."""
+    """Raise ParameterError with the mend where no node can start: clock, logs, shared memory,
+    loopback, domain, middleware.
+    """
     _require_clock()
     _require_domain()
     _require_middleware()
@@ -44,7 +49,10 @@ def _require_clock() -> None:
     if not 0.0 <= now < LAST_START:
         date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now))
         wanted = "1970 to 2038-01-18 03:14 UTC, which the stamps of ROS 2 can hold"
-        _refuse(f"system clock: found {date}, expected {wanted}: set the clock (date --set), or fly with --in-process")
+        _refuse(
+            f"system clock: found {date}, expected {wanted}: set the clock (date --set), or fly "
+            "with --in-process"
+        )
 
 
 def _require_domain() -> None:
@@ -57,8 +65,13 @@ def _require_domain() -> None:
 def _require_middleware() -> None:
     """By the index of the installed packages; an installation without an index passes."""
     wanted = os.environ.get("RMW_IMPLEMENTATION", "")
-    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
-    indexes = [Path(prefix) / "share/ament_index/resource_index/rmw_typesupport" for prefix in prefixes]
+    prefixes = [
+        *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
+        sys.prefix,
+    ]
+    indexes = [
+        Path(prefix) / "share/ament_index/resource_index/rmw_typesupport" for prefix in prefixes
+    ]
     folders = filter(Path.is_dir, indexes)
     names = {path.name for path in chain.from_iterable(map(Path.iterdir, folders))}
     known = sorted(names - {"rmw_implementation"})
@@ -67,7 +80,9 @@ def _require_middleware() -> None:
 
 
 def _require_shared_memory() -> None:
-    """Rclpy writes a page of shared memory when it is loaded: on a full file system that is a bus error."""
+    """Rclpy writes a page of shared memory when it is loaded: on a full file system that is a bus
+    error.
+    """
     try:
         state = os.statvfs(SHARED_MEMORY)
     except OSError:  # without the folder rclpy does without
@@ -75,25 +90,36 @@ def _require_shared_memory() -> None:
     free = state.f_bavail * state.f_frsize
     if state.f_blocks > 0 and free < LEAST_SHARED_MEMORY:
         mend = "remove files there, or start a container with --shm-size=64m"
-        _refuse(f"{SHARED_MEMORY}: found {free} bytes free, expected {LEAST_SHARED_MEMORY} or more: {mend}")
+        _refuse(
+            f"{SHARED_MEMORY}: found {free} bytes free, expected {LEAST_SHARED_MEMORY} or more: "
+            f"{mend}"
+        )
 
 
 def _require_files() -> None:
     """A node has some 50 files and sockets open."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     if most < LEAST_FILES:
-        _refuse(f"ulimit -n: found {most} open files, expected {LEAST_FILES} or more: ulimit -n 1024")
+        _refuse(
+            f"ulimit -n: found {most} open files, expected {LEAST_FILES} or more: ulimit -n 1024"
+        )
 
 
 def _require_log_settings() -> None:
     """Of rcutils/logging.h. With another value each line of a log is an error on the terminal."""
-    for variable in ("RCUTILS_LOGGING_USE_STDOUT", "RCUTILS_LOGGING_BUFFERED_STREAM", "RCUTILS_COLORIZED_OUTPUT"):
+    for variable in (
+        "RCUTILS_LOGGING_USE_STDOUT",
+        "RCUTILS_LOGGING_BUFFERED_STREAM",
+        "RCUTILS_COLORIZED_OUTPUT",
+    ):
         if (value := os.environ.get(variable, "")) not in {"", "0", "1"}:
             _refuse(f"{variable}: found {value!r}, expected 0, 1, or none")
 
 
 def log_folder() -> Path | None:
-    """The folder for the logs of nodes, as rcl_logging_interface has it; None without any of its variables."""
+    """The folder for the logs of nodes, as rcl_logging_interface has it; None without any of its
+    variables.
+    """
     for variable, inside in (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"), ("HOME", ".ros/log")):
         if value := os.environ.get(variable):
             home = os.environ.get("HOME", "~")
@@ -104,7 +130,10 @@ def log_folder() -> Path | None:
 def _require_log_folder() -> None:
     folder = log_folder()
     if folder is None:
-        _refuse("ROS_LOG_DIR: found none and no HOME, expected a folder for the logs of nodes: ROS_LOG_DIR=FOLDER")
+        _refuse(
+            "ROS_LOG_DIR: found none and no HOME, expected a folder for the logs of nodes: "
+            "ROS_LOG_DIR=FOLDER"
+        )
     probe = folder / f".rise-di-{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,7 +142,10 @@ def _require_log_folder() -> None:
         if folder.is_dir() and isinstance(error, FileExistsError):
             return  # of a killed process of the same number
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        _refuse(f"{folder}: cannot be written ({reason}), expected a folder for the logs of nodes that can: ROS_LOG_DIR=FOLDER")
+        _refuse(
+            f"{folder}: cannot be written ({reason}), expected a folder for the logs of nodes "
+            "that can: ROS_LOG_DIR=FOLDER"
+        )
     finally:
         with suppress(OSError, ValueError):
             probe.unlink()
@@ -127,7 +159,10 @@ def _require_loopback() -> None:
             probe.connect(probe.getsockname())
             probe.send(b"")
     except OSError as error:
-        _refuse(f"127.0.0.1: cannot be reached ({error.strerror}), expected the loopback interface up: ip link set lo up")
+        _refuse(
+            f"127.0.0.1: cannot be reached ({error.strerror}), expected the loopback interface "
+            "up: ip link set lo up"
+        )
 
 
 def _refuse(sentence: str) -> NoReturn:

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a parameter set: permission by an annotation, and the sentence about a value not permitted.
+"""Values of a parameter set: permission by an annotation, and the sentence about a value not
+permitted.
 
-Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of NumPy as lists and numbers, and
-a path as a str; nothing else is converted. The annotations are float, int, bool, str, object, Literal, tuple, dict, unions of
-these, and parameter sets, with `Field(...)` in Annotated for the rules.
+Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
+NumPy as lists and numbers, and a path as a str; nothing else is converted. The annotations are
+float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets, with
+`Field(...)` in Annotated for the rules.
 """
 
 import math
@@ -57,7 +59,9 @@ class Kind(NamedTuple):
 
     expected: str  # for the sentence about a value of a different type
     takes: Callable[[Any], bool]  # whether a value has the type
-    content: Callable[[Any, str, Problems], Any]  # (value of the type, key, problems) -> the value in the set
+    content: Callable[
+        [Any, str, Problems], Any
+    ]  # (value of the type, key, problems) -> the value in the set
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
         """The value for the set. A value not permitted adds a sentence to `problems`."""
@@ -98,12 +102,16 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
             return problems.refuse(key, value, "a finite number")
         for holds, words, limit in checks:
             if not holds(number, limit):
-                return problems.refuse(key, value, f"{words} {int(limit) if limit == int(limit) else limit}")
+                return problems.refuse(
+                    key, value, f"{words} {int(limit) if limit == int(limit) else limit}"
+                )
         return number
 
     types = (int, kind)
     expected = "an integer" if kind is int else "a number"
-    return Kind(expected, lambda value: isinstance(value, types) and not isinstance(value, bool), content)
+    return Kind(
+        expected, lambda value: isinstance(value, types) and not isinstance(value, bool), content
+    )
 
 
 def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
@@ -112,7 +120,9 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
         if not value.isprintable():
             return problems.refuse(key, value, "printable characters")
         if len(value) < min_length:
-            return problems.refuse(key, value, f"at least {min_length} character{'s' * (min_length > 1)}")
+            return problems.refuse(
+                key, value, f"at least {min_length} character{'s' * (min_length > 1)}"
+            )
         if pattern and not re.fullmatch(pattern, value):
             return problems.refuse(key, value, f"a string that matches {pattern}")
         return value
@@ -123,13 +133,22 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:
     """A value among choices, of the same type: 1 is neither True nor 1.0."""
     named = expected or _either([repr(choice) for choice in choices])
-    return Kind(named, lambda value: any(type(value) is type(choice) and value == choice for choice in choices), _same)
+    return Kind(
+        named,
+        lambda value: any(type(value) is type(choice) and value == choice for choice in choices),
+        _same,
+    )
 
 
 def _check_count(count: int, key: str, problems: Problems, least: float, most: float) -> None:
-    for fits, words, limit in ((count >= least, "at least", least), (count <= most, "at most", most)):
+    for fits, words, limit in (
+        (count >= least, "at least", least),
+        (count <= most, "at most", most),
+    ):
         if not fits:
-            problems.others.append(f"{key}: found {count} values, expected {words} {limit} value{'s' * (limit > 1)}")
+            problems.others.append(
+                f"{key}: found {count} values, expected {words} {limit} value{'s' * (limit > 1)}"
+            )
 
 
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
@@ -141,10 +160,14 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
     def content(value: Sequence[Any], key: str, problems: Problems) -> tuple[Any, ...]:
         _check_count(len(value), key, problems, least, most)
         each = zip(kinds * len(value) if repeated else kinds, value, strict=False)
-        return tuple(kind.read(item, f"{key}[{i}]", problems) for i, (kind, item) in enumerate(each))
+        return tuple(
+            kind.read(item, f"{key}[{i}]", problems) for i, (kind, item) in enumerate(each)
+        )
 
     def takes(value: object) -> bool:
-        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))  # YAML and ROS give no tuple
+        return isinstance(value, Sequence) and not isinstance(
+            value, (str, bytes)
+        )  # YAML and ROS give no tuple
 
     return Kind("a list of values", takes, content)
 
@@ -157,10 +180,16 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
         for entered, item in value.items():
-            is_number = parts[0] is int and isinstance(entered, str) and re.fullmatch(r"-?\d{1,18}", entered)  # a key of JSON
+            is_number = (
+                parts[0] is int
+                and isinstance(entered, str)
+                and re.fullmatch(r"-?\d{1,18}", entered)
+            )  # a key of JSON
             name = int(entered) if is_number else entered
             if keys.takes(name):
-                table[keys.content(name, key, problems)] = values.read(item, f"{key}.{name}", problems)
+                table[keys.content(name, key, problems)] = values.read(
+                    item, f"{key}.{name}", problems
+                )
             else:
                 problems.others.append(f"{key}: found the key {short_repr(name)}, expected a name")
         return table
@@ -195,7 +224,9 @@ def _union(kinds: Sequence[Kind]) -> Kind:
         problems.others += trial.others
         return None
 
-    expected = _either(list(dict.fromkeys(kind.expected for kind in kinds if kind.expected != "None")))
+    expected = _either(
+        list(dict.fromkeys(kind.expected for kind in kinds if kind.expected != "None"))
+    )
     return Kind(expected, lambda value: any(kind.takes(value) for kind in kinds), content)
 
 
@@ -203,7 +234,9 @@ def _either(words: Sequence[str]) -> str:
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-GENERIC: Mapping[Any, Callable[..., Kind]] = MappingProxyType({Literal: _choice, tuple: _values, dict: _table})
+GENERIC: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
+    {Literal: _choice, tuple: _values, dict: _table}
+)
 SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
     {
         float: lambda **rules: _number(float, **rules),
@@ -217,7 +250,9 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
-    """Values permitted by an annotation under rules, e.g. gt. Raises TypeError for an unknown annotation or rule."""
+    """Values permitted by an annotation under rules, e.g. gt. Raises TypeError for an unknown
+    annotation or rule.
+    """
     origin = get_origin(annotation)
     parts = get_args(annotation)
     if origin is Annotated:
@@ -255,7 +290,7 @@ class FieldInfo:
 def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> Any:  # noqa: N802 - the name in pydantic
     """Declare the default, the meaning and the rules of a field.
 
-    Rules are gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string, min_length and max_length of a
-    tuple and of a dict.
+    Rules are gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string,
+    min_length and max_length of a tuple and of a dict.
     """
     return FieldInfo(default, description, rules)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input and output files: existence checks, YAML, atomic replacement, sentences for unreadable or unwritable files."""
+"""Input and output files: existence checks, YAML, atomic replacement, sentences for unreadable or
+unwritable files.
+"""
 
 import errno
 import math
@@ -21,34 +23,48 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, require
 from flight_core.text import printable
 
-# Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
-# or for too deep nesting.
-NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+# Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_",
+# "2001-99-99", "!!bool 2") or for too deep nesting.
+NOT_YAML = (
+    yaml.YAMLError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
 
 INT_TAG = "tag:yaml.org,2002:int"
 FLOAT_TAG = "tag:yaml.org,2002:float"
 
 MAX_FILE_BYTES = 1 << 19
-"""Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB and 5 us a byte."""
+"""Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB
+and 5 us a byte."""
 
 MAX_YAML_NODES = 100_000
-"""Values of a file after expansion of the aliases. A few lines of nested aliases can expand to billions of values."""
+"""Values of a file after expansion of the aliases. A few lines of nested aliases can expand to
+billions of values."""
 
 
 INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
-FLOAT = re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
-"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: 060 is 48 by YAML 1.1 and 60 by YAML 1.2.
-The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000. These are strings here, so no number is guessed."""
+FLOAT = re.compile(
+    r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
+)
+"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: 060 is 48 by
+YAML 1.1 and 60 by YAML 1.2. The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000.
+These are strings here, so no number is guessed."""
 
 
 LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """Reads numbers as YAML 1.2, rejects duplicate keys and an expansion of aliases to more than MAX_YAML_NODES values.
+    """Reads numbers as YAML 1.2, rejects duplicate keys and an expansion of aliases to more than
+    MAX_YAML_NODES values.
 
-    PyYAML keeps the last of duplicate keys. libyaml parses, nine times as fast as Python. Python composes: where nesting is
-    deep, libyaml's binding exhausts the stack.
+    PyYAML keeps the last of duplicate keys. libyaml parses, nine times as fast as Python. Python
+    composes: where nesting is deep, libyaml's binding exhausts the stack.
     """
 
     def __init__(self, stream: str) -> None:
@@ -58,7 +74,9 @@ class _Loader(Composer, yaml.CSafeLoader):
     def get_single_node(self) -> Any:
         node = super().get_single_node()
         if node is not None and _expanded_size(node, {}) > MAX_YAML_NODES:
-            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_YAML_NODES} values", node.start_mark)
+            raise yaml.composer.ComposerError(
+                None, None, f"found more than {MAX_YAML_NODES} values", node.start_mark
+            )
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
@@ -67,7 +85,9 @@ class _Loader(Composer, yaml.CSafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
                 if (key.tag, key.value) in keys:
-                    raise yaml.composer.ComposerError(None, None, f"found the key {key.value} twice", key.start_mark)
+                    raise yaml.composer.ComposerError(
+                        None, None, f"found the key {key.value} twice", key.start_mark
+                    )
                 keys.add((key.tag, key.value))
         return node
 
@@ -81,33 +101,45 @@ def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
 
 
 for _class in (_Loader, _Dumper):
-    _class.yaml_implicit_resolvers = {first: [*rows] for first, rows in _class.yaml_implicit_resolvers.items()}
+    _class.yaml_implicit_resolvers = {
+        first: [*rows] for first, rows in _class.yaml_implicit_resolvers.items()
+    }
     if _class is _Loader:
         for _rows in _class.yaml_implicit_resolvers.values():
             _rows[:] = [row for row in _rows if row[0] not in {INT_TAG, FLOAT_TAG}]
     for _tag, _pattern in ((INT_TAG, INTEGER), (FLOAT_TAG, FLOAT)):
-        _class.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789"))
+        _class.add_implicit_resolver(
+            _tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789")
+        )
 _Loader.add_constructor(INT_TAG, _integer)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:
-    """A value as YAML text for `parse_yaml`: lists of scalars in one line, everything in blocks with flow False."""
+    """A value as YAML text for `parse_yaml`: lists of scalars in one line, everything in blocks
+    with flow False.
+    """
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Number of nodes after expansion of aliases; infinite for a recursive node. `sizes` caches by identity."""
+    """Number of nodes after expansion of aliases; infinite for a recursive node. `sizes` caches by
+    identity.
+    """
     if isinstance(node, yaml.ScalarNode):
         return 1
     if id(node) not in sizes:
         sizes[id(node)] = math.inf
-        children = chain.from_iterable(node.value) if isinstance(node, yaml.MappingNode) else node.value
+        children = (
+            chain.from_iterable(node.value) if isinstance(node, yaml.MappingNode) else node.value
+        )
         sizes[id(node)] = 1 + sum(_expanded_size(child, sizes) for child in children)
     return sizes[id(node)]
 
 
 def comment(lines: Iterable[str]) -> str:
-    """Lines as comments of a YAML file; unprintable characters, such as line ends of a file's name, as escapes."""
+    """Lines as comments of a YAML file; unprintable characters, such as line ends of a file's name,
+    as escapes.
+    """
     return "".join(f"# {printable(line)}".rstrip() + "\n" for line in lines)
 
 
@@ -127,7 +159,8 @@ def names_in(library: Path) -> list[str]:
 
 
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
-    """The file of a name in a library, or the path of a .yaml file. Raises ParameterError with the names.
+    """The file of a name in a library, or the path of a .yaml file. Raises ParameterError with the
+    names.
 
     `key` and `kind` are of the sentence: "scenario", "a scenario file".
     """
@@ -139,18 +172,23 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
 
 
 def display_path(path: Path) -> str:
-    """A path relative to the working folder if it is below it, else as it is; unprintable characters as escapes."""
+    """A path relative to the working folder if it is below it, else as it is; unprintable
+    characters as escapes.
+    """
     return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:
-    """Open a file for reading. A pipe without a writer reads as empty and does not block. Raises OSError, ValueError."""
+    """Open a file for reading. A pipe without a writer reads as empty and does not block. Raises
+    OSError, ValueError.
+    """
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
 
 @contextmanager
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
-    """Turn an OSError inside the block into a ParameterError: `key`, the unwritable `path`, and `expected`.
+    """Turn an OSError inside the block into a ParameterError: `key`, the unwritable `path`, and
+    `expected`.
 
     `key` may be empty.
     """
@@ -158,11 +196,14 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
         yield
     except OSError as error:
         place = f"{key}: {path}" if key else f"{path}"
-        raise ParameterError(f"{place} cannot be written ({error.strerror or error}), expected {expected}") from None
+        raise ParameterError(
+            f"{place} cannot be written ({error.strerror or error}), expected {expected}"
+        ) from None
 
 
 def read_file(path: Path, key: str, expected: str) -> bytes:
-    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for an unreadable or longer file.
+    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for an unreadable
+    or longer file.
 
     `key` names the file in the sentence, `expected` the right content.
     """
@@ -182,7 +223,9 @@ def limited(content: bytes, key: str, expected: str) -> bytes:
 
 
 def read_yaml(path: Path, key: str, expected: str) -> Any:
-    """Content of a YAML file. Raises ParameterError as `read_file`, and for what is not YAML or has a duplicate key."""
+    """Content of a YAML file. Raises ParameterError as `read_file`, and for what is not YAML or has
+    a duplicate key.
+    """
     return parse_yaml(read_file(path, key, expected), key, expected)
 
 
@@ -200,11 +243,19 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
 
 
 def require_no_octal(content: bytes | str, key: str) -> None:
-    """Raise ParameterError for YAML with a number that begins with 0: rcl reads 0100 as 64, by strtoll with base 0."""
+    """Raise ParameterError for YAML with a number that begins with 0: rcl reads 0100 as 64, by
+    strtoll with base 0.
+    """
     numbers = []
     with suppress(*NOT_YAML):  # rcl has its own sentence for it
-        scalars = (token for token in yaml.scan(content, yaml.CSafeLoader) if isinstance(token, yaml.ScalarToken))
-        numbers = [scalar for scalar in scalars if scalar.plain and LEADING_ZERO.fullmatch(scalar.value)]
+        scalars = (
+            token
+            for token in yaml.scan(content, yaml.CSafeLoader)
+            if isinstance(token, yaml.ScalarToken)
+        )
+        numbers = [
+            scalar for scalar in scalars if scalar.plain and LEADING_ZERO.fullmatch(scalar.value)
+        ]
     if numbers:
         octal = f"{numbers[0].value!r} in line {numbers[0].start_mark.line + 1}"
         raise ParameterError(f"{key}: found {octal}, expected a number without a 0 before it")
@@ -212,11 +263,13 @@ def require_no_octal(content: bytes | str, key: str) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file atomically: the stream becomes the file at `path` once the block ends, and is removed after an error.
+    """Write a file atomically: the stream becomes the file at `path` once the block ends, and is
+    removed after an error.
 
-    After a crash, a kill or a full disk the file has either the new or the old content. The stream is a fresh file in the same
-    folder, so nothing is written through a link at `path`: the file replaces the link. Raises OSError, also for an existing
-    `path` that is no regular file, e.g. a folder or a device.
+    After a crash, a kill or a full disk the file has either the new or the old content. The stream
+    is a fresh file in the same folder, so nothing is written through a link at `path`: the file
+    replaces the link. Raises OSError, also for an existing `path` that is no regular file, e.g. a
+    folder or a device.
     """
     with suppress(FileNotFoundError):  # also of a link to nothing
         mode = path.stat().st_mode
@@ -241,7 +294,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """The permissions withheld from new files of this process. umask(2) returns the mask only while setting a new mask."""
+    """The permissions withheld from new files of this process. umask(2) returns the mask only while
+    setting a new mask.
+    """
     mask = os.umask(0o077)
     os.umask(mask)
     return mask

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What installs a missing Python package: make in a checkout, elsewhere pip with an extra of what `rise-di` came from."""
+"""What installs a missing Python package: make in a checkout, elsewhere pip with an extra of what
+`rise-di` came from.
+"""
 
 import json
 from importlib.metadata import PackageNotFoundError, distribution
@@ -10,7 +12,8 @@ from pathlib import Path
 from flight_core.parameters import ParameterError
 
 CHECKOUT = Path(__file__).resolve().parents[4]
-"""The root of the repository, if this file is ros_ws/src/flight_core/flight_core/installation.py there."""
+"""The root of the repository, if this file is ros_ws/src/flight_core/flight_core/installation.py
+there."""
 
 TARGETS = {
     "ros": "make setup",
@@ -38,13 +41,17 @@ MESSAGE_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
 
 
 def require_package(package: str, remark: str = "") -> None:
-    """Raise ParameterError, with the remark at the end of the sentence, where a Python package is not installed."""
+    """Raise ParameterError, with the remark at the end of the sentence, where a Python package is
+    not installed.
+    """
     if find_spec(package) is None:
         raise ParameterError(missing(package) + remark)
 
 
 def missing(package: str) -> str:
-    """A sentence on a package that is not installed: "found no Python package jax, expected it: make setup-all"."""
+    """A sentence on a package that is not installed: "found no Python package jax, expected it:
+    make setup-all".
+    """
     in_checkout = (CHECKOUT / "Makefile").is_file() and (CHECKOUT / "ros_ws").is_dir()
     has_messages = package.endswith(MESSAGE_SUFFIXES)
     extra = "ros" if has_messages and find_spec("rclpy") is None else EXTRAS.get(package)
@@ -52,16 +59,25 @@ def missing(package: str) -> str:
     if extra is not None:
         ways = f": {TARGETS[extra] if in_checkout else _pip_command(extra)}"
     elif has_messages:
-        build = f"make messages PACKAGE={package} SOURCE=FOLDER builds it from its sources; " if in_checkout else ""
-        ways = f": {build}on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or source a workspace with it"
+        build = (
+            f"make messages PACKAGE={package} SOURCE=FOLDER builds it from its sources; "
+            if in_checkout
+            else ""
+        )
+        ways = (
+            f": {build}on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or "
+            "source a workspace with it"
+        )
     return f"found no Python package {package}, expected it{ways}"
 
 
 def _pip_command(extra: str) -> str:
-    """The command that installs an extra of the stack from where the stack came: a checkout, a wheel, a repository, an index.
+    """The command that installs an extra of the stack from where the stack came: a checkout, a
+    wheel, a repository, an index.
 
-    A checkout that is not released must not send its user to an index, where a foreign package may have this name.
-    Source: PEP 610, direct_url.json, which an installation from an index does not have.
+    A checkout that is not released must not send its user to an index, where a foreign package may
+    have this name. Source: PEP 610, direct_url.json, which an installation from an index does not
+    have.
     """
     try:
         origin = distribution("rise-di").read_text("direct_url.json")

@@ -8,11 +8,19 @@ from typing import Any
 from flight_core.vectors import Array
 
 
-def rk4(x_dot: Callable[[Any, Array, Array, Any], Array], t: Any, x: Array, u: Array, params: Any, dt: Any) -> Array:
-    """A step of the classical fourth-order Runge-Kutta method: x(t + dt) from x(t), with u held over the step.
+def rk4(
+    x_dot: Callable[[Any, Array, Array, Any], Array],
+    t: Any,
+    x: Array,
+    u: Array,
+    params: Any,
+    dt: Any,
+) -> Array:
+    """A step of the classical fourth-order Runge-Kutta method: x(t + dt) from x(t), with u held
+    over the step.
 
-    x+ = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type. Source: Hairer, Norsett, Wanner,
-    Solving Ordinary Differential Equations I, table 1.2.
+    x+ = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type. Source:
+    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, table 1.2.
     """
     k1 = x_dot(t, x, u, params)
     k2 = x_dot(t + dt / 2, x + dt / 2 * k1, u, params)

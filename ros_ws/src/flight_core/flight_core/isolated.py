@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Process isolation: what reads foreign models and logs runs in a subprocess of limited time, memory, files and network."""
+"""Process isolation: what reads foreign models and logs runs in a subprocess of limited time,
+memory, files and network.
+"""
 
 import json
 import math
@@ -24,28 +26,43 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 
 RESULT = "result"  # the file of the result in the working folder
-ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})  # raised here as in the subprocess
-WAIT = 20.0  # times the processor time is waited for: so long may other work keep the processor from the subprocess
+ERRORS = MappingProxyType(
+    {"ended": FlightEnded, "refused": ParameterError}
+)  # raised here as in the subprocess
+# times the processor time is waited for: so long may other work keep the processor from the
+# subprocess
+WAIT = 20.0
 FILE_LIMIT = 1 << 30  # bytes of a file that the subprocess writes
 
 NUMPY = frozenset({"_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar"})
-"""What a pickled array names. Unlike another name in a pickle, none of them runs code of the sender's choice."""
+"""What a pickled array names. Unlike another name in a pickle, none of them runs code of the
+sender's choice."""
 
 
 class IsolatedCallError(RuntimeError):
-    """The subprocess crashed or timed out. The message is the rest of a sentence: "was killed by SIGSEGV"."""
+    """The subprocess crashed or timed out. The message is the rest of a sentence: "was killed by
+    SIGSEGV".
+    """
 
 
-def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: int = DATA_LIMIT, foreign: bool = True) -> Any:
+def call(
+    function: Callable[..., Any],
+    *arguments: Any,
+    timeout: float,
+    memory: int = DATA_LIMIT,
+    foreign: bool = True,
+) -> Any:
     """Return value of function(*arguments) in a fresh process, confined to an empty working folder.
 
-    The subprocess finds the function by module and name. Arguments must fit JSON; the return value consists of plain values,
-    arrays, and named tuples of the function's module. FlightEnded and ParameterError of the function are raised here too.
+    The subprocess finds the function by module and name. Arguments must fit JSON; the return value
+    consists of plain values, arrays, and named tuples of the function's module. FlightEnded and
+    ParameterError of the function are raised here too.
 
-    The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time, or WAIT times as many of
-    wall time: an endless computation is found on a busy machine too, and a finite computation gets enough time. Where the
-    kernel permits, it has no network and writes in its folder alone; where not, a warning says so once, if `foreign`. Raises
-    IsolatedCallError where the process crashes (a segmentation fault, an exception) or returns nothing in that time.
+    The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time,
+    or WAIT times as many of wall time: an endless computation is found on a busy machine too, and a
+    finite computation gets enough time. Where the kernel permits, it has no network and writes in
+    its folder alone; where not, a warning says so once, if `foreign`. Raises IsolatedCallError
+    where the process crashes (a segmentation fault, an exception) or returns nothing in that time.
     """
     call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
     with tempfile.TemporaryDirectory() as folder:
@@ -58,7 +75,8 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: 
                 stdin=subprocess.DEVNULL,
                 timeout=WAIT * timeout,
                 cwd=folder,
-                env=os.environ | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},  # each thread takes memory
+                env=os.environ
+                | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},  # each thread takes memory
                 check=False,
             )
         except subprocess.TimeoutExpired:
@@ -81,7 +99,9 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: 
 
 
 class _Reader(pickle.Unpickler):
-    """Reads plain values, arrays, and named tuples of a module. Raises IsolatedCallError for another name."""
+    """Reads plain values, arrays, and named tuples of a module. Raises IsolatedCallError for
+    another name.
+    """
 
     def __init__(self, stream: Any, module: str) -> None:
         super().__init__(stream)
@@ -92,7 +112,9 @@ class _Reader(pickle.Unpickler):
             return super().find_class(module, name)
         if (module, name) == ("builtins", "dict"):
             return dict
-        member = getattr(import_module(self._module), name, None) if module == self._module else None
+        member = (
+            getattr(import_module(self._module), name, None) if module == self._module else None
+        )
         if isinstance(member, type) and issubclass(member, tuple):
             return member
         raise IsolatedCallError(f"returned {module}.{name}, which is no plain value")
@@ -106,14 +128,26 @@ class _Writer(pickle.Pickler):
 
 
 def main() -> None:
-    """Entry point of the subprocess: limits, then the call in JSON; the result goes into the file RESULT."""
+    """Entry point of the subprocess: limits, then the call in JSON; the result goes into the file
+    RESULT.
+    """
     timeout, memory, module, name, arguments = json.loads(sys.argv[1])
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]  # that of the user, which no process may raise
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[
+        1
+    ]  # that of the user, which no process may raise
     soft = math.ceil(float(timeout))
-    resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard)
+    )
     limit_memory(memory)
     for limit, most in ((resource.RLIMIT_FSIZE, FILE_LIMIT), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(limit, (min(most, current) if (current := resource.getrlimit(limit)[1]) >= 0 else most, current))
+        resource.setrlimit(
+            limit,
+            (
+                min(most, current) if (current := resource.getrlimit(limit)[1]) >= 0 else most,
+                current,
+            ),
+        )
     open_ways = confinement.confine(Path.cwd())
     try:
         result = ("value", getattr(import_module(module), name)(*arguments), open_ways)

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Euler's kinematics of bank and pitch, and their inverse in a coordinated turn. Angles in rad, rates in rad/s, body axes FRD.
+"""Euler's kinematics of bank and pitch, and their inverse in a coordinated turn. Angles in rad,
+rates in rad/s, body axes FRD.
 
 Arguments are Python floats, or arrays with a value per aircraft of a fleet.
 Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2, 3 and 9.
@@ -15,27 +16,37 @@ MAX_TILT = math.radians(80.0)
 """Limit of phi in cos(phi) and of theta in tan(theta), which are singular at 90 deg."""
 
 
-def euler_rates(phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar) -> tuple[Scalar, Scalar]:
-    """phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)) and theta_dot = q cos(phi) - r sin(phi)."""
+def euler_rates(
+    phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar
+) -> tuple[Scalar, Scalar]:
+    """phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)) and theta_dot = q cos(phi) - r
+    sin(phi).
+    """
     xp = array_namespace(phi)
     turn = q * xp.sin(phi) + r * xp.cos(phi)
     return p + xp.tan(tilt(theta)) * turn, q * xp.cos(phi) - r * xp.sin(phi)
 
 
 def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
-    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta). Source: Stevens, Lewis, eq. (1.3-22)."""
+    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta). Source:
+    Stevens, Lewis, eq. (1.3-22).
+    """
     xp = array_namespace(phi)
     return (q * xp.sin(phi) + r * xp.cos(phi)) / xp.cos(tilt(theta))
 
 
 def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
-    """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V; speed V in m/s."""
+    """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g
+    tan(phi) / V; speed V in m/s.
+    """
     xp = array_namespace(phi)
     phi = tilt(phi)
     return GRAVITY * xp.tan(phi) / speed * xp.cos(phi) * xp.cos(theta) - theta_dot * xp.sin(phi)
 
 
-def body_rates(phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar) -> tuple[Scalar, Scalar]:
+def body_rates(
+    phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar
+) -> tuple[Scalar, Scalar]:
     """P and q for these rates of the attitude beside r, the inverse of `euler_rates`:
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))

@@ -1,17 +1,25 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A limit of memory for a node: one packet to its middleware may not take the memory of the host."""
+"""A limit of memory for a node: one packet to its middleware may not take the memory of the
+host.
+"""
 
 import resource
 
-DATA_LIMIT = 2 << 30  # bytes; a node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)), half of it thread stacks
+DATA_LIMIT = (
+    2 << 30
+    # bytes; a node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)), half of it
+    # thread stacks
+)
 
 
 def limit_memory(limit: int = DATA_LIMIT) -> None:
-    """Limit the data of this process and its later children to `limit` bytes, or to a lower limit of the user (ulimit -d).
+    """Limit the data of this process and its later children to `limit` bytes, or to a lower limit
+    of the user (ulimit -d).
 
-    An allocation beyond it fails: Python raises MemoryError, and the middleware, which does not expect that, ends the process.
-    Source: getrlimit(2), RLIMIT_DATA: heap and private writable mappings, thread stacks included.
+    An allocation beyond it fails: Python raises MemoryError, and the middleware, which does not
+    expect that, ends the process. Source: getrlimit(2), RLIMIT_DATA: heap and private writable
+    mappings, thread stacks included.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     lowest = min([limit, *(bound for bound in (soft, hard) if bound != resource.RLIM_INFINITY)])

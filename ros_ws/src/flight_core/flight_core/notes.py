@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notes to the user of a process: once each, on the standard error where no logging is configured."""
+"""Notes to the user of a process: once each, on the standard error where no logging is
+configured.
+"""
 
 import logging
 from functools import cache

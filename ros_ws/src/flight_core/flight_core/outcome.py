@@ -9,7 +9,9 @@ INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
 OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how long and how far
-NOT_FLOWN = "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
+NOT_FLOWN = (
+    "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
+)
 LANDED = " landed "  # in an outcome, between the aircraft and the time
 IMPORT = "imported"  # of a log that an autopilot wrote
 NEVER_FLEW = "never flew"  # before the reason
@@ -17,12 +19,18 @@ UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # 0 completed or landed
-STATUS_INCOMPLETE = 4  # completed with an incomplete log, a leg missed or not flown, or outside of the fence
-LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
+STATUS_INCOMPLETE = (
+    4  # completed with an incomplete log, a leg missed or not flown, or outside of the fence
+)
+LOST_CONTACT = (
+    "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
+)
 
 
 def ended_early(held: float, duration: float) -> str:
-    """The outcome of a flight of `duration` s whose log holds y, y_m and u up to the flight time `held`, s; -inf: none."""
+    """The outcome of a flight of `duration` s whose log holds y, y_m and u up to the flight time
+    `held`, s; -inf: none.
+    """
     if held < 0.0:
         return f"ended early: the log does not hold y, y_m and u of {duration:g} s"
     return f"ended early: the log holds y, y_m and u up to t = {held:.3f} of {duration:g} s"

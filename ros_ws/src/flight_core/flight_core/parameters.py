@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validated parameter sets: a declaration per set, a sentence per error.
 
-A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of a scenario file or of
-a ROS node. The first value not permitted becomes a `ParameterError` of one sentence: the key, what was found, what is expected.
+A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of
+a scenario file or of a ROS node. The first value not permitted becomes a `ParameterError` of one
+sentence: the key, what was found, what is expected.
 
-Declarations and methods have the names of pydantic 2. The stack does not use pydantic: Ubuntu 24.04 has release 1.10, with a
-different interface and no strict types, and with pydantic 2 the parameters of a node took twice as long to import.
+Declarations and methods have the names of pydantic 2. The stack does not use pydantic: Ubuntu 24.04
+has release 1.10, with a different interface and no strict types, and with pydantic 2 the parameters
+of a node took twice as long to import.
 """
 
 import difflib
@@ -20,7 +22,9 @@ from flight_core.text import bounded
 
 
 class ParameterError(ValueError):
-    """An invalid parameter or parameter set. The message is one sentence for the user, printable and bounded."""
+    """An invalid parameter or parameter set. The message is one sentence for the user, printable
+    and bounded.
+    """
 
     def __init__(self, sentence: str) -> None:
         super().__init__(bounded(sentence))
@@ -28,7 +32,9 @@ class ParameterError(ValueError):
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
 class Config:
-    """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float), without unknown keys."""
+    """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float),
+    without unknown keys.
+    """
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
     """The fields by name, fields of bases first."""
@@ -39,11 +45,15 @@ class Config:
             origin: Any = get_origin(annotation)
             if origin is not ClassVar:
                 default = vars(cls).get(name, REQUIRED)
-                new_fields[name] = field = default if isinstance(default, FieldInfo) else Field(default)
+                new_fields[name] = field = (
+                    default if isinstance(default, FieldInfo) else Field(default)
+                )
                 field.annotation = annotation
                 if default is not REQUIRED:
                     delattr(cls, name)
-        bases = (base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Config))
+        bases = (
+            base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Config)
+        )
         cls.model_fields = {}
         for fields in (*bases, new_fields):
             cls.model_fields |= fields
@@ -52,23 +62,28 @@ class Config:
         vars(self).update(vars(type(self).validate_mapping(values, type(self).__name__)))
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"{type(self).__name__}.{name}: found an assignment, expected none to a parameter set")
+        raise AttributeError(
+            f"{type(self).__name__}.{name}: found an assignment, expected none to a parameter set"
+        )
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and all(getattr(self, name) == getattr(other, name) for name in self.model_fields)
+        return type(self) is type(other) and all(
+            getattr(self, name) == getattr(other, name) for name in self.model_fields
+        )
 
     def __hash__(self) -> int:
         return hash(tuple(getattr(self, name) for name in self.model_fields))
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in self.model_fields)})"
+        fields = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.model_fields)
+        return f"{type(self).__name__}({fields})"
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str, *, check: bool = True) -> Self:
         """Build the set from a nested mapping; `where` names the set in errors, e.g. "controller".
 
-        Without `check` relations between the values of the set are left to the caller. Raises ParameterError with a sentence
-        for the first key not permitted.
+        Without `check` relations between the values of the set are left to the caller. Raises
+        ParameterError with a sentence for the first key not permitted.
         """
         problems = Problems()
         try:
@@ -82,22 +97,32 @@ class Config:
         return built
 
     @classmethod
-    def read(cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True) -> Self | None:
-        """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not permitted."""
+    def read(
+        cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
+    ) -> Self | None:
+        """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not
+        permitted.
+        """
         before = len(problems.sentences())
         content = {}
         for name, field in cls.model_fields.items():
             if name in values:
                 content[name] = field.kind.read(values[name], f"{key}.{name}", problems)
             elif field.default is REQUIRED:
-                problems.others.append(f"{key}.{name}: missing, expected {field.description or 'a value'}")
+                problems.others.append(
+                    f"{key}.{name}: missing, expected {field.description or 'a value'}"
+                )
             else:
-                content[name] = dict(field.default) if isinstance(field.default, dict) else field.default
+                content[name] = (
+                    dict(field.default) if isinstance(field.default, dict) else field.default
+                )
         for name in values:
             if not isinstance(name, str):
                 problems.unknown.append(f"{key}: found the key {short_repr(name)}, expected a name")
             elif name not in cls.model_fields:
-                problems.unknown.append(f"{key}.{name}: unknown key, expected {one_of(sorted(cls.model_fields), name)}")
+                problems.unknown.append(
+                    f"{key}.{name}: unknown key, expected {one_of(sorted(cls.model_fields), name)}"
+                )
         if len(problems.sentences()) > before:
             return None
         built = cls.__new__(cls)
@@ -111,10 +136,16 @@ class Config:
         return built
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with changes by dotted name, not validated; None removes a parameter. Raises ParameterError."""
+        """The values with changes by dotted name, not validated; None removes a parameter. Raises
+        ParameterError.
+        """
         flat = dict(flatten(self.model_dump()))
         for name in changes:
-            flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
+            flat = {
+                key: value
+                for key, value in flat.items()
+                if key != name and not key.startswith(name + ".")
+            }
         return nest(flat | dict(changes))
 
     def _check(self) -> None:
@@ -136,12 +167,17 @@ class Config:
         exclude_defaults: bool = False,
         exclude_unset: bool = False,
     ) -> dict[str, Any]:
-        """The set as nested dicts, in mode json with lists in place of tuples. `exclude` has fields of this set alone."""
+        """The set as nested dicts, in mode json with lists in place of tuples. `exclude` has fields
+        of this set alone.
+        """
 
         def plain(value: Any) -> Any:
             if isinstance(value, Config):
                 return value.model_dump(
-                    mode=mode, exclude_none=exclude_none, exclude_defaults=exclude_defaults, exclude_unset=exclude_unset
+                    mode=mode,
+                    exclude_none=exclude_none,
+                    exclude_defaults=exclude_defaults,
+                    exclude_unset=exclude_unset,
                 )
             if isinstance(value, dict):
                 return {name: plain(item) for name, item in value.items()}
@@ -152,23 +188,35 @@ class Config:
         dumped = {}
         for name, field in self.model_fields.items():
             value = getattr(self, name)
-            is_left_out = (exclude_none and value is None) or (exclude_defaults and value == field.default)
-            if not (name in exclude or is_left_out or (exclude_unset and name not in vars(self)["_given"])):
+            is_left_out = (exclude_none and value is None) or (
+                exclude_defaults and value == field.default
+            )
+            if not (
+                name in exclude
+                or is_left_out
+                or (exclude_unset and name not in vars(self)["_given"])
+            ):
                 dumped[name] = plain(value)
         return dumped
 
     def model_dump_json(self, *, indent: int | None = None) -> str:
         """The set as JSON."""
         separators = (",", ":") if indent is None else None
-        return json.dumps(self.model_dump(mode="json"), indent=indent, separators=separators, ensure_ascii=False)
+        return json.dumps(
+            self.model_dump(mode="json"), indent=indent, separators=separators, ensure_ascii=False
+        )
 
     @classmethod
     def model_validate_json(cls, text: str) -> Self:
-        """Build the set from JSON. Raises ParameterError, and ValueError for a text that is not JSON."""
+        """Build the set from JSON. Raises ParameterError, and ValueError for a text that is not
+        JSON.
+        """
         try:
             values = json.loads(text)
         except RecursionError:
-            raise ParameterError(f"{cls.__name__}: found JSON that is nested too deeply, expected an object") from None
+            raise ParameterError(
+                f"{cls.__name__}: found JSON that is nested too deeply, expected an object"
+            ) from None
         require(isinstance(values, dict), cls.__name__, short_repr(values), "an object")
         return cls.validate_mapping(values, cls.__name__)
 
@@ -176,7 +224,9 @@ class Config:
 class NodeConfig(Config):
     """Base of the parameters of a node of a flight."""
 
-    lockstep: bool = Field(default=False, description="run in lockstep with the other nodes, as fast as possible")
+    lockstep: bool = Field(
+        default=False, description="run in lockstep with the other nodes, as fast as possible"
+    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
@@ -186,7 +236,8 @@ class NodeConfig(Config):
 
 SMALLEST = 1e-9
 LARGEST = 1e9
-"""Bounds of a quantity in SI units. A value beyond is an error of units, and overflows in products and quotients of the law."""
+"""Bounds of a quantity in SI units. A value beyond is an error of units, and overflows in products
+and quotients of the law."""
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -196,13 +247,16 @@ Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
 Name = Annotated[str, Field(pattern=r"[A-Za-z][A-Za-z0-9_.]*")]
-"""Type of the name of a channel, a state or an input: it goes into C code, pages and files of other programs as it stands."""
+"""Type of the name of a channel, a state or an input: it goes into C code, pages and files of other
+programs as it stands."""
 Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 
 def require(condition: bool, key: str, actual: object, expected: str) -> None:
-    """Raise ParameterError naming `key`, what was found and what is expected, unless the condition holds."""
+    """Raise ParameterError naming `key`, what was found and what is expected, unless the condition
+    holds.
+    """
     if not condition:
         raise ParameterError(f"{key}: found {actual}, expected {expected}")
 
@@ -210,21 +264,37 @@ def require(condition: bool, key: str, actual: object, expected: str) -> None:
 def one_of(known: Sequence[str], name: str) -> str:
     """What is expected in place of an unknown name: a known name, the similar one first."""
     near = difflib.get_close_matches(name, known, n=1)
-    return f"{near[0]} perhaps, or another of {', '.join(known)}" if near else f"one of {', '.join(known)}"
+    return (
+        f"{near[0]} perhaps, or another of {', '.join(known)}"
+        if near
+        else f"one of {', '.join(known)}"
+    )
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
     """Raise ParameterError unless the number of values is the number of channels."""
-    require(len(values) == len(names), key, f"{len(values)} values", f"{len(names)}, one for each of {', '.join(names)}")
+    require(
+        len(values) == len(names),
+        key,
+        f"{len(values)} values",
+        f"{len(names)}, one for each of {', '.join(names)}",
+    )
 
 
 def require_channels(key: str, names: Sequence[str], expected: Sequence[str], owner: str) -> None:
     """Raise ParameterError unless the names are the channels of `owner`, in any order."""
-    require(sorted(names) == sorted(expected), key, ", ".join(names), f"{owner} in any order: {', '.join(expected)}")
+    require(
+        sorted(names) == sorted(expected),
+        key,
+        ", ".join(names),
+        f"{owner} in any order: {', '.join(expected)}",
+    )
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2; None values are left out."""
+    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2; None values are
+    left out.
+    """
     for key, value in mapping.items():
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -233,7 +303,9 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name of a value and of a group."""
+    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name of
+    a value and of a group.
+    """
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, leaf = name.split(".")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The largest values of the outputs of an aircraft: a sample beyond is wrong, and an aircraft beyond is lost."""
+"""The largest values of the outputs of an aircraft: a sample beyond is wrong, and an aircraft
+beyond is lost.
+"""
 
 from collections.abc import Sequence
 from math import radians
@@ -10,9 +12,12 @@ import numpy as np
 from flight_core.vectors import FloatArray
 
 LARGEST_RATE = radians(2000.0)
-"""rad/s, full scale of the gyros of autopilots: ICM-42688-P (TDK InvenSense, DS-000347), BMI088 (Bosch, BST-BMI088-DS001)."""
+"""rad/s, full scale of the gyros of autopilots: ICM-42688-P (TDK InvenSense, DS-000347), BMI088
+(Bosch, BST-BMI088-DS001)."""
 
-LARGEST_AIRSPEED = 340.0  # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
+LARGEST_AIRSPEED = (
+    340.0  # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
+)
 LARGEST = 1e6  # SI, of other outputs: no state of an aircraft in flight comes near
 
 BY_NAME = {"p": LARGEST_RATE, "q": LARGEST_RATE, "r": LARGEST_RATE, "V": LARGEST_AIRSPEED}

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Publisher lock of a topic with a single publisher: samples of a conflicting publisher are ignored.
+"""Publisher lock of a topic with a single publisher: samples of a conflicting publisher are
+ignored.
 
 A message names the publisher in `frame_id`, e.g. "/controller#4711".
 """
@@ -13,13 +14,15 @@ SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting 
 
 
 class PublisherLock:
-    """Locks to the first publisher of a topic, until the samples time out; then to the next publisher.
+    """Locks to the first publisher of a topic, until the samples time out; then to the next
+    publisher.
 
-    A restarted node, of the same name, may take over earlier than a different node. Overruns of the receiving node do not
-    count: the first sample after an overrun may come from a different publisher.
+    A restarted node, of the same name, may take over earlier than a different node. Overruns of the
+    receiving node do not count: the first sample after an overrun may come from a different
+    publisher.
 
-    `timeouts_ns` returns two ages of the last sample, above which a publisher has timed out: for the same node in a new
-    process, and for a different node.
+    `timeouts_ns` returns two ages of the last sample, above which a publisher has timed out: for
+    the same node in a new process, and for a different node.
     """
 
     def __init__(self, timeouts_ns: Callable[[], tuple[int, int]]) -> None:
@@ -37,7 +40,9 @@ class PublisherLock:
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Whether this is the locked publisher, whose last sample is within the age limit of a restart."""
+        """Whether this is the locked publisher, whose last sample is within the age limit of a
+        restart.
+        """
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
@@ -45,13 +50,21 @@ class PublisherLock:
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked publisher times out."""
+        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked
+        publisher times out.
+        """
         if sender == self.publisher:
             return
         max_age_ns, takeover_ns = self._timeouts_ns()
-        restarted = self.publisher is not None and sender.partition("#")[0] == self.publisher.partition("#")[0]
+        restarted = (
+            self.publisher is not None
+            and sender.partition("#")[0] == self.publisher.partition("#")[0]
+        )
         if not self.timed_out(now_ns - self._overrun_ns, max_age_ns if restarted else takeover_ns):
-            raise ChannelError(SENDER, f"conflicting publisher {sender} ignored: already receiving from {self.publisher}")
+            raise ChannelError(
+                SENDER,
+                f"conflicting publisher {sender} ignored: already receiving from {self.publisher}",
+            )
 
     def refresh(self, sender: str, now_ns: int) -> bool:
         """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""

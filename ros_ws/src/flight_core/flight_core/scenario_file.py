@@ -18,14 +18,23 @@ Sections = dict[str, dict[str, Any]]
 A_SCENARIO = "a scenario file"
 
 
-def parse_sections(content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()) -> Sections:
-    """Sections of the content of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
+def parse_sections(
+    content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> Sections:
+    """Sections of the content of a scenario file by node name, e.g. {"controller": {"rate": 100.0,
+    ...}}.
 
-    Raises ParameterError with the path for content that is no scenario file or too long, has a duplicate key, or lacks or adds
-    a section. A section in `optional` may be absent, or an empty mapping: every parameter by default.
+    Raises ParameterError with the path for content that is no scenario file or too long, has a
+    duplicate key, or lacks or adds a section. A section in `optional` may be absent, or an empty
+    mapping: every parameter by default.
     """
     tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
-    require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
+    require(
+        isinstance(tree, dict),
+        str(path),
+        f"{type(tree).__name__}",
+        f"a mapping with {', '.join(expected)}",
+    )
     sections: Sections = {}
     for key, section in tree.items():
         name = str(key).removeprefix("/**/").removeprefix("/")
@@ -33,12 +42,19 @@ def parse_sections(content: bytes, path: Path, expected: tuple[str, ...], option
         require(name in known, f"{path.name}: {name}", "a section", f"only {', '.join(known)}")
         values = section.get("ros__parameters") if isinstance(section, dict) else None
         require(
-            isinstance(values, dict) and (bool(values) or name in optional) and set(section) == {"ros__parameters"},
+            isinstance(values, dict)
+            and (bool(values) or name in optional)
+            and set(section) == {"ros__parameters"},
             f"{path.name}: {name}",
             "no parameters under ros__parameters",
             "a mapping of them there, as in every ROS parameter file",
         )
         sections[name] = dict(values or {})
     for name in expected:
-        require(name in sections, f"{path.name}: {name}", "no such section", f"one for each of {', '.join(expected)}")
+        require(
+            name in sections,
+            f"{path.name}: {name}",
+            "no such section",
+            f"one for each of {', '.join(expected)}",
+        )
     return sections

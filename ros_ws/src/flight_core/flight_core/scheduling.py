@@ -16,27 +16,37 @@ TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 THREADS = Path("/proc/self/task")
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 SLICE_NS = 100_000  # the shortest slice of Linux; by default 0.7 ms times 1 + log2 of the cores
-SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # numbers of the system call; glibc has no function for the call before 2.41
-ATTRIBUTES = "=IIQiIQQQ"  # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+SCHED_SETATTR = {
+    "x86_64": 314,
+    "aarch64": 274,
+}  # numbers of the system call; glibc has no function for the call before 2.41
+ATTRIBUTES = (
+    "=IIQiIQQQ"  # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+)
 
 
 def lower_real_time_priority(levels: int) -> None:
-    """Lower the real-time priority (chrt) of every thread of this process, if any, by `levels`; the lowest is 1.
+    """Lower the real-time priority (chrt) of every thread of this process, if any, by `levels`; the
+    lowest is 1.
 
-    Threads started later inherit the priority. Processes of equal priority do not preempt: compression in the recorder delays
-    a tick of the law by milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities, the lower
-    the longer the period, are the optimal fixed priorities.
-    Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
+    Threads started later inherit the priority. Processes of equal priority do not preempt:
+    compression in the recorder delays a tick of the law by milliseconds, and a tick of the law, of
+    up to 3 ms, the next y_m. Rate-monotonic priorities, the lower the longer the period, are the
+    optimal fixed priorities. Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM
+    20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
-        _schedule_threads(policy, max(os.sched_getparam(0).sched_priority - levels, os.sched_get_priority_min(policy)))
+        _schedule_threads(
+            policy,
+            max(os.sched_getparam(0).sched_priority - levels, os.sched_get_priority_min(policy)),
+        )
 
 
 def leave_real_time_priority() -> None:
     """Give every thread of this process with a real-time priority (chrt) the default policy.
 
-    For a command that starts and watches nodes of real-time priority: a wake-up or a garbage collection of the command delays
-    no tick.
+    For a command that starts and watches nodes of real-time priority: a wake-up or a garbage
+    collection of the command delays no tick.
     """
     if os.sched_getscheduler(0) in REAL_TIME:
         _schedule_threads(os.SCHED_OTHER, 0)
@@ -49,7 +59,8 @@ def _schedule_threads(policy: int, priority: int) -> None:
 
 
 def disable_timer_slack() -> None:
-    """Set the timer slack of the main thread to the minimum. By default Linux delays a wake-up by up to 50 us to save power.
+    """Set the timer slack of the main thread to the minimum. By default Linux delays a wake-up by
+    up to 50 us to save power.
 
     Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no timer slack.
     """
@@ -60,9 +71,10 @@ def disable_timer_slack() -> None:
 def request_short_slices() -> None:
     """Ask for time slices of SLICE_NS for every thread of this process.
 
-    A waking thread goes before a running thread with a longer slice. The share of a core is unchanged. Linux before 6.12
-    ignores the request. A policy chosen by the user (chrt) is kept.
-    Source: sched_setattr(2); the kernel's documentation, scheduler/sched-eevdf (latency-sensitive tasks).
+    A waking thread goes before a running thread with a longer slice. The share of a core is
+    unchanged. Linux before 6.12 ignores the request. A policy chosen by the user (chrt) is kept.
+    Source: sched_setattr(2); the kernel's documentation, scheduler/sched-eevdf (latency-sensitive
+    tasks).
     """
     number = SCHED_SETATTR.get(platform.machine())
     if number is None or not THREADS.is_dir():

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tape: the in-memory log of a flight, from a single process, over topics or read from a bag."""
+"""The tape: the in-memory log of a flight, from a single process, over topics or read from a
+bag.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,8 +22,8 @@ from flight_core.vectors import FloatArray
 class Signal:
     """A topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instants of the samples, ascending. values: shape (N, k), of a log with a channel
-    contiguous in memory.
+    stamp_ns: shape (N,), int64, the instants of the samples, ascending. values: shape (N, k), of a
+    log with a channel contiguous in memory.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -31,7 +33,9 @@ class Signal:
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of a channel, shape (N,). Raises ParameterError with the list of channels."""
         if name not in self.names:
-            raise ParameterError(f"the log: found no channel {name} among {', '.join(self.names)}, expected one")
+            raise ParameterError(
+                f"the log: found no channel {name} among {', '.join(self.names)}, expected one"
+            )
         return self.values[:, self.names.index(name)]
 
     def until(self, end_ns: int) -> "Signal":
@@ -53,7 +57,11 @@ class Signal:
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
         """The samples inside windows (first, last instant), ns."""
         inside = [(self.stamp_ns >= first) & (self.stamp_ns <= last) for first, last in windows]
-        keep = np.logical_or.reduce(inside, axis=0) if inside else np.zeros(len(self.stamp_ns), dtype=bool)
+        keep = (
+            np.logical_or.reduce(inside, axis=0)
+            if inside
+            else np.zeros(len(self.stamp_ns), dtype=bool)
+        )
         return self.where(keep)
 
     def group(self, prefix: str) -> "Signal":
@@ -61,13 +69,18 @@ class Signal:
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
         adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)  # then without a copy
-        return Signal(self.stamp_ns, names, self.values[:, slice(columns[0], columns[-1] + 1) if adjacent else columns])
+        return Signal(
+            self.stamp_ns,
+            names,
+            self.values[:, slice(columns[0], columns[-1] + 1) if adjacent else columns],
+        )
 
 
 class Recording(NamedTuple):
     """Stamps of the messages of a topic in the order of the recording.
 
-    The samples from a step of the clock of the stamps on, and the samples without a usable stamp, are absent in the signal.
+    The samples from a step of the clock of the stamps on, and the samples without a usable stamp,
+    are absent in the signal.
     """
 
     found: int  # messages
@@ -76,7 +89,9 @@ class Recording(NamedTuple):
     step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
     step_at_ns: int = 0  # the last stamp before the step
     left_out: int = 0  # messages after the step
-    lost: int | None = None  # messages that are missing by the numbers of the publisher; None without numbers
+    lost: int | None = (
+        None  # messages that are missing by the numbers of the publisher; None without numbers
+    )
 
 
 class Process(NamedTuple):
@@ -92,9 +107,10 @@ class Process(NamedTuple):
 class Tape:
     """A flight: signals by topic name.
 
-    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of `simulate`: `scenario`, and
-    `changes` of the controller's parameters in flight. Of a log: `recording` by topic, `duration`, s, of a whole flight where
-    the log has it, `processes` by name, and how many samples of a topic were `refused`.
+    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of
+    `simulate`: `scenario`, and `changes` of the controller's parameters in flight. Of a log:
+    `recording` by topic, `duration`, s, of a whole flight where the log has it, `processes` by
+    name, and how many samples of a topic were `refused`.
     """
 
     signals: Mapping[str, Signal]
@@ -111,7 +127,10 @@ class Tape:
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""
         if topic not in self:
-            raise ParameterError(f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, expected one")
+            raise ParameterError(
+                f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, "
+                "expected one"
+            )
         return self.signals[topic]
 
     def __contains__(self, topic: object) -> bool:
@@ -129,6 +148,11 @@ def refusal_note(topic: str, count: int) -> str:
 
 def as_tape(value: object) -> Tape:
     """The value, a Tape with samples. Raises ParameterError for another value."""
-    tape = as_instance(value, Tape, "tape", "a Tape, as simulate returns one and as a RecordedRun has one: run.tape")
+    tape = as_instance(
+        value,
+        Tape,
+        "tape",
+        "a Tape, as simulate returns one and as a RecordedRun has one: run.tape",
+    )
     require(bool(tape.signals), "tape", "no topic", "a flight")
     return tape

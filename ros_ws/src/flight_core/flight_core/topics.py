@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a flight: name, message, publishers, subscribers, and what the log and the pages say of them.
+"""The topics of a flight: name, message, publishers, subscribers, and what the log and the pages
+say of them.
 
-Transport, recorder and launch read this table. `python -m tools.topics` writes the table of docs/interfaces.md and the access
-control policy from it.
+Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
+docs/interfaces.md and the access control policy from it.
 """
 
 from importlib import import_module
@@ -28,7 +29,9 @@ class Topic(NamedTuple):
 
     name: str
     message: str | type  # as "sensor_msgs/msg/JointState", or the class
-    ends: str = "->"  # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
+    ends: str = (
+        "->"  # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
+    )
     meaning: str = ""  # channels, units and use: Markdown
     keeps: str = HISTORY
     only_with: str = ""  # the node without which the topic is not recorded
@@ -50,7 +53,9 @@ class Topic(NamedTuple):
 
     @property
     def type(self) -> Any:
-        """The class of the messages. Raises ImportError or AttributeError where the package lacks the message."""
+        """The class of the messages. Raises ImportError or AttributeError where the package lacks
+        the message.
+        """
         if not isinstance(self.message, str):
             return self.message
         package, _, name = self.message.partition("/msg/")

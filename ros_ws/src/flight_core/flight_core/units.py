@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of airframe files. Values are converted to SI once, at load; the code uses SI and radians."""
+"""Units of airframe files. Values are converted to SI once, at load; the code uses SI and
+radians.
+"""
 
 import re
 from collections.abc import Mapping
@@ -66,15 +68,19 @@ BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
         "lbf": Quantity(POUND_FORCE, length=1, time=-2, mass=1),
     }
 )
-"""The units by name. Products, quotients and powers of these are units too: ft/s^2, slug*ft^2, deg/s.
+"""The units by name. Products, quotients and powers of these are units too: ft/s^2, slug*ft^2,
+deg/s.
 
-Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of Units, NIST SP 811, 2008, appendix B.
+Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of Units, NIST SP
+811, 2008, appendix B.
 """
 
 
 @lru_cache(maxsize=256)
 def quantity(unit: str, key: str = "unit") -> Quantity:
-    """The SI value and the dimension of a unit, such as "ft/s^2". Raises ParameterError with `key` for an unknown unit."""
+    """The SI value and the dimension of a unit, such as "ft/s^2". Raises ParameterError with `key`
+    for an unknown unit.
+    """
     total = Quantity(1.0)
     for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
         read = re.fullmatch(r"[*/]?([^^]*)(?:\^(-?[1-9]))?", part)
@@ -85,21 +91,29 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
         exponent = (-1 if part.startswith("/") else 1) * int(power or 1)
         base = BASE_UNITS[name]
         si = total.si / base.si**-exponent if exponent < 0 else total.si * base.si**exponent
-        total = Quantity(si, *(a + exponent * b for a, b in zip(total.dimension, base.dimension, strict=True)))
+        total = Quantity(
+            si, *(a + exponent * b for a, b in zip(total.dimension, base.dimension, strict=True))
+        )
     return total
 
 
 def si_per_unit(unit: str) -> float:
-    """SI value of 1 of a unit, the factor of a value in that unit. Raises ParameterError for an unknown unit."""
+    """SI value of 1 of a unit, the factor of a value in that unit. Raises ParameterError for an
+    unknown unit.
+    """
     return quantity(unit).si
 
 
 def in_si(value: str | float, key: str, like: str) -> float:
-    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI; `like`: an SI unit of the same dimension.
+    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI; `like`: an SI unit of
+    the same dimension.
 
-    Raises ParameterError for a text without a finite number, an unknown unit, and a unit of a different dimension.
+    Raises ParameterError for a text without a finite number, an unknown unit, and a unit of a
+    different dimension.
     """
-    parsed = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip())
+    parsed = re.fullmatch(
+        r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip()
+    )
     if parsed is None:
         raise ParameterError(f"{key}: found {value!r}, expected a number in {like}, or with a unit")
     entered = quantity(parsed[2] or like, key)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors: values with their channel names. Channels are matched by name, never by position."""
+"""Named vectors: values with their channel names. Channels are matched by name, never by
+position.
+"""
 
 import math
 from collections.abc import Sequence
@@ -70,7 +72,9 @@ def array_namespace(array: Scalar) -> Any:
 
 
 def as_array(value: Any, key: str, expected: str) -> FloatArray:
-    """The value as an array of float64. Raises ParameterError for what is no array of real numbers."""
+    """The value as an array of float64. Raises ParameterError for what is no array of real
+    numbers.
+    """
     try:
         if not np.iscomplexobj(value):
             return np.asarray(value, dtype=np.float64)
@@ -88,7 +92,9 @@ class StampedVector(NamedTuple):
 
 
 class ChannelError(ValueError):
-    """An invalid sample. `reason` is a short word for counters; the message is a sentence, printable and bounded."""
+    """An invalid sample. `reason` is a short word for counters; the message is a sentence,
+    printable and bounded.
+    """
 
     def __init__(self, reason: str, sentence: str) -> None:
         super().__init__(bounded(sentence))
@@ -96,13 +102,19 @@ class ChannelError(ValueError):
 
 
 def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
-    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp; `what` names the sample."""
+    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp; `what` names
+    the sample.
+    """
     if stamp_ns <= last_ns:
-        raise ChannelError("order", f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one")
+        raise ChannelError(
+            "order", f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one"
+        )
 
 
 def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
-    """Raise ChannelError, reason "future", for a stamp ahead of the clock by more than the age limit."""
+    """Raise ChannelError, reason "future", for a stamp ahead of the clock by more than the age
+    limit.
+    """
     if stamp_ns > now_ns + max_age_ns:
         raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
 
@@ -110,15 +122,22 @@ def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
 def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     """Raise ChannelError, reason "old", for a stamp behind the clock by more than the age limit."""
     if now_ns - stamp_ns > max_age_ns:
-        age = f"stamp {seconds(now_ns - stamp_ns):g} s old" if stamp_ns else "no stamp, expected the instant of the sample"
+        age = (
+            f"stamp {seconds(now_ns - stamp_ns):g} s old"
+            if stamp_ns
+            else "no stamp, expected the instant of the sample"
+        )
         raise ChannelError("old", age)
 
 
-def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray) -> FloatArray:
-    """Values of the wanted channels, in the wanted order: v_i = values[names.index(wanted_i)], shape (len(wanted),).
+def select(
+    wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray
+) -> FloatArray:
+    """Values of the wanted channels, in the wanted order: v_i = values[names.index(wanted_i)],
+    shape (len(wanted),).
 
-    Raises ChannelError with reason "length" (names and values differ in number), "name" (a wanted channel is missing or
-    duplicated) or "finite" (a wanted value is NaN or infinite).
+    Raises ChannelError with reason "length" (names and values differ in number), "name" (a wanted
+    channel is missing or duplicated) or "finite" (a wanted value is NaN or infinite).
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
@@ -126,13 +145,17 @@ def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] 
         selected = np.array(values, dtype=np.float64)
     else:
         selected = np.asarray(values, dtype=np.float64)[_places(tuple(wanted), tuple(names))]
-    if not all(map(math.isfinite, selected.tolist())):  # a third of the time of np.isfinite for a few channels
+    if not all(
+        map(math.isfinite, selected.tolist())
+    ):  # a third of the time of np.isfinite for a few channels
         raise ChannelError("finite", f"{', '.join(wanted)} = {selected.tolist()} is not finite")
     return selected
 
 
 def selection_matrix(wanted: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: the product with values selects."""
+    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: the product
+    with values selects.
+    """
     matrix = np.zeros((len(wanted), len(names)))
     for row, channel in zip(matrix, wanted, strict=True):
         row[:] = [name == channel for name in names]
@@ -144,5 +167,7 @@ def _places(wanted: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]
     """Places of the wanted channels among the names. Raises ChannelError as `select` does."""
     for name in wanted:
         if names.count(name) != 1:
-            raise ChannelError("name", f"channel {name} expected once among {', '.join(names) or 'no names'}")
+            raise ChannelError(
+                "name", f"channel {name} expected once among {', '.join(names) or 'no names'}"
+            )
     return np.array([names.index(name) for name in wanted], dtype=np.intp)

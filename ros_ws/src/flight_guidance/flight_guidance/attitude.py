@@ -11,10 +11,12 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
 YAW_TO_BANK = 1.5
-"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off for the worse."""
+"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off
+for the worse."""
 
 LARGEST_YAW = math.radians(20.0)
-"""Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its stop."""
+"""Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its
+stop."""
 
 
 class AttitudeParams(NamedTuple):
@@ -46,16 +48,19 @@ def body_rates(
     speed: Scalar,
     params: AttitudeParams,
 ) -> BodyRates:
-    """Rates to bring phi and theta to their commands, by the inverse of Euler's equations in a coordinated turn:
+    """Rates to bring phi and theta to their commands, by the inverse of Euler's equations in a
+    coordinated turn:
 
-        phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),  theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
-        r_m = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi) + k_beta beta,  psi_dot = g tan(phi) / V
+        phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
+            theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
+        r_m = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi) + k_beta beta,
+            psi_dot = g tan(phi) / V
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    with the measured r where r is not tracked exactly. The last term of q_m leads the angle of attack of the turn.
-    Arguments: angles in rad, `speed` V in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned
-    Aircraft (2012), chapters 2 and 9.
+    with the measured r where r is not tracked exactly. The last term of q_m leads the angle of
+    attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W. Beard, T. W.
+    McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """  # noqa: D400, D415 - what follows is an equation
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
@@ -65,11 +70,13 @@ def body_rates(
 
 
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
-    """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within +-g tan(LARGEST_YAW) / V.
+    """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within
+    +-g tan(LARGEST_YAW) / V.
 
         r_m = g tan(phi_c) / V + k (phi_c - phi),  k = YAW_TO_BANK
 
-    A yaw rolls an aircraft to the same side: the outer wing is faster, and the dihedral rolls away from the sideslip.
+    A yaw rolls an aircraft to the same side: the outer wing is faster, and the dihedral rolls away
+    from the sideslip.
     """
     xp = array_namespace(phi)
     turn = GRAVITY / speed

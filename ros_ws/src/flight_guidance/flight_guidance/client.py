@@ -21,7 +21,16 @@ from flight_guidance.odometry import MAP
 from flight_ros.client import Client
 from flight_ros.messages import Encoder, NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import GUIDANCE, NEWEST_SAMPLES, PUBLISH, RECORD_FOREIGN, ROSOUT, ROUTE, TARGET, Topic
+from flight_ros.topics import (
+    GUIDANCE,
+    NEWEST_SAMPLES,
+    PUBLISH,
+    RECORD_FOREIGN,
+    ROSOUT,
+    ROUTE,
+    TARGET,
+    Topic,
+)
 
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 TARGET_PERIOD = 0.2  # s, between two equal targets
@@ -35,7 +44,9 @@ NAME = "guidance"
 class GuidanceClient(Client):
     """Commands the guidance of a running flight. Methods return why something is refused, or ""."""
 
-    def __init__(self, name: str = "operator", namespace: str = "", parent: Client | None = None) -> None:
+    def __init__(
+        self, name: str = "operator", namespace: str = "", parent: Client | None = None
+    ) -> None:
         super().__init__(name, namespace, parent)
         self._guidance = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True)
         self._decoder = NamedDecoder()
@@ -43,32 +54,53 @@ class GuidanceClient(Client):
 
     def call(self, service: str) -> str:
         """Call a service of guidance without arguments: hold, skip, resume, home."""
-        return str(self._call(Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance").message)
+        return str(
+            self._call(
+                Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance"
+            ).message
+        )
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
         """Publish a route of waypoints, each north, east and altitude in m."""
-        places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
+        places = [
+            Point(x=float(east), y=float(north), z=float(altitude))
+            for north, east, altitude in points
+        ]
         route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
         route.header.frame_id = MAP
         publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
         try:
-            subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
+            subscribed = (
+                f"{publisher.topic_name}: no subscriber, expected a flight with "
+                "guidance in this domain"
+            )
             self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
             self._log.take()
             publisher.publish(route)
             unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
-            self._spin_until(lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT)
+            self._spin_until(
+                lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT
+            )
             return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
         finally:
-            self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
+            self._node.destroy_publisher(
+                publisher
+            )  # else guidance that starts later would receive the route, and fly it
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
-        """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
-        known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        """Whether guidance is among the subscribers in the graph, and each of them has been
+        matched.
+        """
+        known = [
+            endpoint.node_name
+            for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)
+        ]
         return NAME in known and len(known) <= publisher.get_subscription_count()
 
     def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
-        """Wait until guidance has taken a message, or has refused it. Returns the reason, `unknown` after TARGET_TIMEOUT."""
+        """Wait until guidance has taken a message, or has refused it. Returns the reason, `unknown`
+        after TARGET_TIMEOUT.
+        """
         reasons: list[str] = []
 
         def answered() -> bool:
@@ -87,11 +119,21 @@ class GuidanceClient(Client):
         return reasons[-1] if reasons else ""
 
     def _refusals(self, topic: Topic) -> list[str]:
-        """Why guidance has refused messages of a topic since the last call, from the log of the nodes."""
-        texts = [received.message.msg for received in self._log.take() if received.message.name.split(".")[-1] == NAME]
+        """Why guidance has refused messages of a topic since the last call, from the log of the
+        nodes.
+        """
+        texts = [
+            received.message.msg
+            for received in self._log.take()
+            if received.message.name.split(".")[-1] == NAME
+        ]
         parts = [text.partition(REFUSED) for text in texts]
         namespace = self._node.get_namespace().rstrip("/")
-        return [reason for before, _, reason in parts if reason and before == f"{namespace}/{topic.name}: "]
+        return [
+            reason
+            for before, _, reason in parts
+            if reason and before == f"{namespace}/{topic.name}: "
+        ]
 
     def _has_taken(self, values: Mapping[str, float]) -> bool:
         """Whether a sample of guidance since the last call has taken these commands."""
@@ -99,7 +141,9 @@ class GuidanceClient(Client):
 
         def has_taken(sample: Mapping[str, float]) -> bool:
             is_new = int(sample.get("given", 0.0)) & mask == mask
-            return is_new and all(sample.get(f"target.{name}") == value for name, value in values.items())
+            return is_new and all(
+                sample.get(f"target.{name}") == value for name, value in values.items()
+            )
 
         return any(map(has_taken, self._received()))
 
@@ -119,10 +163,14 @@ class TargetClient(GuidanceClient):
         super().__init__("operator", namespace, parent)
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
-        self._silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
+        self._silent = (
+            f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
+        )
 
     def send(self, values: Mapping[str, float]) -> str:
-        """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
+        """Publish commands by channel until guidance has them in force. Returns why they are not,
+        or "".
+        """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()
         unknown = f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
@@ -134,7 +182,9 @@ class TargetClient(GuidanceClient):
         self._publisher.publish(encoder.encode(time.time_ns(), np.array(())))
 
     def hold_link(self) -> NoReturn:
-        """Keep the link, a message each LINK_PERIOD. Raises ParameterError where no guidance flies in the domain."""
+        """Keep the link, a message each LINK_PERIOD. Raises ParameterError where no guidance flies
+        in the domain.
+        """
         while True:
             self._spin_until(lambda: bool(self._received()), self._silent)
             self.keep_link()

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility: refusal of a route beyond the aircraft's performance before the flight, with the nearest feasible value."""
+"""Feasibility: refusal of a route beyond the aircraft's performance before the flight, with the
+nearest feasible value.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +19,8 @@ from flight_guidance.route_file import Waypoint
 from flight_guidance.zones import Fence, clearance, described
 
 HEADWIND = 1.2
-"""Least ratio of the airspeed to the wind: against the wind the aircraft still goes ahead by a sixth of the airspeed."""
+"""Least ratio of the airspeed to the wind: against the wind the aircraft still goes ahead by a
+sixth of the airspeed."""
 
 
 class Performance(NamedTuple):
@@ -36,7 +39,9 @@ class Performance(NamedTuple):
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
-    """Airspeeds on the legs to the waypoints, m/s: of the waypoint, or of the leg before; `first` where none is named yet."""
+    """Airspeeds on the legs to the waypoints, m/s: of the waypoint, or of the leg before; `first`
+    where none is named yet.
+    """
     named = []
     for waypoint in waypoints:
         first = waypoint.speed or first
@@ -45,22 +50,27 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 
 
 class FlyableRoute(NamedTuple):
-    """The legs of a route, and the waypoints that the legs fly: without those that are cut, with the loiters of steep legs."""
+    """The legs of a route, and the waypoints that the legs fly: without those that are cut, with
+    the loiters of steep legs.
+    """
 
     legs: tuple[Leg, ...]
     waypoints: tuple[Waypoint, ...]
     notes: tuple[str, ...]  # sentences on what differs from the waypoints given
 
 
-def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> FlyableRoute:
+def flyable(
+    waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance
+) -> FlyableRoute:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Of a leg too short for the fillets one waypoint is left out, where the route still passes within `radius`, or 1 s of flight,
-    of the waypoint. A change of altitude beyond the climb or sink along the straight part of the leg, the wind from behind, is
-    flown on a circle: a climb round the waypoint before, a descent round the waypoint after.
-    Raises ParameterError for a waypoint not finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed of at
-    most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a leg too short
-    for the fillets. phi_max is the largest bank at V for the stall speed.
+    Of a leg too short for the fillets one waypoint is left out, where the route still passes within
+    `radius`, or 1 s of flight, of the waypoint. A change of altitude beyond the climb or sink along
+    the straight part of the leg, the wind from behind, is flown on a circle: a climb round the
+    waypoint before, a descent round the waypoint after. Raises ParameterError for a waypoint not
+    finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed of at most HEADWIND
+    times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a
+    leg too short for the fillets. phi_max is the largest bank at V for the stall speed.
     """
     _require_bounds(waypoints, can)
     flown = speeds(waypoints, can.speed)
@@ -72,20 +82,27 @@ def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Pe
         slowest = max(slowest, least_period(speed, bank, can.roll_rate))
     expected = f"at least {_up(slowest, 0.1):g} s at this speed, bank and roll rate"
     require(period >= slowest, "guidance.period", f"{period:g} s", expected)
-    named = [waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)]
+    named = [
+        waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)
+    ]
     remaining, notes = _without_short_legs(named, radius, least)
     return _with_circles(dict(remaining), notes, radius, least, can)
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[Leg, ...]:
-    loiters = {k: Loiter(waypoint.turns, waypoint.wait) for k, waypoint in enumerate(waypoints) if waypoint.loiters}
+    loiters = {
+        k: Loiter(waypoint.turns, waypoint.wait)
+        for k, waypoint in enumerate(waypoints)
+        if waypoint.loiters
+    }
     return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters)
 
 
 def _without_short_legs(
     waypoints: Sequence[Waypoint], radius: float, least: float
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
-    """The waypoints with their numbers, without those left out for short legs, and a note on each of these.
+    """The waypoints with their numbers, without those left out for short legs, and a note on each
+    of these.
 
     Raises ShortLegError where none can go.
     """
@@ -97,10 +114,21 @@ def _without_short_legs(
             break
         except path.ShortLegError as short:
             refusal = refusal or short
-            inner = [k for k in (short.number - 1, short.number) if 0 < k < len(remaining) - 1 and not remaining[k][1].loiters]
+            inner = [
+                k
+                for k in (short.number - 1, short.number)
+                if 0 < k < len(remaining) - 1 and not remaining[k][1].loiters
+            ]
             if not inner:
                 raise refusal from None
-            del remaining[min(inner, key=lambda k: _offset(*(waypoint.point for _, waypoint in remaining[k - 1 : k + 2])))]
+            del remaining[
+                min(
+                    inner,
+                    key=lambda k: _offset(
+                        *(waypoint.point for _, waypoint in remaining[k - 1 : k + 2])
+                    ),
+                )
+            ]
         except ParameterError as error:  # of the rest, which has corners of its own
             raise refusal or error from None
     numbers = {number for number, _ in remaining}
@@ -111,7 +139,10 @@ def _without_short_legs(
         distance = path.distance_from(legs, waypoint.point)
         if distance > max(radius, waypoint.speed or 0.0):
             raise refusal or ParameterError("route")
-        notes.append(f"route[{number}]: corner cut, {distance:.0f} m from the waypoint: a leg is too short for the fillets")
+        notes.append(
+            f"route[{number}]: corner cut, {distance:.0f} m from the waypoint: a leg is too "
+            "short for the fillets"
+        )
     return remaining, tuple(notes)
 
 
@@ -123,9 +154,15 @@ def _offset(before: Point, point: Point, after: Point) -> float:
 
 
 def _with_circles(
-    numbered: Mapping[int, Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
+    numbered: Mapping[int, Waypoint],
+    notes: tuple[str, ...],
+    radius: float,
+    least: float,
+    can: Performance,
 ) -> FlyableRoute:
-    """The route with a circle for each change of altitude beyond the climb or sink along the leg; waypoints by number."""
+    """The route with a circle for each change of altitude beyond the climb or sink along the leg;
+    waypoints by number.
+    """
     numbers = list(numbered)
     waypoints = list(numbered.values())
     sentences = list(notes)
@@ -156,7 +193,10 @@ def _with_circles(
                 waypoints[k - 1] = before._replace(leave=waypoint.altitude)
             else:
                 waypoints[k] = waypoint._replace(altitude=before.departure, leave=waypoint.altitude)
-            where = f"round the waypoint {'before' if rises else 'itself'}, where the leg takes {math.floor(reach)} m"
+            where = (
+                f"round the waypoint {'before' if rises else 'itself'}, where the leg takes "
+                f"{math.floor(reach)} m"
+            )
             sentences.append(f"route[{numbers[k]}]: {difference}, flown on circles {where}")
             break
         else:
@@ -172,18 +212,38 @@ def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
         require(known, f"route[{k}]", position, f"finite values, at most {LARGEST:g} m either way")
         for value in (altitude, waypoint.departure):
             permitted = can.lowest <= value <= can.highest
-            require(permitted, f"route[{k}].altitude", f"{value:g} m", f"{can.lowest:g} to {can.highest:g} m")
+            require(
+                permitted,
+                f"route[{k}].altitude",
+                f"{value:g} m",
+                f"{can.lowest:g} to {can.highest:g} m",
+            )
     floor = protection.speed_floor(can.stall_speed)
     for k, speed in enumerate(speeds(waypoints, can.speed)):
-        require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
-        require(speed <= can.largest_speed, f"route[{k}].V", f"{speed:g} m/s", f"at most {can.largest_speed:g} m/s")
-        expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
+        require(
+            speed >= floor,
+            f"route[{k}].V",
+            f"{speed:g} m/s",
+            f"at least {_up(floor, 0.1):g} m/s, the speed floor",
+        )
+        require(
+            speed <= can.largest_speed,
+            f"route[{k}].V",
+            f"{speed:g} m/s",
+            f"at most {can.largest_speed:g} m/s",
+        )
+        expected = (
+            f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below "
+            f"{speed / HEADWIND:.3g} m/s"
+        )
         speed_in_wind = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
         require(speed > HEADWIND * can.wind, f"route[{k}].V", speed_in_wind, expected)
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
-    """Raise ParameterError for a leg nearer to the fence than `margin`, m, with the place that is the farthest outside."""
+    """Raise ParameterError for a leg nearer to the fence than `margin`, m, with the place that is
+    the farthest outside.
+    """
     start: Point = (0.0, 0.0)
     for number, leg in enumerate(route.legs):
         points = path.outline(leg, start)
@@ -196,12 +256,18 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
         if path.turns_back(leg, next(iter(route.legs[number + 1 :]), None)):
             inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
-        outermost = f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
-        require(bool(inside[worst] >= margin), "route", outermost, f"at least {margin:.0f} m inside")
+        outermost = (
+            f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, "
+            f"east {east[worst]:.0f} m"
+        )
+        require(
+            bool(inside[worst] >= margin), "route", outermost, f"at least {margin:.0f} m inside"
+        )
 
 
 TURN_BACK = 3.0
-"""Radii within which an aircraft joins the next leg after a corner without a fillet; the osprey took 2.0."""
+"""Radii within which an aircraft joins the next leg after a corner without a fillet; the osprey
+took 2.0."""
 
 POINT_DISTANCE = 0.05
 """Distance of the points of a line at which the fence is checked, in radii of the fillets."""

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fence: zones to stay in and zones to keep out of, kept by the last safe turn.
 
-Each step predicts the turn at the largest bank to either side, until the course points along the way home. Once the better of
-the two turns comes nearer to the fence than MARGIN of flight, the aircraft flies the better turn, then home. From outside the
-aircraft flies back inside the shortest way, then home. Functions take Python floats, or arrays with an element per aircraft of
-a fleet.
+Each step predicts the turn at the largest bank to either side, until the course points along the
+way home. Once the better of the two turns comes nearer to the fence than MARGIN of flight, the
+aircraft flies the better turn, then home. From outside the aircraft flies back inside the shortest
+way, then home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
 """
 
 import math
@@ -23,19 +23,22 @@ from flight_guidance.zones import Fence, Zone, clearance
 __all__ = ["Fence", "Zone", "clearance"]
 
 MARGIN = 0.5
-"""s of flight over ground: the largest cross-track error that guidance claims in wind and turbulence."""
+"""s of flight over ground: the largest cross-track error that guidance claims in wind and
+turbulence."""
 
 HOMEWARD = math.radians(20.0)
 """Angle before the bearing of the way home at which the turn ends."""
 
 AHEAD = math.radians(60.0)
-"""Angle between the course and the bearing of the way home up to which an aircraft flies along the way."""
+"""Angle between the course and the bearing of the way home up to which an aircraft flies along the
+way."""
 
 SHARES = (1.0, 1.0 - LARGEST_SLIP)
 """Shares of the coordinated turn that the predicted turns have; the nearer turn counts.
 
-r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip, and k_beta beta in r_m, take
-from the turn. Of the osprey with every entry of A and B off by up to 30 % the sideslip takes 0.19, of JSBSim's f16 0.09.
+r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip,
+and k_beta beta in r_m, take from the turn. Of the osprey with every entry of A and B off by up to
+30 % the sideslip takes 0.19, of JSBSim's f16 0.09.
 """
 
 
@@ -50,7 +53,9 @@ class Motion(NamedTuple):
     wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
-    lag: float  # s, of the turn behind the commanded bank: half of 1 / k_phi, and 2 / w_r of the reference model of r
+    # s, of the turn behind the commanded bank: half of 1 / k_phi, and 2 / w_r of the reference
+    # model of r
+    lag: float
 
 
 def _remaining(side: Array, bearing: Array, course: Array) -> Array:
@@ -67,9 +72,11 @@ def _bearing(chart: Ways, fence: Fence, north: Array, east: Array) -> Array:
 def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     """Least clearance of the turn to the right and to the left, m.
 
-        phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;  [n, e]' = V [cos, sin](chi) + W
+        phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
+            [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before the way home, at the latest after nearly a full turn. Trapezoidal rule over POINTS.
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn.
+    Trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -78,7 +85,11 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     aim = side * motion.bank
     turn = share * GRAVITY / motion.speed
     rolled = motion.lag + abs(aim - motion.phi) / motion.roll_rate
-    longest = motion.lag + 2.0 * motion.bank / motion.roll_rate + 1.95 * math.pi / (turn * xp.tan(motion.bank))
+    longest = (
+        motion.lag
+        + 2.0 * motion.bank / motion.roll_rate
+        + 1.95 * math.pi / (turn * xp.tan(motion.bank))
+    )
     t = np.linspace(0.0, 1.0, POINTS).reshape(-1, *axes) * longest
     reach = motion.roll_rate * xp.maximum(t - motion.lag, 0.0)
     phi = motion.phi + xp.minimum(xp.maximum(aim - motion.phi, -reach), reach)
@@ -87,7 +98,9 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     v_east = motion.speed * xp.sin(chi) + motion.wind[1]
     north = motion.north + _integral(v_north, longest)
     east = motion.east + _integral(v_east, longest)
-    remaining = _remaining(side, _bearing(ways(fence), fence, north, east), xp.atan2(v_east, v_north))
+    remaining = _remaining(
+        side, _bearing(ways(fence), fence, north, east), xp.atan2(v_east, v_north)
+    )
     homeward = (remaining < HOMEWARD) & (t > rolled)
     after = xp.cumsum(homeward, axis=1) - homeward > 0
     nearest = xp.min(xp.where(after, math.inf, clearance(fence.zones, north, east)), axis=1)
@@ -96,7 +109,9 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
 
 
 def _integral(rate: Array, longest: Array) -> Array:
-    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`, by the trapezoidal rule."""
+    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`, by the
+    trapezoidal rule.
+    """
     xp = array_namespace(rate)
     steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * (longest / (POINTS - 1))
     return xp.concat([xp.zeros_like(rate[:, :1]), xp.cumsum(steps, axis=1)], axis=1)
@@ -119,17 +134,18 @@ BACK = 3.0
 AROUND = 4.0
 """Actions of the fence; 0 is none.
 
-A turn to the right, to the left; the way home in a straight line; the way back from outside, the shortest way; the way home
-around a zone or a corner.
+A turn to the right, to the left; the way home in a straight line; the way back from outside, the
+shortest way; the way home around a zone or a corner.
 """
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     """The action of the fence after a step, from the action before.
 
-    A turn begins where the better turn comes nearer to the fence than MARGIN of flight. It ends HOMEWARD before the way home,
-    and beyond where the way is free. On the way home a turn begins only where it keeps farther from the fence than the way that
-    is flown, and the clearance of now is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
+    A turn begins where the better turn comes nearer to the fence than MARGIN of flight. It ends
+    HOMEWARD before the way home, and beyond where the way is free. On the way home a turn begins
+    only where it keeps farther from the fence than the way that is flown, and the clearance of now
+    is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))
@@ -158,6 +174,10 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     passed = (remaining > math.pi) & (way >= needed)
     turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~passed
 
-    after = xp.where(must_turn, xp.where(right_turn >= left_turn, RIGHT, LEFT), xp.where(flies_home, homeward, 0.0))
+    after = xp.where(
+        must_turn,
+        xp.where(right_turn >= left_turn, RIGHT, LEFT),
+        xp.where(flies_home, homeward, 0.0),
+    )
     after = xp.where(turns, action, xp.where(is_outside, BACK, after))
     return Escape(after, (action == 0.0) & (after != 0.0), now, predicted, bearing)

@@ -14,7 +14,13 @@ import numpy as np
 
 from flight_core.channels import POSE
 from flight_core.rates import nanoseconds, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
+from flight_core.vectors import (
+    ChannelError,
+    FloatArray,
+    StampedVector,
+    require_newer,
+    require_not_future,
+)
 from flight_guidance import guidance_state, modes, path, targets
 from flight_guidance.guidance_state import (
     TARGETS,
@@ -39,8 +45,8 @@ WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
 HEADING = "state.psi"
 ADDED = (LINK_AGE, HEADING, *LEARNED)
-"""Channels that logs of earlier versions lack, or flights without a learner: LINK_AGE is taken by no step, HEADING by
-`Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
+"""Channels that logs of earlier versions lack, or flights without a learner: LINK_AGE is taken by
+no step, HEADING by `Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
 
 
 class GuidanceOutput(NamedTuple):
@@ -71,23 +77,42 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def u_m(state: GuidanceState) -> FloatArray:
-    """What is published as u_m: the commands in the order of the parameters' outputs, then ATTITUDE."""
+    """What is published as u_m: the commands in the order of the parameters' outputs, then
+    ATTITUDE.
+    """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, link_age: float) -> FloatArray:
+def row(
+    inputs: Inputs, state: GuidanceState, commands: Commands, route: int, link_age: float
+) -> FloatArray:
     """A sample of the log, in the order of `names`: inputs, state after the step, commands.
 
-    `route`: a `digest`; `link_age`: time since the last message of an operator, s, 0 without a limit.
+    `route`: a `digest`; `link_age`: time since the last message of an operator, s, 0 without a
+    limit.
     """
     return np.array(
         [
-            *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
+            *(
+                state.mode,
+                state.lateral,
+                state.vertical,
+                state.leg,
+                route,
+                commands.xtrack,
+                commands.to_go,
+            ),
             *(state.joining, commands.track, commands.missed),
             *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, guidance_state.bits(inputs.commands), *inputs.authority),
+            *(
+                seconds(inputs.pose_age_ns),
+                link_age,
+                inputs.begin,
+                guidance_state.bits(inputs.commands),
+                *inputs.authority,
+            ),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
@@ -100,9 +125,15 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
     )
 
 
-def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after the step, from a sample of the log. Without HEADING it is that of the pose."""
-    logged = {HEADING: logged["pose.psi"]} | dict(zip(LEARNED, Authority(), strict=True)) | dict(logged)
+def restored(
+    t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
+) -> tuple[Inputs, GuidanceState]:
+    """The inputs of a step and the state after the step, from a sample of the log. Without HEADING
+    it is that of the pose.
+    """
+    logged = (
+        {HEADING: logged["pose.psi"]} | dict(zip(LEARNED, Authority(), strict=True)) | dict(logged)
+    )
 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)
@@ -113,7 +144,13 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
     begin = Begin(int(logged["begin"]))
     age_ns = nanoseconds(logged["age.pose"])
     inputs = Inputs(
-        t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), commanded, Authority(*(logged[name] for name in LEARNED))
+        t_ns,
+        begin,
+        group("pose", POSE),
+        age_ns,
+        group("y", outputs),
+        commanded,
+        Authority(*(logged[name] for name in LEARNED)),
     )
     phi, theta, alpha, alpha_trim, slip, psi = group("state", STATE)
     state = GuidanceState(
@@ -155,7 +192,9 @@ class Guidance:
         waypoints = parameters.waypoints()
         self.route = parameters.plan(waypoints) if waypoints else None
         self._digest = digest(self.route)
-        self._program = deque((nanoseconds(start), target) for start, target in parameters.program_steps())
+        self._program = deque(
+            (nanoseconds(start), target) for start, target in parameters.program_steps()
+        )
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
         self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
@@ -166,7 +205,9 @@ class Guidance:
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
         self._waits_from_ns: int | None = None  # for a pose that is young enough
-        self._operated_ns: int | None = None  # the instant of the operator's last message, or of the first step
+        self._operated_ns: int | None = (
+            None  # the instant of the operator's last message, or of the first step
+        )
         self._link_lost = False
         self._authority = Authority()
 
@@ -183,45 +224,60 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond LARGEST, and for a pose
-        equal to the last in every value.
+        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond
+        LARGEST, and for a pose equal to the last in every value.
         """
         last = self._pose
         newest = self._newest(self._pose, sample, now_ns)
         if last is not None and np.array_equal(last.value, newest.value):
-            raise ChannelError("frozen", "pose: found every value as before, expected an aircraft that moves")
+            raise ChannelError(
+                "frozen", "pose: found every value as before, expected an aircraft that moves"
+            )
         self._pose = newest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a y in the order of the parameters' outputs. Raises ChannelError as `take_pose` does, but for equal values."""
+        """Take a y in the order of the parameters' outputs. Raises ChannelError as `take_pose`
+        does, but for equal values.
+        """
         self._y = self._newest(self._y, sample, now_ns)
 
     def take_authority(self, channels: Mapping[str, float]) -> None:
-        """Limit the steps from now on by what the inputs can do, from the channels of the topic `authority`."""
+        """Limit the steps from now on by what the inputs can do, from the channels of the topic
+        `authority`.
+        """
         self._authority = authority_of(channels)
 
-    def _newest(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> StampedVector:
+    def _newest(
+        self, last: StampedVector | None, sample: StampedVector, now_ns: int
+    ) -> StampedVector:
         require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
         if last is not None:
             require_newer(sample.stamp_ns, last.stamp_ns)
         if (largest := float(np.max(np.abs(sample.value)))) > guidance_state.LARGEST:
-            raise ChannelError("bounds", f"found a value of {largest:g}, expected at most {guidance_state.LARGEST:g} in SI")
+            raise ChannelError(
+                "bounds",
+                f"found a value of {largest:g}, expected at most {guidance_state.LARGEST:g} in SI",
+            )
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of Target; commands of the same instant come in one call. Raises ChannelError."""
+        """Take commands by channel of Target; commands of the same instant come in one call. Raises
+        ChannelError.
+        """
         targets.read_target(values, self._params, self.route, degrees=True)
         # A lateral or vertical command replaces the command of the mode before.
         for table in (guidance_state.LATERAL, guidance_state.VERTICAL):
             if any(name in table for name in values):
-                self._given = {name: value for name, value in self._given.items() if name not in table}
+                self._given = {
+                    name: value for name, value in self._given.items() if name not in table
+                }
         self._given |= values
 
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Commands before the route and not taken by a step yet are
-        void, and so are the legs of the program.
+        While guidance is off, the route waits for the engagement. Commands before the route and not
+        taken by a step yet are void, and so are the legs of the program.
         """
         self.route = route
         self._digest = digest(route)
@@ -241,7 +297,9 @@ class Guidance:
         self._link_lost = False
 
     def hold(self) -> bool:
-        """Hold the heading, the altitude and the airspeed of now; False while guidance does not fly."""
+        """Hold the heading, the altitude and the airspeed of now; False while guidance does not
+        fly.
+        """
         if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
             return False
         speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
@@ -252,27 +310,45 @@ class Guidance:
         """Fly home and orbit there; False while guidance does not fly."""
         if self.mode is not Mode.ENGAGED or self._pose is None:
             return False
-        self.take_target(targets.home(self.pose(), targets.within_reach(self._params, self._authority)))
+        self.take_target(
+            targets.home(self.pose(), targets.within_reach(self._params, self._authority))
+        )
         return True
 
     def skip(self) -> bool:
-        """Leave the waypoint ahead out and fly to the next waypoint; False while no route is flown, and on the last leg."""
+        """Leave the waypoint ahead out and fly to the next waypoint; False while no route is flown,
+        and on the last leg.
+        """
         state = self._state
         route = self.route
-        if self.mode is not Mode.ENGAGED or state is None or state.lateral is not Lateral.ROUTE or route is None:
+        if (
+            self.mode is not Mode.ENGAGED
+            or state is None
+            or state.lateral is not Lateral.ROUTE
+            or route is None
+        ):
             return False
         later = range(state.leg + 1, len(route.legs))
-        leg = next((k for k in later if isinstance(route.legs[k], Line) or route.legs[k].end is None), None)
+        leg = next(
+            (k for k in later if isinstance(route.legs[k], Line) or route.legs[k].end is None), None
+        )
         if leg is None:
             return False
         self.take_target({"leg": float(leg), "along": path.length(route.legs[leg])})
         return True
 
     def resume(self) -> bool:
-        """Fly the last leg again from the nearest point; False while the route is flown, and without a route."""
+        """Fly the last leg again from the nearest point; False while the route is flown, and
+        without a route.
+        """
         state = self._state
         route = self.route
-        if self.mode is not Mode.ENGAGED or state is None or state.lateral is Lateral.ROUTE or route is None:
+        if (
+            self.mode is not Mode.ENGAGED
+            or state is None
+            or state.lateral is Lateral.ROUTE
+            or route is None
+        ):
             return False
         pose = self.pose()
         along = path.nearest(route.legs[state.leg], (pose["north"], pose["east"]))
@@ -287,7 +363,9 @@ class Guidance:
         self._engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
-        """Command nothing while the controller does not fly. `forget`: then hold what is measured, else go on as before."""
+        """Command nothing while the controller does not fly. `forget`: then hold what is measured,
+        else go on as before.
+        """
         if forget:
             self._begin = Begin.HOLD
         if self._paused and not paused and self._begin is Begin.HOLD:
@@ -295,9 +373,15 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget commands given while guidance did not fly, but a route. Before the first step commands wait."""
+        """Forget commands given while guidance did not fly, but a route. Before the first step
+        commands wait.
+        """
         if self._state is not None:
-            self._given = {name: value for name, value in self._given.items() if name == "leg" and self._route_waits}
+            self._given = {
+                name: value
+                for name, value in self._given.items()
+                if name == "leg" and self._route_waits
+            }
 
     def pose(self) -> dict[str, float]:
         """The last pose by channel; empty before the first pose."""
@@ -305,15 +389,25 @@ class Guidance:
 
     def y(self) -> dict[str, float]:
         """The last y by channel; empty before the first y."""
-        return {} if self._y is None else dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
+        return (
+            {}
+            if self._y is None
+            else dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
+        )
 
     def ages(self, now_ns: int) -> dict[str, float]:
         """Ages of the last received y and pose, s; a channel never received is absent."""
         samples = {"y": self._y, "pose": self._pose}
-        return {name: seconds(now_ns - sample.stamp_ns) for name, sample in samples.items() if sample is not None}
+        return {
+            name: seconds(now_ns - sample.stamp_ns)
+            for name, sample in samples.items()
+            if sample is not None
+        }
 
     def waits(self, now_ns: int) -> str:
-        """Why there is no u_m, once guidance has waited for STALE_TIME for a pose that is young enough; else ""."""
+        """Why there is no u_m, once guidance has waited for STALE_TIME for a pose that is young
+        enough; else "".
+        """
         since = self._waits_from_ns
         pose = self._pose
         if since is None or pose is None or now_ns - since < nanoseconds(STALE_TIME):
@@ -323,7 +417,9 @@ class Guidance:
         return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
 
     def _watch_link(self, now_ns: int) -> int:
-        """Age of the operator's link, ns, 0 without a limit; fly home, once, where the age exceeds the limit."""
+        """Age of the operator's link, ns, 0 without a limit; fly home, once, where the age exceeds
+        the limit.
+        """
         if not (limit_ns := self._params.link_timeout_ns):
             return 0
         if self._operated_ns is None:
@@ -334,7 +430,8 @@ class Guidance:
         return age_ns
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """A step at an instant and flight time t; None without fresh y, before the first pose, and while disengaged.
+        """A step at an instant and flight time t; None without fresh y, before the first pose, and
+        while disengaged.
 
         After steps of None the filters start again at the measured values.
         """
@@ -354,12 +451,18 @@ class Guidance:
         link_age_ns = self._watch_link(now_ns)
         y_values = tuple(y.value.tolist())
         pose_values = tuple(pose.value.tolist())
-        inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority)
+        inputs = Inputs(
+            now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority
+        )
         route_notes = self.route.notes if self.route is not None and self._route_waits else ()
         self._begin = Begin.NO
         self._given = {}
         self._route_waits = False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
         log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
-        notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))
-        return GuidanceOutput(u_m(self._state), log, (*route_notes, *(notice.text for notice in notices)))
+        notices = self._notices.take(
+            seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True))
+        )
+        return GuidanceOutput(
+            u_m(self._state), log, (*route_notes, *(notice.text for notice in notices))
+        )

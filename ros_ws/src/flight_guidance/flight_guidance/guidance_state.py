@@ -19,7 +19,8 @@ from flight_guidance.wind import Wind
 from flight_guidance.zones import Fence
 
 LARGEST = 1e9
-"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
+"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the
+moon is 4e8 m away."""
 
 
 class Mode(IntEnum):
@@ -64,7 +65,9 @@ class Target(NamedTuple):
     climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
-    along: float = 0.0  # m along a line of the route from the start, where the aircraft joins the line
+    along: float = (
+        0.0  # m along a line of the route from the start, where the aircraft joins the line
+    )
     r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
 
 
@@ -80,7 +83,11 @@ LATERAL: Mapping[str, Lateral] = {
 }
 
 
-VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
+VERTICAL: Mapping[str, Vertical] = {
+    "theta": Vertical.THETA,
+    "climb": Vertical.CLIMB,
+    "altitude": Vertical.ALTITUDE,
+}
 
 
 class Home(NamedTuple):
@@ -143,7 +150,9 @@ class Inputs(NamedTuple):
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    commands: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
+    commands: Mapping[
+        str, float
+    ]  # commands that are new, by channel of Target; they name the modes
     authority: Authority = Authority()  # of the inputs, as learned in flight
 
 
@@ -164,7 +173,9 @@ class GuidanceState(NamedTuple):
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
-    joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    joining: float = (
+        0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    )
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
     fence: float = 0.0  # action of the fence: of `fence.Escape`
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
@@ -179,7 +190,8 @@ class Commands(NamedTuple):
     xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
     to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
     track: float = 0.0  # course of the path at the nearest point, rad
-    missed: float = 0.0  # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
+    # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
+    missed: float = 0.0
     clearance: float = LARGEST  # m, from the fence
     predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
     bank_limited: bool = False

@@ -16,15 +16,20 @@ from flight_guidance.guidance_state import (
 from flight_guidance.path import Arc, Leg, Loiter, Point, Route
 
 EXIT = 0.5
-"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another turn."""
+"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another
+turn."""
 
 
 LEVEL = 5.0
 """m. Largest distance from the altitude at which an aircraft leaves a loiter."""
 
 
-def along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route) -> tuple[GuidanceState, float]:
-    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and the distance missed by, m."""
+def along_route(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
+) -> tuple[GuidanceState, float]:
+    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and
+    the distance missed by, m.
+    """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
     near = route.near(state.leg)
@@ -35,7 +40,9 @@ def along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, rout
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
         state = _loitering(state, leg, leg.loiter, pose, dt)
-        ends = has_loitered(state, pose, route) and leaves(leg, EXIT * course_and_speed(pose)[1], pose, position)
+        ends = has_loitered(state, pose, route) and leaves(
+            leg, EXIT * course_and_speed(pose)[1], pose, position
+        )
         return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
@@ -43,9 +50,16 @@ def along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, rout
     return joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
 
 
-def _loitering(state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float) -> GuidanceState:
-    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle on."""
-    error, (course, ground_speed) = path.error(leg, (pose["north"], pose["east"])), course_and_speed(pose)
+def _loitering(
+    state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float
+) -> GuidanceState:
+    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle
+    on.
+    """
+    error, (course, ground_speed) = (
+        path.error(leg, (pose["north"], pose["east"])),
+        course_and_speed(pose),
+    )
     if not state.loitered and abs(error.e) > ground_speed:
         return state
     share = dt / loiter.wait if loiter.wait else 1.0
@@ -61,19 +75,33 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that flies the course there."""
-    return leg.end is not None and bool(path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0]))
+    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that
+    flies the course there.
+    """
+    return leg.end is not None and bool(
+        path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
+    )
 
 
 def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
     """The state on a leg of the route, with the leg's altitude and airspeed."""
     target = state.target._replace(V=route.V[leg], along=0.0)
-    return state._replace(leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0)
+    return state._replace(
+        leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0
+    )
 
 
-def on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | None) -> GuidanceState:
-    """The state with the altitude and the climb rate of the leg at the nearest point, or where the aircraft joins the leg."""
-    flies = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and state.vertical is Vertical.PROFILE
+def on_profile(
+    state: GuidanceState, pose: Mapping[str, float], route: Route | None
+) -> GuidanceState:
+    """The state with the altitude and the climb rate of the leg at the nearest point, or where the
+    aircraft joins the leg.
+    """
+    flies = (
+        state.mode is Mode.ENGAGED
+        and state.lateral is Lateral.ROUTE
+        and state.vertical is Vertical.PROFILE
+    )
     if not flies or route is None:
         return state
     leg = route.legs[state.leg]
@@ -88,15 +116,21 @@ def on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | N
     return state._replace(target=state.target._replace(altitude=altitude, climb=climb))
 
 
-def joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route) -> GuidanceState:
-    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg where the point is near."""
+def joining(
+    state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
+) -> GuidanceState:
+    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg
+    where the point is near.
+    """
     state = _on_leg(state, leg, route)
     flown = route.legs[leg]
     if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
         return state
     start, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
-    side = path.joining(start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0])
+    side = path.joining(
+        start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0]
+    )
     if isinstance(flown, Arc) and side:  # the circle of the arc itself
         side = math.copysign(1.0, flown.radius)
     if side and not along and route.from_V:

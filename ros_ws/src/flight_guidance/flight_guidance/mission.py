@@ -19,20 +19,50 @@ JUMP = 177
 CHANGE_SPEED = 178
 AIRSPEED = 0
 UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
-COMMANDS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
-COMMANDS |= {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
+COMMANDS = {
+    17: "NAV_LOITER_UNLIM",
+    18: "NAV_LOITER_TURNS",
+    19: "NAV_LOITER_TIME",
+    31: "NAV_LOITER_TO_ALT",
+}
+COMMANDS |= {
+    20: "NAV_RETURN_TO_LAUNCH",
+    21: "NAV_LAND",
+    22: "NAV_TAKEOFF",
+    84: "NAV_VTOL_TAKEOFF",
+    85: "NAV_VTOL_LAND",
+}
 COMMANDS |= {16: "NAV_WAYPOINT", 82: "NAV_SPLINE_WAYPOINT", 93: "NAV_DELAY", 178: "DO_CHANGE_SPEED"}
-COMMANDS |= {177: "DO_JUMP", 189: "DO_LAND_START", 206: "DO_SET_CAM_TRIGG_DIST", 201: "DO_SET_ROI", 183: "DO_SET_SERVO"}
+COMMANDS |= {
+    177: "DO_JUMP",
+    189: "DO_LAND_START",
+    206: "DO_SET_CAM_TRIGG_DIST",
+    201: "DO_SET_ROI",
+    183: "DO_SET_SERVO",
+}
 
 COMMANDS |= {179: "DO_SET_HOME", 601: "DO_JUMP_TAG"}
 COMMANDS |= {34: "DO_ORBIT", 35: "DO_FIGURE_EIGHT", 36: "NAV_ARC_WAYPOINT", 94: "NAV_PAYLOAD_PLACE"}
-COMMANDS |= {5000: "NAV_FENCE_RETURN_POINT", 5001: "NAV_FENCE_POLYGON_VERTEX_INCLUSION", 5100: "NAV_RALLY_POINT"}
-COMMANDS |= {5002: "NAV_FENCE_POLYGON_VERTEX_EXCLUSION", 5003: "NAV_FENCE_CIRCLE_INCLUSION", 5004: "NAV_FENCE_CIRCLE_EXCLUSION"}
+COMMANDS |= {
+    5000: "NAV_FENCE_RETURN_POINT",
+    5001: "NAV_FENCE_POLYGON_VERTEX_INCLUSION",
+    5100: "NAV_RALLY_POINT",
+}
+COMMANDS |= {
+    5002: "NAV_FENCE_POLYGON_VERTEX_EXCLUSION",
+    5003: "NAV_FENCE_CIRCLE_INCLUSION",
+    5004: "NAV_FENCE_CIRCLE_EXCLUSION",
+}
 MEANINGS = {
     179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }
-LAST = (UNLIMITED, 20, LAND, 85)  # after which an autopilot flies no item: a loiter without end, the return, the landings
+LAST = (
+    UNLIMITED,
+    20,
+    LAND,
+    85,
+)  # after which an autopilot flies no item: a loiter without end, the return, the landings
 OTHER_WAYS = (34, 35, 36, 94)  # to a place, no line and no loiter
 
 
@@ -48,7 +78,9 @@ class Item(NamedTuple):
 
 
 def named(command: int, number: int) -> str:
-    """The name of a command, by pymavlink where COMMANDS lacks the command, and the number of the item."""
+    """The name of a command, by pymavlink where COMMANDS lacks the command, and the number of the
+    item.
+    """
     name = COMMANDS.get(command, f"MAV_CMD {command}")
     if command not in COMMANDS:
         with suppress(ModuleNotFoundError):
@@ -63,11 +95,12 @@ MOST_ITEMS = 20_000
 
 
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
-    """The positions of the items in the order of flight, with the jumps that are followed, up to an item of LAST.
+    """The positions of the items in the order of flight, with the jumps that are followed, up to an
+    item of LAST.
 
-    A DO_JUMP leads to an item as often as it says, with a negative number for good; a jump back for good ends the order. Raises
-    ParameterError for a jump to no item, for a loop inside of a loop, which PX4 begins again and ArduPilot does not, and for
-    more than MOST_ITEMS.
+    A DO_JUMP leads to an item as often as it says, with a negative number for good; a jump back for
+    good ends the order. Raises ParameterError for a jump to no item, for a loop inside of a loop,
+    which PX4 begins again and ArduPilot does not, and for more than MOST_ITEMS.
     """
     places = {items[k].number: k for k in reversed(range(len(items)))}
     repetitions: dict[int, float] = {}  # repetitions of a jump
@@ -78,7 +111,12 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
         name, _, command, params, *_ = items[place]
         k += 1
         steps += 1
-        require(steps <= MOST_ITEMS, key, f"more than {MOST_ITEMS} items by the repetitions of {name}", "fewer")
+        require(
+            steps <= MOST_ITEMS,
+            key,
+            f"more than {MOST_ITEMS} items by the repetitions of {name}",
+            "fewer",
+        )
         if command != JUMP:
             order.append(place)
             continue
@@ -87,20 +125,32 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
         if not count:
             continue
         require(
-            target in places and count.is_integer(), key, f"{name} to {target}", "a jump to an item, a whole number of times"
+            target in places and count.is_integer(),
+            key,
+            f"{name} to {target}",
+            "a jump to an item, a whole number of times",
         )
         if count < 0.0 and places[target] <= place:
             break
         remaining = repetitions.get(place, count)
-        require(count < 0.0 or remaining >= 0.0, key, f"{name}, a loop inside of a loop", "loops one after the other")
+        require(
+            count < 0.0 or remaining >= 0.0,
+            key,
+            f"{name}, a loop inside of a loop",
+            "loops one after the other",
+        )
         repetitions[place] = remaining - 1.0 if count > 0.0 else count
         order.append(place)
         k = places[target] if remaining else k
     return order
 
 
-def mission_route(key: str, items: Sequence[Item], home: Home | None, notes: Sequence[str] = ()) -> Places:
-    """The waypoints and loiters of a mission in the order of flight; the items that are not flown in notes."""
+def mission_route(
+    key: str, items: Sequence[Item], home: Home | None, notes: Sequence[str] = ()
+) -> Places:
+    """The waypoints and loiters of a mission in the order of flight; the items that are not flown
+    in notes.
+    """
     places: list[Place] = []
     flown: set[int] = set()
     circles: list[str] = []  # of a radius, negative to the left
@@ -110,18 +160,34 @@ def mission_route(key: str, items: Sequence[Item], home: Home | None, notes: Seq
         require(item.command not in OTHER_WAYS, key, item.name, "waypoints and loiters")
         before = places[-1] if places and item.command in LOITERS else None
         if item.command in (WAYPOINT, SPLINE, *LOITERS) and (any(item.params[4:6]) or before):
-            loiter = {TURNS: {"turns": item.params[0]}, TIME: {"wait": item.params[0]}, TO_ALTITUDE: {"climbs": True}}
-            places.append(_mission_place(key, item, speed, before)._replace(**loiter.get(item.command, {})))
-            if item.command in LOITERS and (radius := item.params[1 if item.command == TO_ALTITUDE else 2]):
+            loiter = {
+                TURNS: {"turns": item.params[0]},
+                TIME: {"wait": item.params[0]},
+                TO_ALTITUDE: {"climbs": True},
+            }
+            places.append(
+                _mission_place(key, item, speed, before)._replace(**loiter.get(item.command, {}))
+            )
+            if item.command in LOITERS and (
+                radius := item.params[1 if item.command == TO_ALTITUDE else 2]
+            ):
                 circles.append(f"{radius:g} m of {item.name}")
-        elif item.command == CHANGE_SPEED and item.params[0] == AIRSPEED and (item.params[1] or 0) > 0:
+        elif (
+            item.command == CHANGE_SPEED
+            and item.params[0] == AIRSPEED
+            and (item.params[1] or 0) > 0
+        ):
             speed = item.params[1]
         elif item.command != JUMP:
             continue
         flown.add(k)
     skipped = [item.name for k, item in enumerate(items) if k not in flown]
     sentences = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
-    sentences += [sentence for command, sentence in MEANINGS.items() if any(item.command == command for item in items)]
+    sentences += [
+        sentence
+        for command, sentence in MEANINGS.items()
+        if any(item.command == command for item in items)
+    ]
     waits = [item.name for k, item in enumerate(items) if k in flown and not item.goes_on]
     sentences += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
     circle_note = "circles are clockwise, of the radius of the route"

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modes of guidance: a step from pose, y and target to u_m.
 
-Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch, a climb rate or an altitude.
-The law holds the airspeed; guidance limits the command. The step has no clock and no hidden state: the state is in the log, so
-a sample of the log can be computed again from the sample before.
+Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch,
+a climb rate or an altitude. The law holds the airspeed; guidance limits the command. The step has
+no clock and no hidden state: the state is in the log, so a sample of the log can be computed again
+from the sample before.
 """
 
 import math
@@ -45,7 +46,15 @@ from flight_guidance.lateral import (
     slip_estimate,
     turn_towards,
 )
-from flight_guidance.legs import EXIT, along_route, course_and_speed, has_loitered, joining, leaves, on_profile
+from flight_guidance.legs import (
+    EXIT,
+    along_route,
+    course_and_speed,
+    has_loitered,
+    joining,
+    leaves,
+    on_profile,
+)
 from flight_guidance.path import Arc, Leg, Point, Route
 from flight_guidance.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.vertical import (
@@ -59,15 +68,20 @@ from flight_guidance.vertical import (
 from flight_guidance.wind import Wind, wind_estimate, wind_of
 
 LONGEST_LEAD = 0.5
-"""s. Largest age of a pose over which its attitude is brought to now: the rates change within a second."""
+"""s. Largest age of a pose over which its attitude is brought to now: the rates change within a
+second."""
 
 
 STEEPEST = math.radians(89.0)
 """Largest bank that a mode asks for, before protection."""
 
 
-def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
-    """The state before the first step, at t: holds the heading, the altitude and the airspeed of now."""
+def holding(
+    t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
+) -> GuidanceState:
+    """The state before the first step, at t: holds the heading, the altitude and the airspeed of
+    now.
+    """
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
         t_ns - params.period_ns,
@@ -93,7 +107,9 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     """The state before a step, with filters at the measured values where the filters begin."""
     if state is not None and inputs.begin is Begin.NO:
         return state
-    held = holding(inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params)
+    held = holding(
+        inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params
+    )
     if state is None or inputs.begin is Begin.HOLD:
         return held
     again = held._replace(
@@ -125,13 +141,16 @@ def step(
 ) -> tuple[GuidanceState, Commands]:
     """A step: attitude, commands, u_m.
 
-    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics with p, q, r of y, and psi by
-       `heading_estimate`. While pose is stale: Euler's kinematics alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is
-       unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
-    2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a circle that touches the leg at
-       the start, unless the aircraft is near; a leg whose end the aircraft passes far away is missed.
+    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics
+       with p, q, r of y, and psi by `heading_estimate`. While pose is stale: Euler's kinematics
+       alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until
+       pose returns; then wings level and the altitude of then.
+    2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a
+       circle that touches the leg at the start, unless the aircraft is near; a leg whose end the
+       aircraft passes far away is missed.
     3. The fence: the last safe turn, then home, in place of the lateral mode.
-    4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
+    4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in
+       `attitude.body_rates`; slew of u_m.
     5. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     params = within_reach(params, inputs.authority)
@@ -151,8 +170,16 @@ def step(
     return state._replace(t_ns=inputs.t_ns), commands
 
 
-def escaping_bank(escape: Escape, wanted: Scalar, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Scalar:
-    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a turn, or of a course."""
+def escaping_bank(
+    escape: Escape,
+    wanted: Scalar,
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
+) -> Scalar:
+    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a
+    turn, or of a course.
+    """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
     acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
@@ -170,12 +197,16 @@ def _wanted_rates(
     speed: Scalar,
     params: GuidanceParams,
 ) -> BodyRates:
-    """Body rates to the commanded attitude, rad/s; none after the loss of the pose, and none of a dead output."""
+    """Body rates to the commanded attitude, rad/s; none after the loss of the pose, and none of a
+    dead output.
+    """
     flies = state.mode is Mode.ENGAGED
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
     beta = pose["beta"] if flies else 0.0
     flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
-    rates = body_rates(phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude)
+    rates = body_rates(
+        phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
+    )
     if flat:  # the sideslip is wanted
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is Mode.POSE_LOST:
@@ -194,9 +225,11 @@ def command(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, Commands]:
-    """Protection and u_m of `step`, from the bank asked for by the lateral mode, rad. `t_ns` of the state stays.
+    """Protection and u_m of `step`, from the bank asked for by the lateral mode, rad. `t_ns` of the
+    state stays.
 
-    The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole fleet.
+    The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole
+    fleet.
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits
@@ -210,9 +243,15 @@ def command(
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = pitch_for(climb_c, speed, state.alpha)
     if flies and state.vertical is Vertical.THETA:
-        least, largest = (pitch_for(rate, speed, state.alpha) for rate in _climb_within(pose["altitude"], params))
+        least, largest = (
+            pitch_for(rate, speed, state.alpha) for rate in _climb_within(pose["altitude"], params)
+        )
         theta_wanted = state.target.theta
-        theta_bounded = xp.minimum(xp.maximum(theta_wanted, least), largest) if _is_bounded(limits) else theta_wanted
+        theta_bounded = (
+            xp.minimum(xp.maximum(theta_wanted, least), largest)
+            if _is_bounded(limits)
+            else theta_wanted
+        )
         climb_limited = theta_bounded != theta_wanted
         theta_wanted = theta_bounded
     theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
@@ -236,7 +275,9 @@ def command(
         theta_limited=theta_c != theta_wanted,
         climb_limited=climb_limited,
         V_limited=V_wanted != state.target.V,
-        slew_limited=reduce(or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))),
+        slew_limited=reduce(
+            or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))
+        ),
     )
     return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
 
@@ -255,18 +296,29 @@ def _with_estimates(
     flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
     rolling = abs(y["p"]) / params.attitude.roll_rate
     slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
-    return state._replace(alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt))
+    return state._replace(
+        alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt)
+    )
 
 
-def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams) -> GuidanceState:
+def _with_attitude(
+    state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams
+) -> GuidanceState:
     """Mode, and attitude from pose or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
         if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
-            after_loss = home(pose, params) if params.home.after_loss else {"phi": 0.0, "altitude": pose["altitude"]}
+            after_loss = (
+                home(pose, params)
+                if params.home.after_loss
+                else {"phi": 0.0, "altitude": pose["altitude"]}
+            )
             lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
             level = state._replace(
-                lateral=lateral, vertical=Vertical.ALTITUDE, target=state.target._replace(**after_loss), fence=0.0
+                lateral=lateral,
+                vertical=Vertical.ALTITUDE,
+                target=state.target._replace(**after_loss),
+                fence=0.0,
             )
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
         state = state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
@@ -286,9 +338,15 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
 
 
 def motion_of(
-    state: GuidanceState, pose: Mapping[str, Scalar], y: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
 ) -> Motion:
-    """What the fence predicts a turn from. A roll that has begun goes on for the lag of the bank, 1 / (2 k_phi)."""
+    """What the fence predicts a turn from. A roll that has begun goes on for the lag of the bank, 1
+    / (2 k_phi).
+    """
     bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
     lag = 0.5 / params.attitude.k_phi
     phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], y["r"])
@@ -306,7 +364,11 @@ def motion_of(
 
 
 def _within_fence(
-    state: GuidanceState, pose: Mapping[str, float], y: Mapping[str, float], speed: float, params: GuidanceParams
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    y: Mapping[str, float],
+    speed: float,
+    params: GuidanceParams,
 ) -> tuple[GuidanceState, Escape]:
     """The state with the action of the fence; home is the target from the begin of the action on.
 
@@ -314,30 +376,51 @@ def _within_fence(
     """
     if params.fence is None or state.mode is not Mode.ENGAGED:
         return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
-    escape = Escape(*map(float, last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params))))
-    commanded = state.lateral is not Lateral.ORBIT or (state.target.north, state.target.east) != params.home[:2]
+    escape = Escape(
+        *map(
+            float,
+            last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params)),
+        )
+    )
+    commanded = (
+        state.lateral is not Lateral.ORBIT
+        or (state.target.north, state.target.east) != params.home[:2]
+    )
     if commanded and escape.action in {HOME, AROUND}:
         escape = escape._replace(action=0.0)
     elif escape.begins or (commanded and escape.action == BACK):
         target = state.target._replace(**home(pose, params))
-        state = state._replace(lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0)
+        state = state._replace(
+            lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+        )
     return state._replace(fence=escape.action), escape
 
 
 def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
-    return wind_of(pose["v_north"], pose["v_east"], pose["climb"], pose["psi"] + pose["beta"], speed)
+    return wind_of(
+        pose["v_north"], pose["v_east"], pose["climb"], pose["psi"] + pose["beta"], speed
+    )
 
 
 def _with_commands(
-    state: GuidanceState, commands: Mapping[str, float], pose: Mapping[str, float], dt: float, route: Route | None
+    state: GuidanceState,
+    commands: Mapping[str, float],
+    pose: Mapping[str, float],
+    dt: float,
+    route: Route | None,
 ) -> tuple[GuidanceState, float]:
-    """The modes and commands in force: of the next leg once a leg is passed, then the commands given.
+    """The modes and commands in force: of the next leg once a leg is passed, then the commands
+    given.
 
-    A lateral command ends the leg: the command may come with a new route, and so with new legs. Returns further the distance
-    from the end of a leg that ends here and is missed, m.
+    A lateral command ends the leg: the command may come with a new route, and so with new legs.
+    Returns further the distance from the end of a leg that ends here and is missed, m.
     """
     missed = 0.0
-    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & commands.keys()
+    on_route = (
+        state.mode is Mode.ENGAGED
+        and state.lateral is Lateral.ROUTE
+        and not LATERAL.keys() & commands.keys()
+    )
     if on_route and route is not None:
         state, missed = along_route(state, pose, dt, route)
     if not commands:
@@ -348,7 +431,9 @@ def _with_commands(
     if state.fence >= HOME and LATERAL.keys() & commands.keys():
         state = state._replace(fence=0.0)
     for name in commands:
-        state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
+        state = state._replace(
+            lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical)
+        )
     if "leg" in commands and route is not None:
         state = joining(state, int(commands["leg"]), commands.get("along", 0.0), pose, route)
         state = state._replace(target=state.target._replace(**commands))
@@ -360,9 +445,15 @@ def _with_commands(
 
 
 def _bank(
-    state: GuidanceState, pose: Mapping[str, float], speed: float, route: Route | None, params: GuidanceParams
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    speed: float,
+    route: Route | None,
+    params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of the leg, m."""
+    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of
+    the leg, m.
+    """
     nowhere = PathError(0.0, 0.0, 0.0)
     if state.mode is not Mode.ENGAGED:
         return 0.0, nowhere, 0.0
@@ -372,9 +463,21 @@ def _bank(
     if state.lateral is Lateral.PHI:
         return target.phi, nowhere, 0.0
     if state.lateral is Lateral.HEADING:
-        return bank_for(course_acceleration(target.heading, state.psi, speed, params.k_chi), gamma, STEEPEST), nowhere, 0.0
+        return (
+            bank_for(
+                course_acceleration(target.heading, state.psi, speed, params.k_chi), gamma, STEEPEST
+            ),
+            nowhere,
+            0.0,
+        )
     if state.lateral is Lateral.COURSE:
-        return bank_for(course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST), nowhere, 0.0
+        return (
+            bank_for(
+                course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST
+            ),
+            nowhere,
+            0.0,
+        )
     leg: Leg = Arc((target.north, target.east), target.radius)
     following = None
     position = (pose["north"], pose["east"])
@@ -385,16 +488,35 @@ def _bank(
             radius = state.joining * route.radius
             error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
             onto = partial(_joins, start, course, route.near(state.leg), over_ground[0])
-            wanted = follow(error, path.error(leg, start).curvature, onto, state.slip, pose, speed, params)
-            return wanted, error, path.joining_length(start, course, radius, position, over_ground[0])
+            wanted = follow(
+                error, path.error(leg, start).curvature, onto, state.slip, pose, speed, params
+            )
+            return (
+                wanted,
+                error,
+                path.joining_length(start, course, radius, position, over_ground[0]),
+            )
         following = route.legs[state.leg + 1] if leg.end is not None else None
     error = path.error(leg, position)
-    entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
+    entry = (
+        error.curvature
+        if following is None
+        else path.error(following, leg.end or (0.0, 0.0)).curvature
+    )
     entered: Callable[[Point], Any] = partial(path.entered, leg, following)
-    if route is not None and following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
+    if (
+        route is not None
+        and following is not None
+        and path.is_orbit(leg)
+        and has_loitered(state, pose, route)
+    ):
         near = route.near(state.leg)
-        late = leaves(leg, near, pose, position) and not leaves(leg, EXIT * over_ground[1], pose, position)
-        entered = partial(path.entered, leg, following) if late else partial(leaves, leg, near, pose)
+        late = leaves(leg, near, pose, position) and not leaves(
+            leg, EXIT * over_ground[1], pose, position
+        )
+        entered = (
+            partial(path.entered, leg, following) if late else partial(leaves, leg, near, pose)
+        )
     wanted = follow(error, entry, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(leg, position)
 
@@ -413,14 +535,18 @@ def follow(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg at the start, 1/m.
+    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg
+    at the start, 1/m.
 
-    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered` holds for the position a mean
-    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
+    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered`
+    holds for the position a mean lag ahead. The mean lag of a change of the bank d is abs(d) / (2
+    p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
-    change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(ground_speed**2 * -error.curvature / GRAVITY)
+    change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(
+        ground_speed**2 * -error.curvature / GRAVITY
+    )
     lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
     error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
@@ -429,24 +555,36 @@ def follow(
 
 
 def _climb(
-    state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, dt: float, params: GuidanceParams
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    dt: float,
+    params: GuidanceParams,
 ) -> tuple[Scalar, Any]:
     """Commanded climb rate, m/s, and whether protection limits the rate."""
     if state.vertical is Vertical.THETA:
         return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
     vertical = params.vertical
     target = state.target
-    wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
+    wanted = (
+        target.climb
+        if state.vertical is Vertical.CLIMB
+        else climb_for(target.altitude - pose["altitude"], vertical)
+    )
     if state.vertical is Vertical.PROFILE:
         wanted = wanted + target.climb
-    least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)
+    least, largest = protection.climb_range(
+        vertical.climb, vertical.sink, state.V_c - speed, params.speed
+    )
     xp = array_namespace(speed)
     lower, upper = _climb_within(pose["altitude"], params)
     least = xp.maximum(least, lower)
     largest = xp.minimum(largest, upper)
     fast = protection.sink_limit(vertical.climb, vertical.sink, speed, params.limits.largest_speed)
     least = xp.maximum(least, fast)
-    largest = xp.minimum(largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor))
+    largest = xp.minimum(
+        largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
+    )
     permitted = xp.minimum(xp.maximum(wanted, least), largest)
     return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted
 
@@ -456,9 +594,13 @@ def _is_bounded(limits: Limits) -> bool:
 
 
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for` to the bounds."""
+    """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for`
+    to the bounds.
+    """
     vertical = params.vertical
     limits = params.limits
     if not _is_bounded(limits):
         return -vertical.sink, vertical.climb
-    return climb_for(limits.lowest - altitude, vertical), climb_for(limits.highest - altitude, vertical)
+    return climb_for(limits.lowest - altitude, vertical), climb_for(
+        limits.highest - altitude, vertical
+    )

@@ -81,10 +81,12 @@ LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ER
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
-    """A tick takes the received y, pose, target and route, steps `guidance.Guidance` and publishes u_m and guidance.
+    """A tick takes the received y, pose, target and route, steps `guidance.Guidance` and publishes
+    u_m and guidance.
 
-    In real time guidance flies while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step
-    waits for the y and the pose of the instant and publishes exactly one u_m, without channels where guidance has no command.
+    In real time guidance flies while the controller is ENGAGED. In lockstep the number of samples
+    of y gives the time. A step waits for the y and the pose of the instant and publishes exactly
+    one u_m, without channels where guidance has no command.
     """
 
     def __init__(self) -> None:
@@ -94,10 +96,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
         self._named = NamedDecoder()
         self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
-        # An operator has the system clock, not simulated time. A target from before a stop of guidance is void:
-        # the operator knows that the target failed.
+        # An operator has the system clock, not simulated time. A target from before a stop of
+        # guidance is void: the operator knows that the target failed.
         max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
-        self._target = self.receive(TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES)
+        self._target = self.receive(
+            TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES
+        )
         self._route_subscription = self.subscribe(ROUTE, STATE)  # the newest route alone
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
@@ -125,19 +129,35 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self._controller_mode = ControllerMode.WAITING
             self._guidance.pause(paused=True, forget=False)
             self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
-        self._odometry, self._imu, self._fix, self._wind = map(self._view, (ODOMETRY, IMU, FIX, WIND))
+        self._odometry, self._imu, self._fix, self._wind = map(
+            self._view, (ODOMETRY, IMU, FIX, WIND)
+        )
         self._path, self._markers = (self._view(topic, PATH_PERIOD_NS) for topic in (PATH, MARKERS))
         # REP 105: with several aircraft, each body frame has a prefix, and they share the map
         self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
-        self._broadcast = None if TFMessage is None else self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
+        self._broadcast = (
+            None
+            if TFMessage is None
+            else self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
+        )
         if self._broadcast is None:
             self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
         self._flown: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         for kind, name, answer in (
             (SetBool, "engage", self._engage),
             (Trigger, "hold", lambda _: self._guidance.hold() or "guidance does not fly"),
-            (Trigger, "skip", lambda _: self._guidance.skip() or "no route with a further leg is flown"),
-            (Trigger, "resume", lambda _: self._guidance.resume() or "found no route to resume, or the route is flown"),
+            (
+                Trigger,
+                "skip",
+                lambda _: self._guidance.skip() or "no route with a further leg is flown",
+            ),
+            (
+                Trigger,
+                "resume",
+                lambda _: (
+                    self._guidance.resume() or "found no route to resume, or the route is flown"
+                ),
+            ),
             (Trigger, "home", lambda _: self._guidance.home() or "guidance does not fly"),
         ):
             self.create_service(kind, f"~/{name}", _service(answer, self._guidance.keep_link))
@@ -175,7 +195,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose if self._inputs.has_y else self._y).name
 
     def _receives_authority(self, now_ns: int) -> bool:
-        """Lockstep: whether the last `authority` from before a step has arrived, of a controller that learns."""
+        """Lockstep: whether the last `authority` from before a step has arrived, of a controller
+        that learns.
+        """
         if not (rate := self.parameters.authority_rate) or not now_ns:
             return True
         self._authority.poll(now_ns)
@@ -185,8 +207,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._has_authority
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        # One of the instant of the step itself comes before or after it: in lockstep it acts from the next step on.
-        while self._authorities and (self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep):
+        # One of the instant of the step itself comes before or after it: in lockstep it acts from
+        # the next step on.
+        while self._authorities and (
+            self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep
+        ):
             value = self._authorities.popleft().value.tolist()
             self._guidance.take_authority(dict(zip(AUTHORITY_CHANNELS, value, strict=True)))
         self._target.poll(now_ns, MAX_TARGETS)
@@ -223,7 +248,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     # Received messages
 
     def _receive(
-        self, topic: Topic, decode: Callable[[bytes], StampedVector | None], take: Callable[[StampedVector, int], None]
+        self,
+        topic: Topic,
+        decode: Callable[[bytes], StampedVector | None],
+        take: Callable[[StampedVector, int], None],
     ) -> Receiver[StampedVector]:
         lock = PublisherLock(self._timeouts_ns)
         return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
@@ -234,7 +262,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if self.parameters.lockstep and not sample.channels:
             return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
         values = {"beta": 0.0} | sample.channels
-        return StampedVector(sample.stamp_ns, select(channels.POSE, [*values], [*values.values()]), sample.sender)
+        return StampedVector(
+            sample.stamp_ns, select(channels.POSE, [*values], [*values.values()]), sample.sender
+        )
 
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
@@ -254,9 +284,16 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 require_size(received.message, MAX_ROUTE_SIZE)
                 message = deserialize_message(received.message, Path)
                 frame = message.header.frame_id
-                require(frame in ROUTE_FRAMES, "route", f"the frame {frame!r}", f"{MAP!r}, or none named")
+                require(
+                    frame in ROUTE_FRAMES,
+                    "route",
+                    f"the frame {frame!r}",
+                    f"{MAP!r}, or none named",
+                )
                 points = [stamped.pose.position for stamped in message.poses]
-                route = self.parameters.plan([Waypoint(point.y, point.x, point.z) for point in points])
+                route = self.parameters.plan(
+                    [Waypoint(point.y, point.x, point.z) for point in points]
+                )
             except ChannelError as error:
                 self.refusals.add(self._route_subscription, error.reason, str(error))
             except (ParameterError, DeserializationError) as error:
@@ -268,22 +305,33 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
         if np.any(sample.value < 0.0):
-            raise ChannelError("bounds", "authority: found a value below 0, expected what an input can do either way")
+            raise ChannelError(
+                "bounds",
+                "authority: found a value below 0, expected what an input can do either way",
+            )
         self._authorities.append(sample)
         self._authority_ns = sample.stamp_ns
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
-        """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a failsafe, go on."""
+        """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a
+        failsafe, go on.
+        """
         try:
             mode = ControllerMode(int(sample.value[0]))
         except ValueError as error:
             raise ChannelError("mode", str(error)) from None
         if mode is not self._controller_mode:
             self._controller_mode = mode
-            self._guidance.pause(paused=mode is not ControllerMode.ENGAGED, forget=mode is ControllerMode.INACTIVE)
+            self._guidance.pause(
+                paused=mode is not ControllerMode.ENGAGED, forget=mode is ControllerMode.INACTIVE
+            )
 
     def _engage(self, request: Any) -> bool | str:
-        if request.data and not self.parameters.lockstep and self._controller_mode is not ControllerMode.ENGAGED:
+        if (
+            request.data
+            and not self.parameters.lockstep
+            and self._controller_mode is not ControllerMode.ENGAGED
+        ):
             return f"the controller is {self._controller_mode.name}, expected ENGAGED"
         self._guidance.engage(engaged=request.data)
         return True
@@ -299,7 +347,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         message.child_frame_id = self._body
         placed = message.pose.pose
         placed.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
-        for key, value in zip("xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True):
+        for key, value in zip(
+            "xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True
+        ):
             setattr(placed.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
@@ -312,13 +362,17 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
-        """Attitude and rates, the place on the Earth where an origin is given, the estimated wind by where the air moves to."""
+        """Attitude and rates, the place on the Earth where an origin is given, the estimated wind
+        by where the air moves to.
+        """
         place = odometry.pose.pose
         twist = odometry.twist.twist
         imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
         imu.header.stamp = odometry.header.stamp
         imu.header.frame_id = self._body
-        imu.linear_acceleration_covariance[0] = -1.0  # no estimate, as the definition of the message says
+        imu.linear_acceleration_covariance[
+            0
+        ] = -1.0  # no estimate, as the definition of the message says
         self._imu.publish(imu)
         wind = Vector3Stamped(header=odometry.header)
         if (state := self._guidance.state) is not None:
@@ -328,7 +382,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             return
         latitude, longitude, height = self.parameters.origin
         position = geographic(place.position.y, place.position.x, Origin(latitude, longitude))
-        fix = NavSatFix(latitude=position.latitude, longitude=position.longitude, altitude=height + place.position.z)
+        fix = NavSatFix(
+            latitude=position.latitude,
+            longitude=position.longitude,
+            altitude=height + place.position.z,
+        )
         fix.header.stamp = odometry.header.stamp
         fix.header.frame_id = self._body
         fix.status.status = NavSatStatus.STATUS_FIX
@@ -354,14 +412,28 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         ages = {} if self.parameters.lockstep else self._guidance.ages(self.now_ns())
-        further: dict[str, object] = {f"age of {name} (s)": f"{age:.4f}" for name, age in ages.items()}
+        further: dict[str, object] = {
+            f"age of {name} (s)": f"{age:.4f}" for name, age in ages.items()
+        }
         if (state := self._guidance.state) is not None:
-            further |= {"lateral": state.lateral.name, "vertical": state.vertical.name, "leg": state.leg}
-        return LEVELS.get(self._mode, DiagnosticStatus.WARN), self._waits or SENTENCES[self._mode], further
+            further |= {
+                "lateral": state.lateral.name,
+                "vertical": state.vertical.name,
+                "leg": state.leg,
+            }
+        return (
+            LEVELS.get(self._mode, DiagnosticStatus.WARN),
+            self._waits or SENTENCES[self._mode],
+            further,
+        )
 
 
-def _service(answer: Callable[[Any], bool | str], called: Callable[[], None]) -> Callable[[Any, Any], Any]:
-    """A service callback: True, or a sentence of refusal, as the response. `called` knows of each call."""
+def _service(
+    answer: Callable[[Any], bool | str], called: Callable[[], None]
+) -> Callable[[Any, Any], Any]:
+    """A service callback: True, or a sentence of refusal, as the response. `called` knows of each
+    call.
+    """
 
     def callback(request: Any, response: Any) -> Any:
         called()

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, the fence, a flight carried back, a strong wind, a lost link, new limits.
+"""Notices of guidance: a missed leg, the fence, a flight carried back, a strong wind, a lost link,
+new limits.
 
-The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
+The node logs the sentences as warnings; the summary of a flight takes the same sentences from the
+log.
 """
 
 import math
@@ -22,7 +24,8 @@ LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
 
 LINK_AGE = "age.link"
-"""Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier versions had none."""
+"""Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
+versions had none."""
 
 STALE_TIME = 2.0
 """The same for a pose older than its limit, s."""
@@ -36,7 +39,8 @@ class Notice(NamedTuple):
 
 
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
-    """Whether an aircraft that flies ahead along a path through the air goes back along the path over ground.
+    """Whether an aircraft that flies ahead along a path through the air goes back along the path
+    over ground.
 
     `log`: channels of `guidance`, values or arrays.
     """
@@ -52,7 +56,9 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
 
 
 class _Lasting:
-    """Whether a condition has lasted for `dwell`; due once, and again after the condition has been away for `dwell`."""
+    """Whether a condition has lasted for `dwell`; due once, and again after the condition has been
+    away for `dwell`.
+    """
 
     def __init__(self, dwell: float = DWELL) -> None:
         self._dwell = dwell
@@ -75,12 +81,23 @@ class _Lasting:
 class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
-    `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed command, m/s, the wind up to
-    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`.
+    `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed
+    command, m/s, the wind up to which circles fit into the bank; `link_timeout`:
+    guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`.
     """
 
     CHANNELS = (
-        *("leg", "missed", "mode.lateral", "track", "V_c", "pose.v_north", "pose.v_east", "wind.north", "wind.east"),
+        *(
+            "leg",
+            "missed",
+            "mode.lateral",
+            "track",
+            "V_c",
+            "pose.v_north",
+            "pose.v_east",
+            "wind.north",
+            "wind.east",
+        ),
         *("fence.action", "fence.clearance", "age.pose"),
     )
 
@@ -120,27 +137,47 @@ class Notices:
         self._action = log["fence.action"]
         if abs(self._action) == RIGHT and self._action != action:
             side = "right" if self._action == RIGHT else "left"
-            texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
+            texts.append(
+                f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home"
+            )
         texts += self._outside(t, log["fence.clearance"])
         wind = math.hypot(log["wind.north"], log["wind.east"])
         largest = self._largest_wind(log["V_c"])
-        if (authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))) != self._authority:
-            self._authority, reached, self._reached = authority, self._reached, self._reach(authority)
+        if (
+            authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))
+        ) != self._authority:
+            self._authority, reached, self._reached = (
+                authority,
+                self._reached,
+                self._reach(authority),
+            )
             if reached != self._reached:
-                texts.append(f"by the learned model {self._reached}" if self._reached else "own limits again")
+                texts.append(
+                    f"by the learned model {self._reached}" if self._reached else "own limits again"
+                )
         if self._link.due(t, holds=log.get(LINK_AGE, 0.0) > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
-            texts.append(f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s")
+            texts.append(
+                f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s"
+            )
         if self._blown.due(t, holds=bool(is_blown_back(log))):
-            texts.append(f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of {wind:.1f} m/s")
+            texts.append(
+                f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of "
+                f"{wind:.1f} m/s"
+            )
         if self._strong.due(t, holds=wind > largest):
-            consequence = f"above {largest:.1f} m/s circles of the least radius take more than the largest bank"
+            consequence = (
+                f"above {largest:.1f} m/s circles of the least radius take more than "
+                "the largest bank"
+            )
             texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {consequence}")
         return [Notice(t, text) for text in texts]
 
     def _outside(self, t: float, clearance: float) -> list[str]:
-        """The sentence where the aircraft leaves the fence, or is back inside. While pose is lost, neither is known."""
+        """The sentence where the aircraft leaves the fence, or is back inside. While pose is lost,
+        neither is known.
+        """
         if clearance >= LARGEST:
             return []
         is_outside = clearance < 0.0
@@ -153,11 +190,15 @@ class Notices:
         if was_outside and not is_outside:
             lasted = t - self._outside_from
             self._outside_from = math.nan
-            return [f"inside of the fence after {lasted:.1f} s outside, {self._farthest:.0f} m at most"]
+            return [
+                f"inside of the fence after {lasted:.1f} s outside, {self._farthest:.0f} m at most"
+            ]
         return []
 
     def read_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
-        """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""
+        """The notices of a whole log, with arrays as channels; none where the log is of a version
+        without these channels.
+        """
         if not has_channels([*log]):
             return []
         names = [*self.CHANNELS, *(name for name in (LINK_AGE, *LEARNED) if name in log)]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose as odometry of REP 103: the map frame is east, north, up, the body frame forward, left, up."""
+"""Pose as odometry of REP 103: the map frame is east, north, up, the body frame forward, left,
+up.
+"""
 
 import math
 from collections.abc import Mapping
@@ -12,9 +14,12 @@ ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes
 
 
 def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
-    """Orientation x, y, z, w of forward-left-up in east-north-up: R_z(pi/2 - psi) R_y(-theta) R_x(phi); angles in rad."""
+    """Orientation x, y, z, w of forward-left-up in east-north-up: R_z(pi/2 - psi) R_y(-theta)
+    R_x(phi); angles in rad.
+    """
     (cr, sr), (cp, sp), (cy, sy) = (
-        (math.cos(angle / 2.0), math.sin(angle / 2.0)) for angle in (phi, -theta, math.pi / 2.0 - psi)
+        (math.cos(angle / 2.0), math.sin(angle / 2.0))
+        for angle in (phi, -theta, math.pi / 2.0 - psi)
     )
     return (
         sr * cp * cy - cr * sp * sy,
@@ -33,4 +38,8 @@ def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
     right = pose["v_east"] * math.cos(psi) - pose["v_north"] * math.sin(psi)
     forward = ahead * math.cos(theta) + pose["climb"] * math.sin(theta)
     down = ahead * math.sin(theta) - pose["climb"] * math.cos(theta)
-    return forward, -right * math.cos(phi) - down * math.sin(phi), right * math.sin(phi) - down * math.cos(phi)
+    return (
+        forward,
+        -right * math.cos(phi) - down * math.sin(phi),
+        right * math.sin(phi) - down * math.cos(phi),
+    )

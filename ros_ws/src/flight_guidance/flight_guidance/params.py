@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of guidance. What is left out follows by rule from the reference model, the throttle and the speeds."""
+"""Parameters of guidance. What is left out follows by rule from the reference model, the throttle
+and the speeds.
+"""
 
 import math
 from collections.abc import Sequence
@@ -66,7 +68,9 @@ class Steps(Config):
 
     def _check(self) -> None:
         require_length("value", self.value, [f"{start:g} s" for start in self.start])
-        rises = all(later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False))
+        rises = all(
+            later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False)
+        )
         require(rises, "start", list(self.start), "times in rising order")
 
 
@@ -76,9 +80,13 @@ class RouteConfig(Config):
     north: Numbers = Field(description="m")
     east: Numbers = Field(description="m")
     altitude: Numbers = Field(description="m, as `pose`")
-    V: tuple[Positive, ...] = Field(default=(), description="airspeed to each waypoint, m/s; none: trim speed")
+    V: tuple[Positive, ...] = Field(
+        default=(), description="airspeed to each waypoint, m/s; none: trim speed"
+    )
     turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
-    wait: tuple[NonNegative, ...] = Field(default=(), description="time on a circle round each waypoint, s")
+    wait: tuple[NonNegative, ...] = Field(
+        default=(), description="time on a circle round each waypoint, s"
+    )
     leave: tuple[Number, ...] = Field(
         default=(),
         description="altitude at which a circle is left, m; none: `altitude`",
@@ -86,16 +94,40 @@ class RouteConfig(Config):
 
     def _check(self) -> None:
         waypoints = [f"waypoint {k}" for k in range(len(self.north))]
-        for key in ("east", "altitude", *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key))):
+        for key in (
+            "east",
+            "altitude",
+            *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key)),
+        ):
             require_length(key, getattr(self, key), waypoints)
-        both = [k for k, (turns, wait) in enumerate(zip(self.turns, self.wait, strict=False)) if turns and wait]
-        require(not both, "turns", f"turns and a wait at waypoint {both[0] if both else 0}", "one of both")
+        both = [
+            k
+            for k, (turns, wait) in enumerate(zip(self.turns, self.wait, strict=False))
+            if turns and wait
+        ]
+        require(
+            not both,
+            "turns",
+            f"turns and a wait at waypoint {both[0] if both else 0}",
+            "one of both",
+        )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
         """The waypoints of the equations."""
         count = len(self.north)
-        columns = (self.V or (None,) * count, self.turns or (0.0,) * count, self.wait or (0.0,) * count)
-        rows = zip(self.north, self.east, self.altitude, *columns, self.leave or (None,) * count, strict=True)
+        columns = (
+            self.V or (None,) * count,
+            self.turns or (0.0,) * count,
+            self.wait or (0.0,) * count,
+        )
+        rows = zip(
+            self.north,
+            self.east,
+            self.altitude,
+            *columns,
+            self.leave or (None,) * count,
+            strict=True,
+        )
         return tuple(Waypoint(*row) for row in rows)
 
 
@@ -117,9 +149,21 @@ class ZoneConfig(Config):
         shape = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
         require(fits, "north", shape, "three or more corners, or a centre with a radius")
         corners = list(zip(self.north, self.east, strict=True))
-        twice = [k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]]
-        require(not twice, "north", f"the corner {corners[twice[0]] if twice else ''} twice in succession", "each corner once")
-        require(self.group is None or not self.exclude, "group", f"{self.group} of a zone to keep out of", "none")
+        twice = [
+            k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]
+        ]
+        require(
+            not twice,
+            "north",
+            f"the corner {corners[twice[0]] if twice else ''} twice in succession",
+            "each corner once",
+        )
+        require(
+            self.group is None or not self.exclude,
+            "group",
+            f"{self.group} of a zone to keep out of",
+            "none",
+        )
 
     def zone(self) -> Zone:
         """The zone of the equations."""
@@ -127,33 +171,54 @@ class ZoneConfig(Config):
 
 
 class HomeConfig(Config):
-    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the operator's link by choice."""
+    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the
+    operator's link by choice.
+    """
 
     north: Number = Field(default=0.0, description="m")
     east: Number = Field(default=0.0, description="m")
     altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
-    after_loss: bool = Field(default=False, description="fly home when pose returns; else level the wings")
-    link_timeout: Positive | None = Field(default=None, description="time without an operator before the way home, s")
+    after_loss: bool = Field(
+        default=False, description="fly home when pose returns; else level the wings"
+    )
+    link_timeout: Positive | None = Field(
+        default=None, description="time without an operator before the way home, s"
+    )
 
 
 class GuidanceConfig(NodeConfig):
     """Parameters of the guidance node."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(
+        default=50.0, description="the rate at which u_m is published, Hz"
+    )
     start_time: float = Field(
-        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
+        default=0.0,
+        ge=-1,
+        le=1e10,
+        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
-    authority_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: rate of `authority`, Hz; 0: none")
+    authority_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: rate of `authority`, Hz; 0: none"
+    )
     outputs: Names = Field(default=RATES_AND_SPEED, description="the commands u_m in any order")
-    natural_frequency: Positives = Field(description="those of the reference model, rad/s; `parameters.yaml` of a run has them")
+    natural_frequency: Positives = Field(
+        description="those of the reference model, rad/s; `parameters.yaml` of a run has them"
+    )
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
         default=(), description="deceleration and acceleration by throttle from trim, m/s^2"
     )
-    roll_authority: Positive | None = Field(default=None, description="roll acceleration of full aileron, rad/s^2")
-    stall_speed: Positive | None = Field(default=None, description="V_s, true airspeed, m/s; none: 1.15 V_s is 0.8 V0")
-    speed_limit: Positive | None = Field(default=None, description="largest true airspeed, m/s; none: 1.4 V0")
+    roll_authority: Positive | None = Field(
+        default=None, description="roll acceleration of full aileron, rad/s^2"
+    )
+    stall_speed: Positive | None = Field(
+        default=None, description="V_s, true airspeed, m/s; none: 1.15 V_s is 0.8 V0"
+    )
+    speed_limit: Positive | None = Field(
+        default=None, description="largest true airspeed, m/s; none: 1.4 V0"
+    )
     ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose`")
     altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose`")
     wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
@@ -162,61 +227,120 @@ class GuidanceConfig(NodeConfig):
         default=math.radians(30.0), description="largest bank phi_max, rad"
     )
     roll_rate: Positive | None = Field(
-        default=None, description="largest rate of the bank p_max, rad/s; none: by the aileron's authority"
+        default=None,
+        description="largest rate of the bank p_max, rad/s; none: by the aileron's authority",
     )
     load: Positive = Field(default=0.3, description="largest change of the load factor by pitch, 1")
     pitch: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
-        default=(math.radians(-15.0), math.radians(25.0)), description="least and largest pitch, rad"
+        default=(math.radians(-15.0), math.radians(25.0)),
+        description="least and largest pitch, rad",
     )
-    climb: Positive | None = Field(default=None, description="largest climb rate, m/s; none: by the throttle's authority")
-    sink: Positive | None = Field(default=None, description="largest sink rate, m/s; none: by the throttle's authority")
-    acceleration: Positive = Field(default=1.0, description="permitted vertical acceleration, m/s^2")
-    altitude_gain: Positive | None = Field(default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule")
+    climb: Positive | None = Field(
+        default=None, description="largest climb rate, m/s; none: by the throttle's authority"
+    )
+    sink: Positive | None = Field(
+        default=None, description="largest sink rate, m/s; none: by the throttle's authority"
+    )
+    acceleration: Positive = Field(
+        default=1.0, description="permitted vertical acceleration, m/s^2"
+    )
+    altitude_gain: Positive | None = Field(
+        default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule"
+    )
     alpha_time: Positive | None = Field(
         default=None, description="time constant of the estimated angle of attack, s; none: by rule"
     )
-    sideslip_gain: NonNegative | None = Field(default=None, description="k_beta, 1/s, with beta in `pose`; none: by rule")
-    period: Positive | None = Field(default=None, description="period of path following, s; none: by rule")
-    damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(default=0.75, description="damping of path following, 1")
+    sideslip_gain: NonNegative | None = Field(
+        default=None, description="k_beta, 1/s, with beta in `pose`; none: by rule"
+    )
+    period: Positive | None = Field(
+        default=None, description="period of path following, s; none: by rule"
+    )
+    damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(
+        default=0.75, description="damping of path following, 1"
+    )
     capture: Annotated[float, Field(gt=0, le=math.pi / 4.0)] = Field(
         default=math.radians(30.0), description="largest angle at which a path is approached, rad"
     )
-    radius: Positive | None = Field(default=None, description="radius of fillets and of the last orbit, m; none: by rule")
-    profile: Literal["slope", "step"] = Field(default="slope", description="altitude changes along a leg, or at its begin")
-    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which y and pose are stale, s")
+    radius: Positive | None = Field(
+        default=None, description="radius of fillets and of the last orbit, m; none: by rule"
+    )
+    profile: Literal["slope", "step"] = Field(
+        default="slope", description="altitude changes along a leg, or at its begin"
+    )
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
+        default=0.2, description="the age at which y and pose are stale, s"
+    )
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long dead reckoning replaces a stale pose, s"
     )
     origin: Annotated[Numbers, Field(min_length=3, max_length=3)] | None = Field(
         default=None,
-        description="latitude, longitude (deg) and height above WGS84 (m) of north = east = altitude = 0",
+        description="latitude, longitude (deg) and height above WGS84 (m) of north = east = "
+        "altitude = 0",
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
-    route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")
-    fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in or to keep out of")
-    home: HomeConfig = Field(default=HomeConfig(), description="where the aircraft goes at a fence and by `guidance/home`")
+    route: RouteConfig | None = Field(
+        default=None, description="the route, flown from the start on"
+    )
+    fence: dict[str, ZoneConfig] = Field(
+        default={}, description="zones to stay in or to keep out of"
+    )
+    home: HomeConfig = Field(
+        default=HomeConfig(),
+        description="where the aircraft goes at a fence and by `guidance/home`",
+    )
 
     def _check(self) -> None:
         period_ns(self.rate, "rate")
-        require(sorted(self.outputs) == sorted(RATES_AND_SPEED), "outputs", ", ".join(self.outputs), ", ".join(RATES_AND_SPEED))
+        require(
+            sorted(self.outputs) == sorted(RATES_AND_SPEED),
+            "outputs",
+            ", ".join(self.outputs),
+            ", ".join(RATES_AND_SPEED),
+        )
         require_length("natural_frequency", self.natural_frequency, self.outputs)
         if self.throttle_authority:
-            require(len(self.throttle_authority) == 2, "throttle_authority", self.throttle_authority, "two: down and up")
-        require(self.pitch[0] < self.pitch[1], "pitch", list(self.pitch), "the least before the largest")
+            require(
+                len(self.throttle_authority) == 2,
+                "throttle_authority",
+                self.throttle_authority,
+                "two: down and up",
+            )
+        require(
+            self.pitch[0] < self.pitch[1], "pitch", list(self.pitch), "the least before the largest"
+        )
         if self.lockstep:
             require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
             divides = period_ns(self.rate, "rate") % period_ns(self.y_rate, "y_rate") == 0
-            require(divides, "rate", f"{self.rate:g} Hz", f"a whole fraction of y_rate ({self.y_rate:g} Hz)")
+            require(
+                divides,
+                "rate",
+                f"{self.rate:g} Hz",
+                f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
+            )
         floor = self._floor()
-        require(floor < self.speed, "stall_speed", f"{self.stall_speed} m/s", f"a floor of 1.15 V_s below {self.speed:g} m/s")
+        require(
+            floor < self.speed,
+            "stall_speed",
+            f"{self.stall_speed} m/s",
+            f"a floor of 1.15 V_s below {self.speed:g} m/s",
+        )
         least = math.ceil(self.least_period() * 10.0) / 10.0
         fits = self.period is None or self.period >= least
         rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
         fastest = self._largest_speed()
-        require(fastest > self.speed, "speed_limit", f"{fastest:g} m/s", f"more than the trim speed, {self.speed:g} m/s")
+        require(
+            fastest > self.speed,
+            "speed_limit",
+            f"{fastest:g} m/s",
+            f"more than the trim speed, {self.speed:g} m/s",
+        )
         lowest, highest = self._altitudes()
-        require(lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m")
+        require(
+            lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
+        )
         self._check_home()
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
@@ -232,15 +356,25 @@ class GuidanceConfig(NodeConfig):
     def fence_zones(self) -> Fence | None:
         """The fence of the equations; None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
-        return Fence(zones, (self.home.north, self.home.east), float(math.ceil(self.least_radius()))) if zones else None
+        return (
+            Fence(zones, (self.home.north, self.home.east), float(math.ceil(self.least_radius())))
+            if zones
+            else None
+        )
 
     def fence_clearance(self, north: float, east: float) -> float:
         """Distance of a place from the fence, m, negative outside; infinite without a fence."""
         fence = self.fence_zones()
-        return math.inf if fence is None else float(clearance(fence.zones, np.array(north), np.array(east)))
+        return (
+            math.inf
+            if fence is None
+            else float(clearance(fence.zones, np.array(north), np.array(east)))
+        )
 
     def fence_margin(self, speed: float) -> float:
-        """Least distance of a route from the fence at an airspeed, m: MARGIN of flight with the wind from behind."""
+        """Least distance of a route from the fence at an airspeed, m: MARGIN of flight with the
+        wind from behind.
+        """
         return MARGIN * (speed + self.wind)
 
     def by_rule(self) -> list[tuple[str, Any]]:
@@ -248,7 +382,11 @@ class GuidanceConfig(NodeConfig):
         return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
     def _floor(self) -> float:
-        return FLOOR_FRACTION * self.speed if self.stall_speed is None else protection.speed_floor(self.stall_speed)
+        return (
+            FLOOR_FRACTION * self.speed
+            if self.stall_speed is None
+            else protection.speed_floor(self.stall_speed)
+        )
 
     def _largest_speed(self) -> float:
         return self.speed_limit or protection.FASTEST * self.speed
@@ -261,13 +399,17 @@ class GuidanceConfig(NodeConfig):
         )
 
     def largest_roll_rate(self) -> float:
-        """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the authority."""
+        """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a
+        third of the authority.
+        """
         frequency = self.natural_frequency[self.outputs.index("p")]
         authority = math.inf if self.roll_authority is None else self.roll_authority
         return self.roll_rate or min(FASTEST_ROLL, reach.roll_rate(authority, frequency))
 
     def k_beta(self) -> float:
-        """k_beta = min(0.5, k_chi V0 d / s), 1/s: a lateral gust of s = 1.5 m/s turns a held heading by d = 1 deg."""
+        """k_beta = min(0.5, k_chi V0 d / s), 1/s: a lateral gust of s = 1.5 m/s turns a held
+        heading by d = 1 deg.
+        """
         if self.sideslip_gain is not None:
             return self.sideslip_gain
         k_chi = self.natural_frequency[self.outputs.index("p")] / 14.0
@@ -289,9 +431,11 @@ class GuidanceConfig(NodeConfig):
         return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of)
 
     def climb_limits(self) -> tuple[float, float]:
-        """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0.
+        """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and
+        at most a tenth of V0.
 
-        The rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back where the rest is too little.
+        The rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back
+        where the rest is too little.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -340,9 +484,11 @@ class GuidanceConfig(NodeConfig):
         )
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
-        """The altitude loop. Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L.
+        """The altitude loop. Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4
+        / T_L.
 
-        The flight path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by Routh's criterion.
+        The flight path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by
+        Routh's criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0
         gain = min(ALTITUDE_GAIN, 0.4 / lag) if lag else ALTITUDE_GAIN
@@ -360,21 +506,42 @@ class GuidanceConfig(NodeConfig):
         flown = speeds(waypoints, self.speed)
         roll_rate = self.largest_roll_rate()
         fastest = self._largest_speed()
-        can = Performance(self.speed, stall, self.bank, roll_rate, climb, sink, self.wind, fastest, *self._altitudes())
+        can = Performance(
+            self.speed,
+            stall,
+            self.bank,
+            roll_rate,
+            climb,
+            sink,
+            self.wind,
+            fastest,
+            *self._altitudes(),
+        )
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         # an empty route is refused below
-        radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)
-        legs, waypoints, notes = flyable(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
+        radius = max(
+            (
+                least_radius(speed, self.wind, bank)
+                for speed, bank in zip(flown, banks, strict=True)
+            ),
+            default=0.0,
+        )
+        legs, waypoints, notes = flyable(
+            waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can
+        )
         flown = speeds(waypoints, self.speed)
         numbers = leads(legs)
-        # A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the altitude at its waypoint.
+        # A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes
+        # the altitude at its waypoint.
         before = [max(k - 1, 0) for k in numbers]
         slopes = self.profile == "slope"
         altitude = []
         departures = []
         for leg, to, start in zip(legs, numbers, before, strict=True):
             fillet = isinstance(leg, Arc) and not is_orbit(leg)
-            departures.append(waypoints[to].altitude if is_orbit(leg) else waypoints[start].departure)
+            departures.append(
+                waypoints[to].altitude if is_orbit(leg) else waypoints[start].departure
+            )
             end = waypoints[to].departure if is_orbit(leg) else waypoints[to].altitude
             altitude.append(departures[-1] if fillet and slopes else end)
         route = Route(

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are fillets."""
+"""Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are
+fillets.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,19 +18,24 @@ from flight_guidance.lateral import PathError
 Point = tuple[Scalar, Scalar]  # north, east, m
 
 SHARPEST = math.radians(150.0)
-"""Largest turn of a fillet, which cuts the corner by 2.8 radii. A sharper corner is passed, and the next leg joined."""
+"""Largest turn of a fillet, which cuts the corner by 2.8 radii. A sharper corner is passed, and the
+next leg joined."""
 
 JOINED = math.radians(30.0)
-"""Largest difference between the course flown and that of a leg where an aircraft leaves the joining circle for the leg."""
+"""Largest difference between the course flown and that of a leg where an aircraft leaves the
+joining circle for the leg."""
 
 OPPOSITE = math.radians(120.0)
-"""Difference of courses beyond which an aircraft near the start of a leg turns onto the leg by the joining circle too."""
+"""Difference of courses beyond which an aircraft near the start of a leg turns onto the leg by the
+joining circle too."""
 
 SLACK = 0.1
-"""rad. A tangent that touches the joining circle by less beyond the point of the leg needs no further turn of 360 deg."""
+"""rad. A tangent that touches the joining circle by less beyond the point of the leg needs no
+further turn of 360 deg."""
 
 SHORTEST = 1e-3
-"""m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a fillet by rounding alone."""
+"""m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a
+fillet by rounding alone."""
 
 
 class Line(NamedTuple):
@@ -39,14 +46,18 @@ class Line(NamedTuple):
 
 
 class Loiter(NamedTuple):
-    """What an aircraft does on a circle before it flies on; at the end it is at the altitude of the leg."""
+    """What an aircraft does on a circle before it flies on; at the end it is at the altitude of the
+    leg.
+    """
 
     turns: float = 0.0  # 1
     wait: float = 0.0  # s
 
 
 class Arc(NamedTuple):
-    """A leg on a circle, less than a full turn; without an end an orbit, with a loiter an orbit until the loiter is flown."""
+    """A leg on a circle, less than a full turn; without an end an orbit, with a loiter an orbit
+    until the loiter is flown.
+    """
 
     centre: Point
     radius: float  # m, positive to the right (clockwise from above), negative to the left
@@ -74,11 +85,15 @@ class Route(NamedTuple):
         return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
 
     def near(self, leg: int) -> float:
-        """Distance from the end of a leg within which the leg counts as flown, m: the radius, at least 1 s of flight."""
+        """Distance from the end of a leg within which the leg counts as flown, m: the radius, at
+        least 1 s of flight.
+        """
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """The start of a leg, of a line the point at a distance along, m, and the course there, rad; the centre of an orbit."""
+        """The start of a leg, of a line the point at a distance along, m, and the course there,
+        rad; the centre of an orbit.
+        """
         flown = self.legs[leg]
         if isinstance(flown, Line):
             course = course_of(flown.start, flown.end)
@@ -89,7 +104,9 @@ class Route(NamedTuple):
         return before.end or flown.centre, end_course(before)
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
-        """The altitude at a distance along a leg, m, and its slope, 1: a straight line from waypoint to waypoint, or a step."""
+        """The altitude at a distance along a leg, m, and its slope, 1: a straight line from
+        waypoint to waypoint, or a step.
+        """
         altitude = self.altitude[leg]
         distance = length(self.legs[leg])
         if not self.slopes or not distance:
@@ -120,8 +137,14 @@ def along(start: Point, end: Point, share: float) -> Point:
 
 
 def nearest(leg: Leg, position: Point) -> float:
-    """Distance along a line from the start to the point nearest to a position, m, from 0 to the length; 0 for an arc."""
-    return min(max(length(leg) - to_go(leg, position), 0.0), length(leg)) if isinstance(leg, Line) else 0.0
+    """Distance along a line from the start to the point nearest to a position, m, from 0 to the
+    length; 0 for an arc.
+    """
+    return (
+        min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
+        if isinstance(leg, Line)
+        else 0.0
+    )
 
 
 def course_of(start: Point, end: Point) -> float:
@@ -130,7 +153,9 @@ def course_of(start: Point, end: Point) -> float:
 
 
 def error(leg: Leg, position: Point) -> PathError:
-    """The cross-track error of a position, and course and curvature of the leg at the nearest point."""
+    """The cross-track error of a position, and course and curvature of the leg at the nearest
+    point.
+    """
     if isinstance(leg, Line):
         return line_error(leg.start, course_of(leg.start, leg.end), position)
     return circle_error(leg.centre, leg.radius, position)
@@ -151,7 +176,9 @@ def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
     east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
     bearing = xp.atan2(east, north)  # from the centre
-    return PathError(side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius)
+    return PathError(
+        side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius
+    )
 
 
 def end_course(leg: Leg) -> float:
@@ -164,8 +191,14 @@ def end_course(leg: Leg) -> float:
 
 
 def passed(leg: Leg, position: Point) -> bool:
-    """Whether a position lies beyond the half plane at the end of a leg, across the course there. Never for an orbit."""
-    return leg.end is not None and not is_orbit(leg) and bool(is_beyond(leg.end, end_course(leg), position))
+    """Whether a position lies beyond the half plane at the end of a leg, across the course there.
+    Never for an orbit.
+    """
+    return (
+        leg.end is not None
+        and not is_orbit(leg)
+        and bool(is_beyond(leg.end, end_course(leg), position))
+    )
 
 
 def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
@@ -178,7 +211,9 @@ def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
 
 def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
     """Whether a position lies beyond the end of a leg, but not beyond a following arc."""
-    return passed(leg, position) and not (isinstance(following, Arc) and passed(following, position))
+    return passed(leg, position) and not (
+        isinstance(following, Arc) and passed(following, position)
+    )
 
 
 def to_go(leg: Leg, position: Point) -> float:
@@ -187,25 +222,34 @@ def to_go(leg: Leg, position: Point) -> float:
         return 0.0
     if isinstance(leg, Line):
         course = end_course(leg)
-        return float((leg.end[0] - position[0]) * math.cos(course) + (leg.end[1] - position[1]) * math.sin(course))
+        return float(
+            (leg.end[0] - position[0]) * math.cos(course)
+            + (leg.end[1] - position[1]) * math.sin(course)
+        )
     turn = course_of(leg.centre, leg.end) - course_of(leg.centre, position)
     return leg.radius * math.remainder(turn, 2.0 * math.pi)
 
 
-# Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point, and round the circle onto it.
+# Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point,
+# and round the circle onto it.
 
 
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
-    """Centre of the circle that touches a course, rad, at a point; the radius is positive to the right, m."""
+    """Centre of the circle that touches a course, rad, at a point; the radius is positive to the
+    right, m.
+    """
     xp = array_namespace(course)
     return point[0] - radius * xp.sin(course), point[1] + radius * xp.cos(course)
 
 
-def joining_length(point: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar) -> Scalar:
+def joining_length(
+    point: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar
+) -> Scalar:
     """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
 
-    turn: from the course flown to the tangent; d: distance from the centre of the joining circle; sweep: from the point where
-    the tangent touches the circle to the point of the leg. `flown` and `course` in rad.
+    turn: from the course flown to the tangent; d: distance from the centre of the joining circle;
+    sweep: from the point where the tangent touches the circle to the point of the leg. `flown` and
+    `course` in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -221,26 +265,39 @@ def joining_length(point: Point, course: Scalar, radius: Scalar, position: Point
     return R * abs(turned) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
 
 
-def joining(point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar) -> Scalar:
-    """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the left, 0 needs none.
+def joining(
+    point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar
+) -> Scalar:
+    """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the
+    left, 0 needs none.
 
     None is needed within `near`, m, and within OPPOSITE of the course.
     """
-    right_way, left_way = (joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0))
+    right_way, left_way = (
+        joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0)
+    )
     xp = array_namespace(right_way)
-    far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (xp.cos(flown - course) < math.cos(OPPOSITE))
+    far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (
+        xp.cos(flown - course) < math.cos(OPPOSITE)
+    )
     return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
 
 
 def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
-    """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the course of the leg."""
+    """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the
+    course of the leg.
+    """
     xp = array_namespace(course)
     is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
-    return is_near & is_beyond(point, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+    return (
+        is_near & is_beyond(point, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+    )
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
-    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is at least a full turn."""
+    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is
+    at least a full turn.
+    """
     if isinstance(leg, Line):
         return [leg.start, leg.end]
     side = math.copysign(1.0, leg.radius)
@@ -249,15 +306,26 @@ def outline(leg: Leg, start: Point) -> list[Point]:
     if leg.end is not None:
         turn += side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
     count = math.ceil(turn / math.radians(10.0)) + 1
-    return [_along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius)) for k in range(count)]
+    return [
+        _along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius))
+        for k in range(count)
+    ]
 
 
 def route_outline(route: Route) -> list[tuple[float, float, float]]:
     """Points along a route, for drawing: north, east and altitude, m."""
     points: list[tuple[float, float, float]] = []
     for number, leg in enumerate(route.legs):
-        start = leg.start if isinstance(leg, Line) else points[-1][:2] if points else _along(leg.centre, 0.0, abs(leg.radius))
-        points += [(*point, route.profile(number, nearest(leg, point))[0]) for point in outline(leg, start)]
+        start = (
+            leg.start
+            if isinstance(leg, Line)
+            else points[-1][:2]
+            if points
+            else _along(leg.centre, 0.0, abs(leg.radius))
+        )
+        points += [
+            (*point, route.profile(number, nearest(leg, point))[0]) for point in outline(leg, start)
+        ]
     return points
 
 
@@ -273,7 +341,9 @@ def lengths_after(route: Route) -> list[float]:
 
 
 def leg_places(route: Route) -> dict[int, Point]:
-    """Where the number of a leg is drawn: the middle of a line, the centre of a circle; the fillets have none."""
+    """Where the number of a leg is drawn: the middle of a line, the centre of a circle; the fillets
+    have none.
+    """
     places: dict[int, Point] = {}
     for number, leg in enumerate(route.legs):
         if isinstance(leg, Line):
@@ -288,7 +358,9 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
     distances = []
     for leg in legs:
         if isinstance(leg, Line):
-            distances.append(math.dist(point, along(leg.start, leg.end, nearest(leg, point) / length(leg))))
+            distances.append(
+                math.dist(point, along(leg.start, leg.end, nearest(leg, point) / length(leg)))
+            )
         elif leg.loiter is None:
             distances.append(abs(math.dist(point, leg.centre) - abs(leg.radius)))
             if leg.end is not None:
@@ -304,7 +376,9 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to the next waypoint."""
+    """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to
+    the next waypoint.
+    """
     numbers = []
     number = 0
     for leg in legs:
@@ -322,19 +396,29 @@ class ShortLegError(ParameterError):
 
 
 def route(
-    waypoints: Sequence[Point], radius: float, least: float, loiters: Mapping[int, Loiter] = MappingProxyType({})
+    waypoints: Sequence[Point],
+    radius: float,
+    least: float,
+    loiters: Mapping[int, Loiter] = MappingProxyType({}),
 ) -> tuple[Leg, ...]:
-    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint, clockwise.
+    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the
+    last waypoint, clockwise.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint; one beyond SHARPEST has no fillet. At a
-    waypoint of `loiters`, by the number, a clockwise circle round the waypoint takes the place of the fillet. Lines touch
-    circles and the orbit; a line too short for a
-    tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius below `least`
-    (`lateral.least_radius`), and a waypoint within the circle of a loiter; ShortLegError for a leg too short for the fillets.
-    Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint; one beyond
+    SHARPEST has no fillet. At a waypoint of `loiters`, by the number, a clockwise circle round the
+    waypoint takes the place of the fillet. Lines touch circles and the orbit; a line too short for
+    a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
+    below `least` (`lateral.least_radius`), and a waypoint within the circle of a loiter;
+    ShortLegError for a leg too short for the fillets. Source: R. W. Beard, T. W. McLain, Small
+    Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
-    require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
+    require(
+        radius >= least,
+        "guidance.radius",
+        f"{radius:g} m",
+        f"at least {math.ceil(least)} m at this speed, wind and bank",
+    )
     legs: list[Leg] = []
     first = 0
     last = len(waypoints) - 1
@@ -342,39 +426,58 @@ def route(
         if k > 0:
             lines = _between_circles(waypoints[first : k + 1], radius, first, leaves=bool(legs))
             if legs and isinstance(circle := legs[-1], Arc):
-                legs[-1] = circle._replace(end=lines[0].start if isinstance(lines[0], Line) else None)
+                legs[-1] = circle._replace(
+                    end=lines[0].start if isinstance(lines[0], Line) else None
+                )
             legs += lines
         legs.append(Arc(waypoints[k], radius, None, None if k == last else loiters[k]))
         first = k
     return tuple(legs)
 
 
-def _between_circles(waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool) -> list[Leg]:
-    """Lines and fillets onto a clockwise circle round the last waypoint, from a circle round the first where `leaves`.
+def _between_circles(
+    waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool
+) -> list[Leg]:
+    """Lines and fillets onto a clockwise circle round the last waypoint, from a circle round the
+    first where `leaves`.
 
-    `first`: number of the first waypoint. The centre of a clockwise circle is on the right of the tangent.
+    `first`: number of the first waypoint. The centre of a clockwise circle is on the right of the
+    tangent.
     """
     points = list(waypoints)
     if leaves:
         (centre, after), distance = points[:2], math.dist(*points[:2])
         gap = f"{distance:g} m from the loiter before"
-        require(distance > radius, f"route[{first + 1}]", gap, f"more than {radius:g} m, the radius of the circle")
+        require(
+            distance > radius,
+            f"route[{first + 1}]",
+            gap,
+            f"more than {radius:g} m, the radius of the circle",
+        )
         bearing = course_of(centre, after)
         if len(points) == 2:  # to a circle of the same radius
             start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
             return [Line(start, end)]
-        points[0] = _along(after, bearing + math.asin(radius / distance), -math.sqrt(distance**2 - radius**2))
+        points[0] = _along(
+            after, bearing + math.asin(radius / distance), -math.sqrt(distance**2 - radius**2)
+        )
     before, last = points[-2:]
     distance = math.dist(before, last)
     if distance > radius:
         course = course_of(before, last) - math.asin(radius / distance)
         with suppress(ParameterError):
-            return _filleted([*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))], radius, first)
+            return _filleted(
+                [*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))],
+                radius,
+                first,
+            )
     return _filleted(points, radius, first)
 
 
 def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg]:
-    """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number of the first waypoint."""
+    """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number
+    of the first waypoint.
+    """
     turns = [0.0]
     for before, corner, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):
         turn = math.remainder(course_of(corner, after) - course_of(before, corner), 2.0 * math.pi)
@@ -389,7 +492,9 @@ def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg
         if length <= needed:
             expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
             number = first + k + 1
-            raise ShortLegError(f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number)
+            raise ShortLegError(
+                f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number
+            )
         course = course_of(start_point, end_point)
         turn = turns[k + 1]
         end = _along(end_point, course, -cut[k + 1])
@@ -397,7 +502,9 @@ def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg
         if cut[k + 1] > SHORTEST:
             side = math.copysign(1.0, turn)
             start = _along(end_point, course + turn, cut[k + 1])
-            legs.append(Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start))
+            legs.append(
+                Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start)
+            )
         else:
             start = end_point
     return legs

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of bank, speed and climb, in this order, from the stall speed and the commanded airspeed."""
+"""Protection: limits of bank, speed and climb, in this order, from the stall speed and the
+commanded airspeed.
+"""
 
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
@@ -15,11 +17,14 @@ FASTEST = 1.4
 """Largest airspeed over the trim speed where no limit of the aircraft is given."""
 
 SHORTFALL = 0.05
-"""Largest error of V over the trim speed before the climb or sink is limited; at twice the value the limit is zero."""
+"""Largest error of V over the trim speed before the climb or sink is limited; at twice the value
+the limit is zero."""
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
-    """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)), for the load factor of a level turn is 1 / cos(phi)."""
+    """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)), for the load factor of a level turn
+    is 1 / cos(phi).
+    """
     xp = array_namespace(speed)
     return xp.minimum(limit, xp.acos(xp.minimum((STALL_MARGIN * stall_speed / speed) ** 2, 1.0)))
 
@@ -30,9 +35,11 @@ def speed_floor(stall_speed: float) -> float:
 
 
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
-    """Largest climb rate, m/s: ratio climb - (1 - ratio) sink, ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1).
+    """Largest climb rate, m/s: ratio climb - (1 - ratio) sink, ratio = clip((V - 0.9 V_floor) /
+    (0.1 V_floor), 0, 1).
 
-    Below the floor pitch flies the speed: at nine tenths of the floor the aircraft sinks at the largest rate.
+    Below the floor pitch flies the speed: at nine tenths of the floor the aircraft sinks at the
+    largest rate.
     """
     xp = array_namespace(speed)
     ratio = xp.minimum(xp.maximum((speed - 0.9 * floor) / (0.1 * floor), 0.0), 1.0)
@@ -40,7 +47,8 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
 
 
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
-    """Least climb rate, m/s: (1 - ratio) climb - ratio sink, ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1).
+    """Least climb rate, m/s: (1 - ratio) climb - ratio sink, ratio = clip((1.1 V_max - V) / (0.1
+    V_max), 0, 1).
 
     The mirror of `climb_limit`: beyond the largest airspeed pitch flies the speed.
     """
@@ -49,12 +57,17 @@ def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scal
     return (1.0 - ratio) * climb - ratio * sink
 
 
-def climb_range(climb: float, sink: float, shortfall: Scalar, speed: float) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, since a throttle at the stop leaves V:
+def climb_range(
+    climb: float, sink: float, shortfall: Scalar, speed: float
+) -> tuple[Scalar, Scalar]:
+    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, since a
+    throttle at the stop leaves V:
 
-        -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),  d = max(0.05 V0, g climb / (0.4 V0))
+        -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
+            d = max(0.05 V0, g climb / (0.4 V0))
 
-    `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by climb to 0.4 rad/s.
+    `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by
+    climb to 0.4 rad/s.
     """  # noqa: D400, D415 - what follows is an equation
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
     xp = array_namespace(shortfall)

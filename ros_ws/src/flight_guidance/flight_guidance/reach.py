@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of commands by what the inputs can do: by rule at the start, and by a model that is learned in flight."""
+"""Limits of commands by what the inputs can do: by rule at the start, and by a model that is
+learned in flight.
+"""
 
 import math
 from collections.abc import Mapping
@@ -15,8 +17,8 @@ SINK = 0.5
 """Parts of the throttle's authority for a climb and a sink; the rest holds the airspeed."""
 
 REVERSALS = 11.0
-"""Least period of path following over bank / roll rate. A bank reversal takes 2 bank / roll rate. With a period of 3.5
-reversals the osprey cycled in turbulence; 5.5 are asked for."""
+"""Least period of path following over bank / roll rate. A bank reversal takes 2 bank / roll rate.
+With a period of 3.5 reversals the osprey cycled in turbulence; 5.5 are asked for."""
 
 
 LEAST = 1e-3
@@ -24,11 +26,14 @@ LEAST = 1e-3
 
 
 YAWED_BANK = math.radians(10.0)
-"""Largest bank without an aileron: the rudder flies its turn with level wings too, in a sideslip of 6 deg of the osprey."""
+"""Largest bank without an aileron: the rudder flies its turn with level wings too, in a sideslip of
+6 deg of the osprey."""
 
 
 class Authority(NamedTuple):
-    """Least change of an output by the input from trim, units/s: 0 without an effect, UNKNOWN without a learned model."""
+    """Least change of an output by the input from trim, units/s: 0 without an effect, UNKNOWN
+    without a learned model.
+    """
 
     q: float = UNKNOWN  # rad/s^2
     p: float = UNKNOWN  # rad/s^2
@@ -48,12 +53,16 @@ def authority_of(channels: Mapping[str, float]) -> Authority:
 
 
 def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
-    """Climb and sink rate, m/s, that full throttle up and down gives, a V0 / g, by the parts CLIMB and SINK."""
+    """Climb and sink rate, m/s, that full throttle up and down gives, a V0 / g, by the parts CLIMB
+    and SINK.
+    """
     return CLIMB * up * speed / GRAVITY, SINK * down * speed / GRAVITY
 
 
 def roll_rate(authority: float, frequency: float) -> float:
-    """Roll rate p_max, rad/s: 0.4 w p_max, the largest p_m_dot of the reference after a step, is a third of the authority."""
+    """Roll rate p_max, rad/s: 0.4 w p_max, the largest p_m_dot of the reference after a step, is a
+    third of the authority.
+    """
     return authority / (3.0 * 0.4 * frequency)
 
 

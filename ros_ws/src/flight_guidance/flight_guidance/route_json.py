@@ -18,13 +18,17 @@ from flight_guidance.route_places import A_ROUTE, Geometry, Place, Places, lon_l
 def parsed_json(content: bytes, key: str) -> Any:
     """The content of a JSON file. Raises ParameterError."""
     try:
-        return json.loads(content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members, parse_int=_whole)
+        return json.loads(
+            content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members, parse_int=_whole
+        )
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{key}: not valid JSON ({error}), expected {A_ROUTE}") from None
 
 
 def _whole(digits: str) -> int | float:
-    """A whole number; one of more digits than a float holds is a float, infinite beyond its range."""
+    """A whole number; one of more digits than a float holds is a float, infinite beyond its
+    range.
+    """
     return int(digits) if len(digits) < 16 else float(digits)
 
 
@@ -60,7 +64,9 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
 
 
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
-    """The lines, rings and points of a GeoJSON, in the order of the file. Raises ParameterError as `read`."""
+    """The lines, rings and points of a GeoJSON, in the order of the file. Raises ParameterError as
+    `read`.
+    """
     tree = parsed_json(content, key)
     require_wgs84(tree, key)
     lines: list[list[Place]] = []
@@ -70,7 +76,9 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
         if node is None:
             continue
         known = isinstance(kind, str) and kind in GEOJSON
-        require(known, key, f"a geometry of the type {short_repr(kind)}", f"one of {', '.join(GEOJSON)}")
+        require(
+            known, key, f"a geometry of the type {short_repr(kind)}", f"one of {', '.join(GEOJSON)}"
+        )
         parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
         if kind == "MultiPoint":
             parts = [[position] for position in chain.from_iterable(parts)]
@@ -79,7 +87,9 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """The outer ring of a Polygon, whose only line is a route; every ring of a Polygon with holes."""
+    """The outer ring of a Polygon, whose only line is a route; every ring of a Polygon with
+    holes.
+    """
     return [ring for ring in rings if isinstance(ring, list)]
 
 
@@ -104,7 +114,9 @@ PARTS = {
 
 
 def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """The geometries with the properties of their Feature, in the order of the file; None for a Feature without geometry."""
+    """The geometries with the properties of their Feature, in the order of the file; None for a
+    Feature without geometry.
+    """
     pending: list[tuple[Any, Any]] = [(tree, None)]
     while pending:
         node, properties = pending.pop()
@@ -119,11 +131,20 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def require_wgs84(tree: Any, key: str) -> None:
-    """Refuse a member `crs` of another system: RFC 7946 has WGS84 alone, and GDAL wrote others before."""
+    """Refuse a member `crs` of another system: RFC 7946 has WGS84 alone, and GDAL wrote others
+    before.
+    """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
-    known = crs is None or re.search(r"CRS84h?$|EPSG:+4326$|EPSG:+4979$|WGS ?84$", name, re.IGNORECASE)
-    require(bool(known), key, f"the coordinate system {short_repr(name)}", "WGS84: ogr2ogr -t_srs EPSG:4326 converts it")
+    known = crs is None or re.search(
+        r"CRS84h?$|EPSG:+4326$|EPSG:+4979$|WGS ?84$", name, re.IGNORECASE
+    )
+    require(
+        bool(known),
+        key,
+        f"the coordinate system {short_repr(name)}",
+        "WGS84: ogr2ogr -t_srs EPSG:4326 converts it",
+    )
 
 
 def member(tree: Any, name: str) -> Any:
@@ -139,7 +160,9 @@ def entries(tree: Any, name: str, key: str) -> list[Any]:
 
 
 def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
-    """A member of a JSON object that is true or false, also as 1 or 0; `absent`: its value where the object lacks it."""
+    """A member of a JSON object that is true or false, also as 1 or 0; `absent`: its value where
+    the object lacks it.
+    """
     value = absent if member(tree, name) is None else tree[name]
     require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")
     return bool(value)

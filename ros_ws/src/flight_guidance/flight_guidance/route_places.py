@@ -35,7 +35,9 @@ class Place(NamedTuple):
     altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
     turns: Any = 0.0  # round the place, 1
     wait: Any = 0.0  # round the place, s
-    climbs: bool = False  # whether the altitude is reached round the place, and not on the way to the place
+    climbs: bool = (
+        False  # whether the altitude is reached round the place, and not on the way to the place
+    )
 
 
 class Home(NamedTuple):
@@ -62,34 +64,56 @@ class Geometry(NamedTuple):
     name: str = ""  # by the user
 
 
-def one_route(key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None) -> Places:
-    """The only line, or that of `line`; the points where there is no line. Raises ParameterError that names what is there."""
+def one_route(
+    key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None
+) -> Places:
+    """The only line, or that of `line`; the points where there is no line. Raises ParameterError
+    that names what is there.
+    """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]
     points = [geometry for geometry in geometries if geometry.kind in POINTS]
     ignored = _counted([point.kind for point in points])
     if (lines and others) or (lines and line is None and len(lines) > 1):
         kinds = _counted([*(geometry.kind for geometry in lines), *others])
-        raise ParameterError(f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}")
+        raise ParameterError(
+            f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}"
+        )
     if line is not None:
-        chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
+        chosen = [
+            geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)
+        ]
         mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
-        require(len(chosen) == 1, "route.line", mismatch, _choice(lines) if lines else "a file with several lines")
+        require(
+            len(chosen) == 1,
+            "route.line",
+            mismatch,
+            _choice(lines) if lines else "a file with several lines",
+        )
         if len(lines) > 1:
             ignored = " and ".join([f"{len(lines) - 1} further lines", *[ignored] * bool(points)])
         lines = chosen
     if lines:
-        return Places(lines[0].places, (f"{ignored} beside the {lines[0].kind}: no part of the route",) if ignored else ())
+        return Places(
+            lines[0].places,
+            (f"{ignored} beside the {lines[0].kind}: no part of the route",) if ignored else (),
+        )
     has = f", but {_counted(others)}" if others else ""
     require(bool(points) and not others, key, f"no LineString and no Point{has}", "a route")
-    mixture = f"{_counted([geometry.kind for geometry in joined_lines])} without a position, and {ignored}"
+    mixture = (
+        f"{_counted([geometry.kind for geometry in joined_lines])} without a position, "
+        f"and {ignored}"
+    )
     require(not joined_lines, key, mixture, "a line, or Points alone")
     return Places([*chain.from_iterable(point.places for point in points)])
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
     """What `--set route.line` may name: "--set route.line=1 (north), 2 or 3 (south)"."""
-    names = [f"{k} ({geometry.name})" if geometry.name else f"{k}" for k, geometry in enumerate(lines[:SHOWN], start=1)]
+    names = [
+        f"{k} ({geometry.name})" if geometry.name else f"{k}"
+        for k, geometry in enumerate(lines[:SHOWN], start=1)
+    ]
     return f"--set route.line={', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
 
 
@@ -110,7 +134,9 @@ def _counted(kinds: Sequence[str]) -> str:
 
 
 def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
-    """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section 3.1.9)."""
+    """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section
+    3.1.9).
+    """
     joined: list[Geometry] = []
     for line in lines:
         cut = bool(joined and joined[-1].places and line.places)
@@ -125,7 +151,10 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
 def _meets(end: Place, begin: Place) -> bool:
     """Whether both are one position on the antimeridian."""
     try:
-        return bool(abs(end.longitude) == 180.0 and (end.longitude, end.latitude) == (-begin.longitude, begin.latitude))
+        return bool(
+            abs(end.longitude) == 180.0
+            and (end.longitude, end.latitude) == (-begin.longitude, begin.latitude)
+        )
     except TypeError:
         return False
 
@@ -138,11 +167,19 @@ def number_of(text: str | None) -> float | str | None:
         return text
 
 
-def lon_lat(position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = "") -> Place:
+def lon_lat(
+    position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = ""
+) -> Place:
     """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
     fits = isinstance(position, list) and 2 <= len(position) <= 3
     require(fits, "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
     return Place(
-        "route", latitude, longitude, altitude[0] if altitude else None, speed, above, altitude_text or short_repr(position)
+        "route",
+        latitude,
+        longitude,
+        altitude[0] if altitude else None,
+        speed,
+        above,
+        altitude_text or short_repr(position),
     )

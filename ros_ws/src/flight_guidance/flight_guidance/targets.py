@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The targets that an operator may command: the limits of the parameters and of a learned model, to hold and to fly home."""
+"""The targets that an operator may command: the limits of the parameters and of a learned model, to
+hold and to fly home.
+"""
 
 import math
 from collections.abc import Mapping
@@ -23,9 +25,10 @@ from flight_guidance.reach import Authority
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
     """The parameters with limits by a model learned in flight, where less than their own.
 
-    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters. Reversals of the bank fit into
-    the period of path following, and orbits have the radius for the bank. Without an aileron the largest bank is YAWED_BANK.
-    Without a throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
+    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters.
+    Reversals of the bank fit into the period of path following, and orbits have the radius for the
+    bank. Without an aileron the largest bank is YAWED_BANK. Without a throttle there is no climb,
+    and the sink stays: pitch then flies the airspeed at the floor.
     """
     if authority == Authority():
         return params
@@ -42,8 +45,13 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if "p" not in dead:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    if "q" in dead:  # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
-        faster = tuple(4.0 * rate if name == "V" else rate for name, rate in zip(params.outputs, params.slew, strict=True))
+    if (
+        "q" in dead
+    ):  # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
+        faster = tuple(
+            4.0 * rate if name == "V" else rate
+            for name, rate in zip(params.outputs, params.slew, strict=True)
+        )
         params = params._replace(slew=faster)
     radius = limits.radius * (math.tan(0.8 * limits.bank) / math.tan(0.8 * bank))
     return params._replace(
@@ -55,14 +63,25 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
-    """The limits by a model learned in flight, as a sentence; empty where the own limits are less."""
+    """The limits by a model learned in flight, as a sentence; empty where the own limits are
+    less.
+    """
     now = within_reach(params, authority)
-    parts = [f"no {command}: {name} has no input with an effect" for name, command in DEAD.items() if name in now.dead]
+    parts = [
+        f"no {command}: {name} has no input with an effect"
+        for name, command in DEAD.items()
+        if name in now.dead
+    ]
     if min(authority.down, authority.up) < reach.LEAST:
         parts.append("no climb: V has no input with an effect")
     for name, nominal, limit, unit in (
         ("bank", math.degrees(params.limits.bank), math.degrees(now.limits.bank), "deg"),
-        ("roll rate", math.degrees(params.attitude.roll_rate), math.degrees(now.attitude.roll_rate), "deg/s"),
+        (
+            "roll rate",
+            math.degrees(params.attitude.roll_rate),
+            math.degrees(now.attitude.roll_rate),
+            "deg/s",
+        ),
         ("climb", params.vertical.climb, now.vertical.climb, "m/s"),
         ("sink", params.vertical.sink, now.vertical.sink, "m/s"),
     ):
@@ -80,9 +99,15 @@ ANGLES = ("phi", "heading", "course", "theta", "r")
 
 
 def read_target(
-    values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target", *, degrees: bool = False
+    values: Mapping[str, float],
+    params: GuidanceParams,
+    route: Route | None,
+    what: str = "target",
+    *,
+    degrees: bool = False,
 ) -> None:
-    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond the limits.
+    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond
+    the limits.
 
     `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
     """
@@ -90,17 +115,33 @@ def read_target(
     vertical_modes = {VERTICAL[name] for name in values if name in VERTICAL}
     unknown = [name for name in values if name not in TARGETS]
     if unknown or not values:
-        raise ChannelError("name", f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of {', '.join(TARGETS)}")
+        raise ChannelError(
+            "name",
+            f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
+            f"{', '.join(TARGETS)}",
+        )
     if len(lateral_modes) > 1 or len(vertical_modes) > 1:
-        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
+        raise ChannelError(
+            "name",
+            f"{what}: found {', '.join(values)}, expected one lateral and one vertical command "
+            "at most",
+        )
     if Lateral.ORBIT in lateral_modes and not {"north", "east", "radius"} <= set(values):
-        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
+        raise ChannelError(
+            "name",
+            f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit "
+            "together",
+        )
     for name, needed in (("r", "phi"), ("along", "leg")):
         if name in values and needed not in values:
-            raise ChannelError("name", f"{what}: found {name} without {needed}, expected {needed} too")
+            raise ChannelError(
+                "name", f"{what}: found {name} without {needed}, expected {needed} too"
+            )
     for name, value in values.items():
         if abs(value) > LARGEST:
-            raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
+            raise ChannelError(
+                "bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way"
+            )
     limits = params.limits
     vertical = params.vertical
     for name, least, largest in (
@@ -113,14 +154,22 @@ def read_target(
     ):
         if name in values and not least <= values[name] <= largest:
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
-            unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
+            unit = (
+                ("deg" if degrees else "rad")
+                if name in ANGLES
+                else "m"
+                if name == "altitude"
+                else "m/s"
+            )
             unit += "/s" * (name == "r")
             entered = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
             raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
-        raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
+        raise ChannelError(
+            "bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}"
+        )
     _read_leg(values, route, what)
 
 
@@ -137,12 +186,20 @@ def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> No
         and not 0.0 <= values["along"] <= (longest := path.length(route.legs[int(values["leg"])]))
     ):
         expected = f"0 to {longest:.6g} m, the length of the leg; 0 for an arc"
-        raise ChannelError("bounds", f"{what}.along: found {values['along']:g} m, expected {expected}")
+        raise ChannelError(
+            "bounds", f"{what}.along: found {values['along']:g} m, expected {expected}"
+        )
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the airspeed."""
-    return {"heading": pose["psi"], "altitude": pose["altitude"], "V": permitted_speed(speed, params)}
+    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the
+    airspeed.
+    """
+    return {
+        "heading": pose["psi"],
+        "altitude": pose["altitude"],
+        "V": permitted_speed(speed, params),
+    }
 
 
 def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
@@ -155,4 +212,9 @@ def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
     """Commands to orbit home clockwise on the least radius, at the altitude of home or of now."""
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude
-    return {"north": place.north, "east": place.east, "radius": float(math.ceil(params.limits.radius)), "altitude": altitude}
+    return {
+        "north": place.north,
+        "east": place.east,
+        "radius": float(math.ceil(params.limits.radius)),
+        "altitude": altitude,
+    }

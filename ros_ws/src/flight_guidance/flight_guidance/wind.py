@@ -1,19 +1,23 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wind: the velocity over ground less the velocity through the air, to the north and to the east."""
+"""Wind: the velocity over ground less the velocity through the air, to the north and to the
+east.
+"""
 
 import math
 
 from flight_core.vectors import Scalar, array_namespace
 
 WIND_TIME = 5.0
-"""Time constant of the estimated wind, s: long against a gust that the aircraft flies through, short against a leg."""
+"""Time constant of the estimated wind, s: long against a gust that the aircraft flies through,
+short against a leg."""
 
 Wind = tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
 
 
 def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, speed: Scalar) -> Wind:
-    """Wind from the velocity over ground and the airspeed, m/s: v_g - sqrt(V^2 - climb^2) [cos, sin](heading).
+    """Wind from the velocity over ground and the airspeed, m/s: v_g - sqrt(V^2 - climb^2) [cos,
+    sin](heading).
 
     `heading`: psi + beta, rad, the direction of the flight through the air.
     """
@@ -23,7 +27,11 @@ def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, spe
 
 
 def wind_estimate(wind: Wind, measured: Wind, dt: float) -> Wind:
-    """Low-pass of the wind a step later: wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME."""
+    """Low-pass of the wind a step later: wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T =
+    WIND_TIME.
+    """
     share = 1.0 - math.exp(-dt / WIND_TIME)
-    north, east = (before + share * (now - before) for before, now in zip(wind, measured, strict=True))
+    north, east = (
+        before + share * (now - before) for before, now in zip(wind, measured, strict=True)
+    )
     return north, east

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Zones of a fence, and the distance from the fence. Functions take arrays, of NumPy or of JAX, of any shape."""
+"""Zones of a fence, and the distance from the fence. Functions take arrays, of NumPy or of JAX, of
+any shape.
+"""
 
 import math
 from functools import lru_cache, reduce
@@ -12,10 +14,12 @@ import numpy as np
 from flight_core.vectors import Array, FloatArray, array_namespace
 
 CHORDS = 180
-"""Chords of a circle among several groups: they depart from the circle by 0.15 thousandths of the radius."""
+"""Chords of a circle among several groups: they depart from the circle by 0.15 thousandths of the
+radius."""
 
 SEAM = 1e-3
-"""m. Two groups that share a border are one region: a gap is wider. A position in m has more digits."""
+"""m. Two groups that share a border are one region: a gap is wider. A position in m has more
+digits."""
 
 
 class Zone(NamedTuple):
@@ -51,13 +55,22 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
-    level = np.where(edge_north == 0.0, 1.0, edge_north)  # an edge to the east crosses no line to the east
-    crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)  # by a ray to the east: even-odd rule
+    level = np.where(
+        edge_north == 0.0, 1.0, edge_north
+    )  # an edge to the east crosses no line to the east
+    crossed = ((x < 0.0) != (x < edge_north)) & (
+        y < x * edge_east / level
+    )  # by a ray to the east: even-odd rule
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
 
 
 def _distance(
-    start_north: FloatArray, start_east: FloatArray, edge_north: FloatArray, edge_east: FloatArray, north: Array, east: Array
+    start_north: FloatArray,
+    start_east: FloatArray,
+    edge_north: FloatArray,
+    edge_east: FloatArray,
+    north: Array,
+    east: Array,
 ) -> Array:
     """Distance of places from the nearest of edges, m."""
     xp = array_namespace(north)
@@ -76,7 +89,9 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
         return reduce(xp.minimum, out)
     stay = _deepest(groups, north, east)
     if len(groups) > 1:  # a border inside of another group is no border
-        stay = xp.where(stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay)
+        stay = xp.where(
+            stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay
+        )
     return reduce(xp.minimum, [stay, *out])
 
 
@@ -91,7 +106,9 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Distance from the border of the deepest group of a place, m, negative outside of the groups."""
+    """Distance from the border of the deepest group of a place, m, negative outside of the
+    groups.
+    """
     xp = array_namespace(north)
     depths = []
     for group in groups:
@@ -101,10 +118,14 @@ def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) ->
 
 
 @lru_cache(maxsize=64)
-def _border(groups: tuple[tuple[Zone, ...], ...]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The border of all groups together: starts and lengths of edges to the north and to the east, m, shapes (M,).
+def _border(
+    groups: tuple[tuple[Zone, ...], ...],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The border of all groups together: starts and lengths of edges to the north and to the east,
+    m, shapes (M,).
 
-    Each edge of a zone is cut where other edges cross or touch it. A piece belongs to the border where one side is inside.
+    Each edge of a zone is cut where other edges cross or touch it. A piece belongs to the border
+    where one side is inside.
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)
     corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
@@ -114,7 +135,11 @@ def _border(groups: tuple[tuple[Zone, ...], ...]) -> tuple[FloatArray, FloatArra
     start, end = (np.concatenate(column) for column in zip(*pieces, strict=True))
     edge = end - start
     middle = (start + end) / 2.0
-    shift = SEAM * np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
+    shift = (
+        SEAM
+        * np.column_stack([-edge[:, 1], edge[:, 0]])
+        / np.hypot(edge[:, 0], edge[:, 1])[:, None]
+    )
     sides = [_deepest(groups, *(middle + side * shift).T) >= 0.0 for side in (1.0, -1.0)]
     on_border = sides[0] != sides[1]
     return start[on_border, 0], start[on_border, 1], edge[on_border, 0], edge[on_border, 1]
@@ -130,8 +155,12 @@ def _polygon(zone: Zone) -> Zone:
     return zone._replace(north=north, east=east, radius=0.0)
 
 
-def _cut(start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where further edges cross or begin."""
+def _cut(
+    start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where further edges cross or
+    begin.
+    """
     edge = end - start
     edges = ends - starts
     to_start = starts - start

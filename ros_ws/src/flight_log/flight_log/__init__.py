@@ -20,4 +20,4 @@
 | `playback` | schedules the messages of a bag for sending |
 | `age_of_u` | reads the age of u at the aircraft |
 | `latency` | computes the time from y to u |
-"""
+"""  # noqa: E501 - a text as it is written

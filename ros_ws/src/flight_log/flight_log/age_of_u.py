@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft, from the diagnostics: the delay of the whole loop, from the instant of y to u."""
+"""The age of u at the aircraft, from the diagnostics: the delay of the whole loop, from the instant
+of y to u.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -21,7 +23,9 @@ CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Mean and largest age of u between two reports of the aircraft of a namespace, s; None without any."""
+    """Mean and largest age of u between two reports of the aircraft of a namespace, s; None without
+    any.
+    """
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:
         try:
@@ -30,8 +34,15 @@ def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
                 values = {value.key: value.value for value in status.values}
                 if status.name == f"{namespace}/aircraft" and MEAN in values:
                     stamp = report.header.stamp
-                    rows[stamp.sec * NANOSECONDS + stamp.nanosec] = float(values[MEAN]), float(values[MAX])
+                    rows[stamp.sec * NANOSECONDS + stamp.nanosec] = (
+                        float(values[MEAN]),
+                        float(values[MAX]),
+                    )
         except (SerdeError, LookupError, ValueError):
             continue
     stamps = sorted(rows)
-    return Signal(np.array(stamps), CHANNELS, np.array([rows[stamp] for stamp in stamps])) if rows else None
+    return (
+        Signal(np.array(stamps), CHANNELS, np.array([rows[stamp] for stamp in stamps]))
+        if rows
+        else None
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml. Needs no ROS."""
+"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml. Needs no
+ROS.
+"""
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,15 +30,21 @@ BEFORE_REMAP = "rise_di_topic"  # of a channel: the full name of its topic befor
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
-IMPORTED = "rise_di_imported"  # name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED
-COMPARED = "parameters"  # what the parameters of the vehicle do not tell, a sentence; empty where all agree with the map
-CHANNEL_UNITS = "rise_di_units"  # name of the metadata record with the SI units of channels, for a log without a scenario
-SIMULATED_TIME = "rise_di_simulated_time"  # name of the metadata record of a flight by /clock: topic, speed over real time
-LOST_MESSAGES = "rise_di_lost"  # name of the metadata record that counts the messages the recorder lost, by topic
+# name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED
+IMPORTED = "rise_di_imported"
+# what the parameters of the vehicle do not tell, a sentence; empty where all agree with the map
+COMPARED = "parameters"
+# name of the metadata record with the SI units of channels, for a log without a scenario
+CHANNEL_UNITS = "rise_di_units"
+# name of the metadata record of a flight by /clock: topic, speed over real time
+SIMULATED_TIME = "rise_di_simulated_time"
+# name of the metadata record that counts the messages the recorder lost, by topic
+LOST_MESSAGES = "rise_di_lost"
 CHUNK_BYTES = 256 * 1024
 
-# Bytes reserved for the end of a file: the chunk in progress and its index, and the summary without the chunk indexes. The
-# chunk indexes grow with the file: 77 bytes for each chunk and 10 for each topic in it (MCAP specification, Chunk Index).
+# Bytes reserved for the end of a file: the chunk in progress and its index, and the summary without
+# the chunk indexes. The chunk indexes grow with the file: 77 bytes for each chunk and 10 for each
+# topic in it (MCAP specification, Chunk Index).
 END_BYTES = 2 * CHUNK_BYTES
 INDEX_BYTES = 77
 INDEX_BYTES_BY_TOPIC = 10
@@ -45,7 +53,9 @@ INDEX_BYTES_BY_TOPIC = 10
 CHUNK_BUILDER = "_Writer__chunk_builder"
 CHUNK_INDEXES = "_Writer__chunk_indices"
 MESSAGE = int(Opcode.MESSAGE)
-MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # RECORD, then channel, sequence, log time and publish time (MCAP specification)
+MESSAGE_HEAD = struct.Struct(
+    "<BQHIQQ"
+)  # RECORD, then channel, sequence, log time and publish time (MCAP specification)
 INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
 
 
@@ -54,7 +64,9 @@ class LogAttachments(NamedTuple):
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
-    metadata: Path | None = None  # a YAML file: named sets of strings, each becomes a metadata record
+    metadata: Path | None = (
+        None  # a YAML file: named sets of strings, each becomes a metadata record
+    )
 
 
 @dataclass
@@ -73,16 +85,22 @@ class _MessageIndex(MessageIndex):
 
     def write(self, stream: RecordBuilder) -> None:
         size = 16 * len(self.records)
-        head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size - RECORD.size + size, self.channel_id, size)
+        head = INDEX_HEAD.pack(
+            Opcode.MESSAGE_INDEX, INDEX_HEAD.size - RECORD.size + size, self.channel_id, size
+        )
         stream.write(head + struct.pack(f"<{size // 8}Q", *chain.from_iterable(self.records)))
 
 
 class _ChunkBuilder(ChunkBuilder):
-    """The bytes of mcap's builder in half the time. The builder of mcap writes field by field, and the length afterwards."""
+    """The bytes of mcap's builder in half the time. The builder of mcap writes field by field, and
+    the length afterwards.
+    """
 
     def add_message(self, message: Message) -> None:
         time_ns = message.log_time
-        self.message_start_time = time_ns if self.num_messages == 0 else min(self.message_start_time, time_ns)
+        self.message_start_time = (
+            time_ns if self.num_messages == 0 else min(self.message_start_time, time_ns)
+        )
         self.message_end_time = max(self.message_end_time, time_ns)
         index = self.message_indices.get(message.channel_id)
         if index is None:
@@ -91,13 +109,16 @@ class _ChunkBuilder(ChunkBuilder):
         self.num_messages += 1
         length = MESSAGE_HEAD.size - RECORD.size + len(message.data)
         self.record_writer.write(
-            MESSAGE_HEAD.pack(MESSAGE, length, message.channel_id, message.sequence, time_ns, message.publish_time)
+            MESSAGE_HEAD.pack(
+                MESSAGE, length, message.channel_id, message.sequence, time_ns, message.publish_time
+            )
         )
         self.record_writer.write(message.data)
 
 
 class _ChunkIndexes:
-    """Chunk indexes as records on disk, in place of mcap's list, which grows by 1 kB a chunk, 36 MB an hour.
+    """Chunk indexes as records on disk, in place of mcap's list, which grows by 1 kB a chunk, 36 MB
+    an hour.
 
     The reserve for the end of the file grows with the number of chunks.
     """
@@ -112,7 +133,9 @@ class _ChunkIndexes:
         index.write(record)
         self._file.keep(record.end())
         self._count += 1
-        self._file.reserve(END_BYTES + self._count * (INDEX_BYTES + INDEX_BYTES_BY_TOPIC * len(self._channels)))
+        self._file.reserve(
+            END_BYTES + self._count * (INDEX_BYTES + INDEX_BYTES_BY_TOPIC * len(self._channels))
+        )
 
     def __iter__(self) -> Iterator["_ChunkIndexes"]:
         yield self
@@ -122,15 +145,19 @@ class _ChunkIndexes:
 
 
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
-    """The full name that a topic of a log has in the stack: `remaps`, by topics of the log, come before those of the log."""
+    """The full name that a topic of a log has in the stack: `remaps`, by topics of the log, come
+    before those of the log.
+    """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
 
 class BagWriter:
-    """Writes a bag into a folder. `flush` closes the chunk: closed chunks stay readable after a kill of the process.
+    """Writes a bag into a folder. `flush` closes the chunk: closed chunks stay readable after a
+    kill of the process.
 
-    Disk space for the end of the file is reserved. Once a write has used the reserve, `full` is true and the bag has to be
-    closed. Raises OSError when a write fails for any further reason, or when the reserve does not suffice.
+    Disk space for the end of the file is reserved. Once a write has used the reserve, `full` is
+    true and the bag has to be closed. Raises OSError when a write fails for any further reason, or
+    when the reserve does not suffice.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -140,7 +167,9 @@ class BagWriter:
         self.channels: list[BagChannel] = []
         self._file = ReservedFile(self.path)
         self._file.reserve(END_BYTES)
-        self._writer = Writer(cast(Any, self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(
+            cast(Any, self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+        )
         setattr(self._writer, CHUNK_BUILDER, _ChunkBuilder())
         setattr(self._writer, CHUNK_INDEXES, _ChunkIndexes(self._file, self.channels))
         try:
@@ -163,7 +192,9 @@ class BagWriter:
         return self._file.full
 
     def add_attachments(self, attachments: LogAttachments, now_ns: int) -> None:
-        """Store the scenario and further files as attachments, and the named sets of strings as metadata records."""
+        """Store the scenario and further files as attachments, and the named sets of strings as
+        metadata records.
+        """
         typed = [(path, FILE_MEDIA_TYPE) for path in attachments.files]
         if attachments.scenario is not None:
             typed.insert(0, (attachments.scenario, SCENARIO_MEDIA_TYPE))
@@ -178,7 +209,8 @@ class BagWriter:
         self._writer.add_metadata(name, dict(values))
 
     def add_topic(self, topic: str, type_name: str, qos: str, before_remap: str = "") -> BagChannel:
-        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles, `before_remap` the name in the stack.
+        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles,
+        `before_remap` the name in the stack.
 
         Raises ParameterError when the definition of the type is unknown.
         """
@@ -187,11 +219,15 @@ class BagWriter:
         metadata = {"offered_qos_profiles": qos, "topic_type_hash": known.type_hash}
         if before_remap not in {"", topic}:
             metadata[BEFORE_REMAP] = before_remap
-        channel = BagChannel(topic, known, qos, self._writer.register_channel(topic, "cdr", schema, metadata))
+        channel = BagChannel(
+            topic, known, qos, self._writer.register_channel(topic, "cdr", schema, metadata)
+        )
         self.channels.append(channel)
         return channel
 
-    def write(self, channel: BagChannel, received_ns: int, sent_ns: int, sequence: int, message: bytes) -> None:
+    def write(
+        self, channel: BagChannel, received_ns: int, sent_ns: int, sequence: int, message: bytes
+    ) -> None:
         """Append a serialised message."""
         self._writer.add_message(channel.identity, received_ns, message, sent_ns, sequence)
         channel.messages += 1
@@ -206,7 +242,13 @@ class BagWriter:
     def contents(self) -> FileContents:
         """What the file holds so far."""
         counts = (
-            TopicCount(channel.topic, channel.type.name, channel.type.type_hash, channel.qos, channel.messages)
+            TopicCount(
+                channel.topic,
+                channel.type.name,
+                channel.type.type_hash,
+                channel.qos,
+                channel.messages,
+            )
             for channel in self.channels
         )
         return FileContents(self.path.name, self._first_ns or 0, self._last_ns, tuple(counts))
@@ -224,7 +266,9 @@ class BagWriter:
 
 
 def _is_mapping_of_strings(content: object) -> bool:
-    return isinstance(content, dict) and all(isinstance(text, str) for text in (*content.keys(), *content.values()))
+    return isinstance(content, dict) and all(
+        isinstance(text, str) for text in (*content.keys(), *content.values())
+    )
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The clock of the stamps of a topic, followed in the order of the recording: steps, damaged stamps, equal stamps."""
+"""The clock of the stamps of a topic, followed in the order of the recording: steps, damaged
+stamps, equal stamps.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -15,16 +17,21 @@ from flight_core.tape import Recording, Signal
 
 STEP_NS = NANOSECONDS // 10  # back: late samples are less late
 LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
-STRAY_NS = NANOSECONDS  # back: fewer messages than CONFIRMED that are so much older have a damaged stamp
-CONFIRMED = 10  # successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
+STRAY_NS = (
+    NANOSECONDS  # back: fewer messages than CONFIRMED that are so much older have a damaged stamp
+)
+# successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
+CONFIRMED = 10
 CONFIRMED_AT_END = 3
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
 
 
 class StampClock:
-    """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a damaged stamp is left out.
+    """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a
+    damaged stamp is left out.
 
-    The samples after a step forth stay: `without_leaps` knows all topics and decides on the samples.
+    The samples after a step forth stay: `without_leaps` knows all topics and decides on the
+    samples.
     """
 
     def __init__(self) -> None:
@@ -45,10 +52,10 @@ class StampClock:
     ) -> tuple[NDArray[np.bool_], int]:
         """Mask of the usable messages of the next K messages, shape (K,), and K.
 
-        With `more` messages to come at once, K is less than the number of messages where the last messages confirm no step.
-        `end`: the messages are the last messages of the topic. `steps`: of the publisher's number before each message, (K,). A
-        number falls together with both times in a part of the log out of order. A jump forth beside lost
-        messages is a gap.
+        With `more` messages to come at once, K is less than the number of messages where the last
+        messages confirm no step. `end`: the messages are the last messages of the topic. `steps`:
+        of the publisher's number before each message, (K,). A number falls together with both times
+        in a part of the log out of order. A jump forth beside lost messages is a gap.
         """
         unset = (stamp_ns == 0) & ((self._last_ns or 0) > STEP_NS)
         if self._step_ns:
@@ -69,7 +76,9 @@ class StampClock:
         keep = ~unset
         for first, after in pairwise(edges if len(stamps) else []):
             is_last = after == len(stamps)
-            jump_ns, is_ahead = self._jump_to(int(stamps[first]), int(offsets[first]), has_time=bool(timed[first]))
+            jump_ns, is_ahead = self._jump_to(
+                int(stamps[first]), int(offsets[first]), has_time=bool(timed[first])
+            )
             if after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED):
                 if is_last and more and first > 0:
                     return self._taken(stamp_ns, keep[: known[first]], int(known[first]))
@@ -82,29 +91,42 @@ class StampClock:
                 after_step = int(known[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            if self._last_ns is None:  # the messages before are too few to be the begin of the clock
+            if (
+                self._last_ns is None
+            ):  # the messages before are too few to be the begin of the clock
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
-                # a recorder on a busy host stores its first sample late: a lead below STRAY_NS is no damage
-                keep[known[:first]] &= (away_ns >= -STEP_NS) & ((away_ns <= STRAY_NS) | (lead_ns <= STRAY_NS))
+                # a recorder on a busy host stores its first sample late: a lead below STRAY_NS is
+                # no damage
+                keep[known[:first]] &= (away_ns >= -STEP_NS) & (
+                    (away_ns <= STRAY_NS) | (lead_ns <= STRAY_NS)
+                )
             self._last_ns = int(stamps[after - 1])
             self._last_offset_ns = int(offsets[after - 1])
             self._offset_ns = max(self._offset_ns, int(offsets[first:after].max()))
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """From the usable part to a stamp, ns, 0 without one; and whether the stamp is ahead of the clock."""
+        """From the usable part to a stamp, ns, 0 without one; and whether the stamp is ahead of the
+        clock.
+        """
         if not self._last_ns:  # none, or a stamp that was not set
             return 0, False
         jump_ns = stamp_ns - self._last_ns
         return jump_ns, jump_ns > LEAP_NS and has_time and offset_ns > self._offset_ns + LEAP_NS
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples that stay after the step: behind a step forth those later than the step."""
+        """Mask of the samples that stay after the step: behind a step forth those later than the
+        step.
+        """
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
     def _taken(
-        self, stamp_ns: NDArray[np.int64], keep: NDArray[np.bool_], count: int, after_step: int | None = None
+        self,
+        stamp_ns: NDArray[np.int64],
+        keep: NDArray[np.bool_],
+        count: int,
+        after_step: int | None = None,
     ) -> tuple[NDArray[np.bool_], int]:
         before = count if after_step is None else after_step
         self._found += count
@@ -115,18 +137,30 @@ class StampClock:
 
     def recording(self, unset: int = 0) -> Recording:
         """The result; `unset`: further messages without a usable stamp."""
-        return Recording(self._found, self._unset + unset, self._repeated, self._step_ns, self._step_at_ns, self._left_out)
+        return Recording(
+            self._found,
+            self._unset + unset,
+            self._repeated,
+            self._step_ns,
+            self._step_at_ns,
+            self._left_out,
+        )
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str:
     """The sentence on the stamps of a topic; empty for a clock without steps and damaged stamps."""
     parts = []
     if recording.unset:
-        parts.append(f"{recording.unset} of {recording.found} samples have no usable stamp and are left out")
+        parts.append(
+            f"{recording.unset} of {recording.found} samples have no usable stamp and are left out"
+        )
     if recording.step_ns:
         way = "back" if recording.step_ns < 0 else "forth"
         t = seconds(recording.step_at_ns - start_ns)
-        step = f"the clock of its stamps steps {way} by {abs(seconds(recording.step_ns)):.3f} s at t = {t:.3f} s"
+        step = (
+            f"the clock of its stamps steps {way} by {abs(seconds(recording.step_ns)):.3f} s "
+            f"at t = {t:.3f} s"
+        )
         parts.append(f"{step}: the {recording.left_out} samples after the step are left out")
     return f"{name}: {'; '.join(parts)}" if parts else ""
 
@@ -159,7 +193,11 @@ def without_leaps(
     for leap in _candidates(signals, recording):
         earlier = Leap(leap.at_ns - sum(before.by_ns for before in leaps), leap.by_ns)
         leaping = [name for name, signal in mended.items() if _has_gap(signal, earlier)]
-        loop = [name for name in LOOP if name in mended and mended[name].stamp_ns[-1] > earlier.at_ns + STEP_NS]
+        loop = [
+            name
+            for name in LOOP
+            if name in mended and mended[name].stamp_ns[-1] > earlier.at_ns + STEP_NS
+        ]
         if len(loop) < 2 or not {*loop} <= {*leaping}:  # a single topic has a clock of its own
             continue
         leaps.append(earlier)
@@ -173,8 +211,12 @@ def without_leaps(
     return mended, clocks, leaps
 
 
-def _candidates(signals: Mapping[str, Signal], recording: Mapping[str, Recording]) -> Iterator[Leap]:
-    """Leaps of the stamps: beside the flight times of `truth`, else beside numbers of messages without a gap."""
+def _candidates(
+    signals: Mapping[str, Signal], recording: Mapping[str, Recording]
+) -> Iterator[Leap]:
+    """Leaps of the stamps: beside the flight times of `truth`, else beside numbers of messages
+    without a gap.
+    """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
         return
@@ -182,7 +224,9 @@ def _candidates(signals: Mapping[str, Signal], recording: Mapping[str, Recording
     elapsed_ns = np.diff(stamp_ns)
     if "t" in signals[name].names:
         flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
-    elif len(elapsed_ns) and all(recording[topic].lost == 0 for topic in LOOP if topic in recording):
+    elif len(elapsed_ns) and all(
+        recording[topic].lost == 0 for topic in LOOP if topic in recording
+    ):
         flown_ns = np.full(len(elapsed_ns), np.median(elapsed_ns))
     else:
         return

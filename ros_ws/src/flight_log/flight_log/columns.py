@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of a topic as columns: a short topic in memory, a long one in a temporary file.
 
-Metrics and figures use whole channels, one after another. An hour of `truth` has 400 MB, and one of its channels 14 MB.
+Metrics and figures use whole channels, one after another. An hour of `truth` has 400 MB, and one of
+its channels 14 MB.
 """
 
 from collections.abc import Iterator
@@ -22,9 +23,11 @@ IN_MEMORY = 32_000_000
 
 
 class Columns:
-    """Samples in order of arrival: stamps, and rows of equal length that are read as columns, contiguous in memory.
+    """Samples in order of arrival: stamps, and rows of equal length that are read as columns,
+    contiguous in memory.
 
-    `expected` samples are expected, more are taken. Raises ParameterError where no temporary file can hold a long topic.
+    `expected` samples are expected, more are taken. Raises ParameterError where no temporary file
+    can hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
@@ -71,7 +74,9 @@ class _Memory:
 
 
 class _File:
-    """Columns in a temporary file without a name, written past memory and mapped as long as an array of them is used."""
+    """Columns in a temporary file without a name, written past memory and mapped as long as an
+    array of them is used.
+    """
 
     def __init__(self, width: int, capacity: int) -> None:
         self._capacity = capacity
@@ -92,7 +97,9 @@ class _File:
             self._file.flush()
         if not self._capacity or first == end:
             return np.empty((count, end - first))
-        return np.asarray(np.memmap(self._file, np.float64, "r", shape=self._shape))[first:end, :count].T
+        return np.asarray(np.memmap(self._file, np.float64, "r", shape=self._shape))[
+            first:end, :count
+        ].T
 
 
 @contextmanager
@@ -101,17 +108,27 @@ def _on_disk() -> Iterator[None]:
         yield
     except OSError as error:
         expected = "space for the samples of a long log: set TMPDIR to a folder with it"
-        raise ParameterError(f"a temporary file: cannot be written ({error.strerror}), expected {expected}") from None
+        raise ParameterError(
+            f"a temporary file: cannot be written ({error.strerror}), expected {expected}"
+        ) from None
 
 
 class _StoredSignal(Signal):
     """A signal with values in a file, whose neighbouring columns from `first` on are its channels.
 
-    `values` maps the file each time: the memory is free once the caller drops the array. A caller in a loop keeps the array.
+    `values` maps the file each time: the memory is free once the caller drops the array. A caller
+    in a loop keeps the array.
     """
 
-    def __init__(self, stamp_ns: NDArray[np.int64], names: tuple[str, ...], store: _File, first: int) -> None:
-        for name, value in (("stamp_ns", stamp_ns), ("names", names), ("_store", store), ("_first", first)):
+    def __init__(
+        self, stamp_ns: NDArray[np.int64], names: tuple[str, ...], store: _File, first: int
+    ) -> None:
+        for name, value in (
+            ("stamp_ns", stamp_ns),
+            ("names", names),
+            ("_store", store),
+            ("_first", first),
+        ):
             object.__setattr__(self, name, value)
 
     _store: _File
@@ -131,5 +148,8 @@ class _StoredSignal(Signal):
         if tuple(names) != self.names[first : first + len(names)]:
             return super().group(prefix)
         return _StoredSignal(
-            self.stamp_ns, tuple(name.removeprefix(f"{prefix}.") for name in names), self._store, self._first + first
+            self.stamp_ns,
+            tuple(name.removeprefix(f"{prefix}.") for name in names),
+            self._store,
+            self._first + first,
         )

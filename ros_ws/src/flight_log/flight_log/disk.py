@@ -20,7 +20,8 @@ def free_bytes(folder: Path) -> int:
 
 
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
-    """Lock a file until the stream is closed. False when a second process, such as a recorder, holds the lock.
+    """Lock a file until the stream is closed. False when a second process, such as a recorder,
+    holds the lock.
 
     A file system without locks always grants the lock.
     """
@@ -34,7 +35,9 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a second process, such as a recorder, holds the lock of a file. Raises OSError when the file cannot be opened."""
+    """Whether a second process, such as a recorder, holds the lock of a file. Raises OSError when
+    the file cannot be opened.
+    """
     with path.open("rb") as stream:
         return not try_lock(stream, fcntl.LOCK_SH)
 
@@ -42,14 +45,17 @@ def is_locked(path: Path) -> bool:
 class ReservedFile:
     """A new unbuffered file with a reserve of disk space for the end of the file on a full disk.
 
-    A second, unnamed file takes up the reserve. The first write without space closes the unnamed file and then succeeds. The
-    reserve also ends with the process. Until then the reserve holds the data of `keep`, for the end of the file.
+    A second, unnamed file takes up the reserve. The first write without space closes the unnamed
+    file and then succeeds. The reserve also ends with the process. Until then the reserve holds the
+    data of `keep`, for the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
         self._reserve = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115 - open as long as this file
         try:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._descriptor = os.open(
+                path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
+            )
         except OSError:
             self._reserve.close()
             raise
@@ -63,7 +69,8 @@ class ReservedFile:
         self.full = False  # the reserve was needed
 
     def reserve(self, size: int) -> None:
-        """Reserve this many bytes in total. Without enough space `full` is set and the earlier reserve stays.
+        """Reserve this many bytes in total. Without enough space `full` is set and the earlier
+        reserve stays.
 
         A call after `release` has no effect: the last chunk is written then.
         """
@@ -76,7 +83,9 @@ class ReservedFile:
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file: in the reserve while a reserve exists, then in memory."""
+        """Keep data for the end of the file: in the reserve while a reserve exists, then in
+        memory.
+        """
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
@@ -100,7 +109,9 @@ class ReservedFile:
             self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:
-        """Write the data. Raises OSError when the reserve does not suffice, or for any further reason."""
+        """Write the data. Raises OSError when the reserve does not suffice, or for any further
+        reason.
+        """
         unwritten = memoryview(data)
         size = unwritten.nbytes
         while unwritten:

@@ -23,7 +23,9 @@ class Engagement(NamedTuple):
 
 
 def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
-    """The engagements, in order, from the times of sending and the messages of the reports; None without a report."""
+    """The engagements, in order, from the times of sending and the messages of the reports; None
+    without a report.
+    """
     spans: list[Engagement] | None = None
     for sent_ns, data in reports:
         try:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names the kind of a file by the first bytes: a log, a packed log, or a file of another program."""
+"""Names the kind of a file by the first bytes: a log, a packed log, or a file of another
+program.
+"""
 
 import struct
 from datetime import UTC, datetime
@@ -33,7 +35,8 @@ MAGICS = MappingProxyType(
         ZSTD_MAGIC: ZSTD,
         LZ4_MAGIC: LZ4,
         b"ULog\x01\x12\x35": "a ULog of PX4",  # PX4 guide, ULog file format
-        b"\xa3\x95\x80": "a DataFlash log of ArduPilot",  # a packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h)
+        # a packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h)
+        b"\xa3\x95\x80": "a DataFlash log of ArduPilot",
         b"FMT, 128, 89,": "a DataFlash log of ArduPilot as text",
         b"H Product:Blackbox": "a blackbox log of Betaflight or INAV",
         b"#ROSBAG V": "a bag of ROS 1",
@@ -60,8 +63,13 @@ MAGICS = MappingProxyType(
 # POSIX.1-2017, pax, ustar Interchange Format
 TAR_PLACE = 257
 TAR = b"ustar"
-MAVLINK = (b"\xfd", b"\xfe")  # first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
-TLOG_TIME = struct.Struct(">Q")  # us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
+MAVLINK = (
+    b"\xfd",
+    b"\xfe",
+)  # first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
+TLOG_TIME = struct.Struct(
+    ">Q"
+)  # us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
 TLOG_YEARS = (2000, 2100)
 HEAD_BYTES = 4096
 
@@ -77,11 +85,20 @@ def file_kind(path: Path) -> str:
 
 
 def kind_of(head: bytes) -> str:
-    """The kind of a file by the first HEAD_BYTES bytes, or the kind of a text or of unknown bytes."""
+    """The kind of a file by the first HEAD_BYTES bytes, or the kind of a text or of unknown
+    bytes.
+    """
     if MCAP0_MAGIC.startswith(head):  # also of a recorder that was killed at its start
         return BEGUN if head else EMPTY
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
-    by_magic = next((kind for magic, kind in MAGICS.items() if (text if magic.isascii() else head).startswith(magic)), "")
+    by_magic = next(
+        (
+            kind
+            for magic, kind in MAGICS.items()
+            if (text if magic.isascii() else head).startswith(magic)
+        ),
+        "",
+    )
     if by_magic:
         return by_magic
     kinds = {

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight in a log: when ready, by the line on /rosout, and the span of the samples."""
+"""The processes of a flight in a log: when ready, by the line on /rosout, and the span of the
+samples.
+"""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -16,7 +18,8 @@ from flight_log.named_vectors import typestore
 
 ROSOUT = "/rosout"
 LOG = "rcl_interfaces/msg/Log"
-READY = b"\x06\x00\x00\x00ready\x00"  # the text of the line in CDR: its length with the final zero, and its bytes
+# the text of the line in CDR: its length with the final zero, and its bytes
+READY = b"\x06\x00\x00\x00ready\x00"
 UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
 
@@ -30,7 +33,11 @@ class Span(NamedTuple):
 
     def joined(self, later: "Span") -> "Span":
         """The joint span."""
-        return Span(min(self.first_ns, later.first_ns), max(self.last_ns, later.last_ns), self.samples + later.samples)
+        return Span(
+            min(self.first_ns, later.first_ns),
+            max(self.last_ns, later.last_ns),
+            self.samples + later.samples,
+        )
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
@@ -42,16 +49,23 @@ def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
         except SerdeError:
             continue
         if line.msg == "ready":
-            times.append((f"/{line.name.replace('.', '/')}", line.stamp.sec * NANOSECONDS + line.stamp.nanosec))
+            times.append(
+                (
+                    f"/{line.name.replace('.', '/')}",
+                    line.stamp.sec * NANOSECONDS + line.stamp.nanosec,
+                )
+            )
     return sorted(times, key=lambda time: time[1])
 
 
-def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]], namespace: str) -> dict[str, Process]:
+def flight_processes(
+    spans: Mapping[str, Span], ready: Iterable[tuple[str, int]], namespace: str
+) -> dict[str, Process]:
     """The processes by name, "/controller#4711", by the `spans` of the publishers.
 
-    A node that was restarted is several processes. A process was ready at the last such time of its node before its first
-    sample. A node without samples, as the recorder, has no process id. Beside nodes of the stack every publisher counts, as
-    `ros2 topic pub`, which gives no name.
+    A node that was restarted is several processes. A process was ready at the last such time of its
+    node before its first sample. A node without samples, as the recorder, has no process id. Beside
+    nodes of the stack every publisher counts, as `ros2 topic pub`, which gives no name.
     """
     has_stack = any(INSTANCE.fullmatch(name) for name in spans)
     waiting: dict[str, list[int]] = {}
@@ -61,21 +75,31 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
     processes = {}
     for name, (first_ns, last_ns, samples) in sorted(spans.items(), key=lambda span: span[1]):
         if (instance := INSTANCE.fullmatch(name)) is not None:
-            before = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns <= first_ns + NANOSECONDS]
+            before = [
+                time_ns
+                for time_ns in waiting.get(instance[1], [])
+                if time_ns <= first_ns + NANOSECONDS
+            ]
             processes[name] = Process(before[-1] if before else None, first_ns, last_ns, samples)
-            waiting[instance[1]] = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before]
+            waiting[instance[1]] = [
+                time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before
+            ]
         elif has_stack:
             processes[name or UNNAMED] = Process(None, first_ns, last_ns, samples)
-    return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}
+    return processes | {
+        node: Process(times[-1], None, None) for node, times in waiting.items() if times
+    }
 
 
 RESTART = 10  # a number of a tick that is less by more is of another controller
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the time.
+    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the
+    time.
 
-    Two ticks of one instant may be stored in either order: a number a little less, new to the controller, begins no controller.
+    Two ticks of one instant may be stored in either order: a number a little less, new to the
+    controller, begins no controller.
     """
     starts = []
     first = 0

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sensor or instance of an autopilot's log with the flight.
 
-Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH), AP_InertialSensor.cpp (INS_USE);
-PX4, vtol_att_control (instance 0 of the setpoints of torque is of the rotors, 1 of the surfaces).
+Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
+AP_InertialSensor.cpp (INS_USE); PX4, vtol_att_control (instance 0 of the setpoints of torque is of
+the rotors, 1 of the surfaces).
 """
 
 from collections.abc import Mapping, Set
@@ -28,11 +29,16 @@ def flown(
 ) -> tuple[dict[str, Table], list[tuple[str, str]]]:
     """A table by message, and the choice among several instances with the reason.
 
-    `fields`: the fields that are read, by message; further messages give their first instance. Raises ParameterError where
-    two unlike instances remain.
+    `fields`: the fields that are read, by message; further messages give their first instance.
+    Raises ParameterError where two unlike instances remain.
     """
     for name in choice.instances:
-        require(name in instances, "--instance", name, f"a message of the log, as {', '.join([*instances][:8])}")
+        require(
+            name in instances,
+            "--instance",
+            name,
+            f"a message of the log, as {', '.join([*instances][:8])}",
+        )
     tables: dict[str, Table] = {}
     taken: list[tuple[str, str]] = []
     for name, numbered in instances.items():
@@ -48,10 +54,16 @@ def flown(
             number = min(numbered)
             reason = "the first" if name in fields and len(numbered) > 1 else ""
         elif name in SURFACES:
-            number, reason = (1, "the surfaces of a VTOL") if choice.vehicle == PLANE else (0, "the rotors of a VTOL")
+            number, reason = (
+                (1, "the surfaces of a VTOL")
+                if choice.vehicle == PLANE
+                else (0, "the rotors of a VTOL")
+            )
         else:
             usable = _used(numbered, parameters) if name == "IMU" else set(numbered)
-            number, reason = _of_motion(name, {k: numbered[k] for k in sorted(usable)}, fields[name])
+            number, reason = _of_motion(
+                name, {k: numbered[k] for k in sorted(usable)}, fields[name]
+            )
         tables[name] = numbered[number]
         taken += [(name, f"{number} of {_listed(numbered)}: {reason}")] * bool(reason)
     return tables, taken
@@ -60,12 +72,16 @@ def flown(
 def _of_motion(name: str, numbered: Mapping[int, Table], fields: Set[str]) -> tuple[int, str]:
     """The moving instance; the first of several equal ones."""
     motions = {number: _motion(table, fields) for number, table in numbered.items()}
-    moving = {number: numbered[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)}
+    moving = {
+        number: numbered[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)
+    }
     first, *others = moving
     if all(_agree(moving[first], moving[number], fields) for number in others):
         return first, "the first of those that agree" if others else "it alone is used and moves"
     ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
-    raise ParameterError(f"the log: found {name} of {_listed(moving)}, which differ, expected {ways_out}")
+    raise ParameterError(
+        f"the log: found {name} of {_listed(moving)}, which differ, expected {ways_out}"
+    )
 
 
 def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
@@ -74,7 +90,9 @@ def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
 
 
 def _motion(table: Table, fields: Set[str]) -> float:
-    """The deviations of the fields, or the typical value of an airspeed: a dead sensor has no airspeed."""
+    """The deviations of the fields, or the typical value of an airspeed: a dead sensor has no
+    airspeed.
+    """
     for field in fields & AIRSPEEDS & table.fields.keys():
         finite = table.fields[field][np.isfinite(table.fields[field])]
         return float(np.percentile(finite, TYPICAL)) if len(finite) else 0.0
@@ -92,7 +110,9 @@ def _agree(first: Table, second: Table, fields: Set[str]) -> bool:
         values = first.fields[field]
         difference = values - second.at(field, first.stamp_ns)
         known = np.isfinite(difference)
-        if known.any() and np.sqrt(np.mean(difference[known] ** 2)) > UNLIKE * _deviation(values[known]):
+        if known.any() and np.sqrt(np.mean(difference[known] ** 2)) > UNLIKE * _deviation(
+            values[known]
+        ):
             return False
     return True
 
@@ -100,10 +120,21 @@ def _agree(first: Table, second: Table, fields: Set[str]) -> bool:
 def _used(numbered: Mapping[int, Table], parameters: Parameters) -> set[int]:
     """The healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
     names = {number: f"INS_USE{number + 1 if number else ''}" for number in numbered}
-    used = {number for number, name in names.items() if name not in parameters or parameters[name][0].value}
+    used = {
+        number
+        for number, name in names.items()
+        if name not in parameters or parameters[name][0].value
+    }
     healthy = {number for number in used if _share(numbered[number], "GH") >= MOST}
-    logged = ", ".join(f"{name} {parameters[name][0].value:g}" for name in names.values() if name in parameters)
-    require(bool(healthy), "the log", f"no IMU that is used and healthy ({logged})", "one, or --instance IMU=0")
+    logged = ", ".join(
+        f"{name} {parameters[name][0].value:g}" for name in names.values() if name in parameters
+    )
+    require(
+        bool(healthy),
+        "the log",
+        f"no IMU that is used and healthy ({logged})",
+        "one, or --instance IMU=0",
+    )
     return healthy
 
 
@@ -113,29 +144,48 @@ def _share(table: Table, field: str) -> float:
 
 
 def _airspeed(numbered: Mapping[int, Table]) -> tuple[Table, str]:
-    """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use. NaN: not healthy."""
+    """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use.
+    NaN: not healthy.
+    """
     tables = {number: _healthy(table) for number, table in numbered.items()}
-    live = {number: table for number, table in tables.items() if np.isfinite(table.fields["Airspeed"]).mean() >= MOST}
+    live = {
+        number: table
+        for number, table in tables.items()
+        if np.isfinite(table.fields["Airspeed"]).mean() >= MOST
+    }
     used = {number: table for number, table in live.items() if _share(table, "U") >= MOST} or live
     primary = _primary(tables)
     if primary is not None and np.isfinite(primary[1].fields["Airspeed"]).mean() >= MOST:
         numbers, table = primary
-        unlike = [number for number in used if number not in numbers and not _agree(used[number], table, {"Airspeed"})]
+        unlike = [
+            number
+            for number in used
+            if number not in numbers and not _agree(used[number], table, {"Airspeed"})
+        ]
         if not unlike:
             return table, f"{_listed(numbers)} of {_listed(tables)}: the primary"
         used = {number: tables[number] for number in (*numbers, *unlike)}
-    require(bool(used), "the log", "no healthy airspeed sensor (ARSP.H is 0)", "one, or --instance ARSP=0")
+    require(
+        bool(used),
+        "the log",
+        "no healthy airspeed sensor (ARSP.H is 0)",
+        "one, or --instance ARSP=0",
+    )
     number, _ = _of_motion("ARSP", used, {"Airspeed"})
     return tables[number], f"{number} of {_listed(tables)}: healthy and used"
 
 
 def _healthy(table: Table) -> Table:
     healthy = table.fields.get("H", np.ones(len(table.stamp_ns))) != 0.0
-    return table._replace(fields={**table.fields, "Airspeed": np.where(healthy, table.fields["Airspeed"], np.nan)})
+    return table._replace(
+        fields={**table.fields, "Airspeed": np.where(healthy, table.fields["Airspeed"], np.nan)}
+    )
 
 
 def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
-    """The samples of the primary sensor at every instant, and the numbers of the sensors; None for a log without `Pri`."""
+    """The samples of the primary sensor at every instant, and the numbers of the sensors; None for
+    a log without `Pri`.
+    """
     if not all("Pri" in table.fields for table in tables.values()):
         return None
     masks = {number: table.fields["Pri"] == number for number, table in tables.items()}
@@ -143,7 +193,9 @@ def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
     if not numbers:
         return None
     stamps = np.concatenate([tables[number].stamp_ns[masks[number]] for number in numbers])
-    airspeed = np.concatenate([tables[number].fields["Airspeed"][masks[number]] for number in numbers])
+    airspeed = np.concatenate(
+        [tables[number].fields["Airspeed"][masks[number]] for number in numbers]
+    )
     order = np.argsort(stamps, kind="stable")
     return numbers, Table(stamps[order], {"Airspeed": airspeed[order]})
 

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a growing log: a call continues at the end of the last call. A finished log is read in the same way.
+"""Reads a growing log: a call continues at the end of the last call. A finished log is read in the
+same way.
 
 A log of another storage, or a packed log, is finished: `open_log` reads it.
 
-A record is read once the record is whole: a chunk in progress is never read. The message index behind a chunk gives the
-places of the messages: messages of unwanted topics cost nothing.
+A record is read once the record is whole: a chunk in progress is never read. The message index
+behind a chunk gives the places of the messages: messages of unwanted topics cost nothing.
 """
 
 import math
@@ -74,7 +75,8 @@ class _Channel:
 class Follower:
     """Follows the log of a run: the folder of a bag, with or without a file yet, or an MCAP file.
 
-    `rate_of(topic, type_name)` is the highest wanted rate of the messages of a topic, Hz: infinite without a limit, 0 for none.
+    `rate_of(topic, type_name)` is the highest wanted rate of the messages of a topic, Hz: infinite
+    without a limit, 0 for none.
     """
 
     def __init__(self, run: Path, rate_of: Callable[[str, str], float]) -> None:
@@ -82,7 +84,9 @@ class Follower:
         self.damaged = 0  # records that could not be read
         self.complete = False  # the end of the data has been read
         self.fault = ""  # why nothing more of the log can be read
-        self.definitions: dict[str, str] = {}  # of the message types that have occurred, ros2msg, by name
+        self.definitions: dict[
+            str, str
+        ] = {}  # of the message types that have occurred, ros2msg, by name
         self._rate_of = rate_of
         self._read_files: list[Path] = []
         self._pending: deque[Messages | Attachment | Metadata] = deque()
@@ -96,12 +100,18 @@ class Follower:
         self._channels: dict[int, _Channel] = {}
         self._chunk = b""  # the last chunk
         self._indexed = True  # at least one message index of it has been read
-        self._unread: list[tuple[int, int]] = []  # place and length of the chunks whose schemas and channels were not read
-        self._finished: Iterator[object] | None = None  # records of a file of another storage, or of a packed file
+        self._unread: list[
+            tuple[int, int]
+        ] = []  # place and length of the chunks whose schemas and channels were not read
+        self._finished: Iterator[object] | None = (
+            None  # records of a file of another storage, or of a packed file
+        )
 
     @property
     def path(self) -> Path | None:
-        """The present file; None before the first file. Raises ParameterError for a folder with several bags."""
+        """The present file; None before the first file. Raises ParameterError for a folder with
+        several bags.
+        """
         if self._path is None:
             files = bag_files(self.run)
             if files and not self.run.is_file():
@@ -121,7 +131,8 @@ class Follower:
                 channel.rate = 0.0
 
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
-        """The records since the last call. A caller may stop the iteration: the next call continues.
+        """The records since the last call. A caller may stop the iteration: the next call
+        continues.
 
         Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
         """
@@ -140,7 +151,9 @@ class Follower:
                 size = status.st_size
                 identity = (status.st_dev, status.st_ino)
                 if self._position > 0 and (identity != self._identity or size < self._position):
-                    self.fault = f"{path} was replaced by another file, as rise-di report --repair does"
+                    self.fault = (
+                        f"{path} was replaced by another file, as rise-di report --repair does"
+                    )
                     return
                 self._identity = identity
                 for opcode, content in self._records(stream, size):
@@ -178,7 +191,9 @@ class Follower:
             yield self._pending.popleft()
 
     def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of every whole record behind the position. The position moves on before a record is given."""
+        """Opcode and content of every whole record behind the position. The position moves on
+        before a record is given.
+        """
         if self._position == 0 and size >= len(MCAP0_MAGIC):
             self.complete = False
             self._position = len(MCAP0_MAGIC)
@@ -237,19 +252,27 @@ class Follower:
             raise McapError("messages without their channel")
         if size == 0 or channel.rate <= 0.0:
             return
-        places: Sequence[int] = struct.unpack_from(f"<{size // 8}Q", content, MESSAGE_INDEX.size)[1::2]
+        places: Sequence[int] = struct.unpack_from(f"<{size // 8}Q", content, MESSAGE_INDEX.size)[
+            1::2
+        ]
         if channel.rate < math.inf:
             if channel.step == 0:
-                channel.step = _step(channel.rate, len(places), self._messages_at((places[0], places[-1]))[1])
+                channel.step = _step(
+                    channel.rate, len(places), self._messages_at((places[0], places[-1]))[1]
+                )
             step = max(channel.step, 1)
             skipped = channel.skip
             channel.skip = (channel.skip - len(places)) % step
             places = places[skipped::step]
         if places:
-            self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
+            self._pending.append(
+                Messages(channel.topic, channel.type_name, *self._messages_at(places))
+            )
 
     def _learn_from_chunks(self) -> None:
-        """Schemas and channels of the chunks so far: that of a topic may be in a chunk without a message of it."""
+        """Schemas and channels of the chunks so far: that of a topic may be in a chunk without a
+        message of it.
+        """
         places = self._unread
         self._unread = []
         if self.path is None:
@@ -262,7 +285,9 @@ class Follower:
                         self._learn(record)
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
-        """Times of sending, else of receipt, in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""
+        """Times of sending, else of receipt, in ns and data of messages of the last chunk. Raises
+        DECODE_ERRORS.
+        """
         chunk = self._chunk
         sent_ns = []
         data = []
@@ -300,13 +325,25 @@ class Follower:
             self._schemas[record.id] = record.name
             self.definitions[record.name] = record.data.decode(errors="replace")
         elif isinstance(record, Channel):
-            type_name = full_name(self._schemas.get(record.schema_id, "")) if record.message_encoding == "cdr" else ""
+            type_name = (
+                full_name(self._schemas.get(record.schema_id, ""))
+                if record.message_encoding == "cdr"
+                else ""
+            )
             if record.id not in self._channels:
                 topic = stack_topic(record)
-                self._channels[record.id] = _Channel(topic, type_name, self._rate_of(topic, type_name))
+                self._channels[record.id] = _Channel(
+                    topic, type_name, self._rate_of(topic, type_name)
+                )
 
 
 def _step(rate: float, count: int, ends: Sequence[bytes]) -> int:
-    """Every how many-th of `count` messages is read, from the stamps of the first and the last; 0 where they do not tell."""
+    """Every how many-th of `count` messages is read, from the stamps of the first and the last; 0
+    where they do not tell.
+    """
     span_ns = stamp_of(ends[1]) - stamp_of(ends[0])
-    return max(1, math.floor(NANOSECONDS / rate * (count - 1) / span_ns + 0.01)) if count > 1 and span_ns > 0 else 0
+    return (
+        max(1, math.floor(NANOSECONDS / rate * (count - 1) / span_ns + 0.01))
+        if count > 1 and span_ns > 0
+        else 0
+    )

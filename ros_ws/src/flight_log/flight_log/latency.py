@@ -23,16 +23,19 @@ class Times(NamedTuple):
 
 
 def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
-    """Time from the sending of y to the sending of u with the stamp of y, s: a channel by the stamps of u.
+    """Time from the sending of y to the sending of u with the stamp of y, s: a channel by the
+    stamps of u.
 
-    `sent` holds the times by the full names of the topics y and u. None for a log without y or u, with several aircraft, or
-    with equal times, as of a flight in one process.
+    `sent` holds the times by the full names of the topics y and u. None for a log without y or u,
+    with several aircraft, or with equal times, as of a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in sent}
     if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):
         return None
     y, u = (_last_of_each(sent[topics[name]]) for name in TOPICS)
-    stamps, place_y, place_u = np.intersect1d(y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True)
+    stamps, place_y, place_u = np.intersect1d(
+        y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True
+    )
     values = (u.sent_ns[place_u] - y.sent_ns[place_y]) / NANOSECONDS
     return Signal(stamps, (CHANNEL,), values[:, None]) if values.any() else None
 

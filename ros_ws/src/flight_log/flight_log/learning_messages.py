@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the proposals of a learner: messages of the topic `learning`, written and read without ROS."""
+"""What became of the proposals of a learner: messages of the topic `learning`, written and read
+without ROS.
+"""
 
 import json
 from typing import Any
@@ -18,7 +20,10 @@ WARN = 1
 def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
     """A message of LEARNING, as the controller itself publishes it; `kind` is that of the event."""
     store = typestore()
-    types = {name: store.types[f"diagnostic_msgs/msg/{name}"] for name in ("DiagnosticArray", "DiagnosticStatus", "KeyValue")}
+    types = {
+        name: store.types[f"diagnostic_msgs/msg/{name}"]
+        for name in ("DiagnosticArray", "DiagnosticStatus", "KeyValue")
+    }
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
     header = store.types["std_msgs/msg/Header"](stamp, "in_process")
     event = types["KeyValue"]("event", json.dumps(kind))
@@ -29,4 +34,6 @@ def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) ->
 def stamped_sentence(message: Any) -> tuple[int, str]:
     """Stamp, ns, and sentence of a message of LEARNING; "" for one without."""
     stamp = message.header.stamp
-    return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(status.message for status in message.status)
+    return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(
+        status.message for status in message.status
+    )

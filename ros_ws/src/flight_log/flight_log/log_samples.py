@@ -19,7 +19,8 @@ LOST_NS = 60 * NANOSECONDS
 AGREEING = 5  # samples, after which another time is that of the clock
 
 Sample = tuple[tuple[str, int], int, Any]
-"""Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and a value."""
+"""Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and
+a value."""
 
 Instances = dict[str, dict[int, Table]]
 """The tables of the messages, by name and by the number of the instance."""
@@ -27,12 +28,15 @@ Instances = dict[str, dict[int, Table]]
 SETTING = (PARAMETER, 0)
 
 
-def tables_of(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tuple[Instances, Parameters, str]:
+def tables_of(
+    samples: Iterable[Sample], wanted: Mapping[str, set[str]]
+) -> tuple[Instances, Parameters, str]:
     """Tables of messages, parameters, and a note. A field that its first message lacks is absent.
 
-    Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the longest part counts alone. A
-    stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it. A parameter belongs
-    to the part of the next sample: an autopilot that starts writes its parameters first.
+    Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the
+    longest part counts alone. A stamp is damaged, and its sample is left out, where fewer than
+    AGREEING samples in a row agree with it. A parameter belongs to the part of the next sample: an
+    autopilot that starts writes its parameters first.
     """
     parts = [list[Sample]()]
     newest_ns = 0
@@ -48,7 +52,11 @@ def tables_of(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tupl
             newest_ns = max(newest_ns, sample[1])
             apart = []
         else:
-            apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
+            apart = (
+                [*apart, sample]
+                if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS
+                else [sample]
+            )
             if len(apart) < AGREEING:
                 continue
             if parts[-1] and apart[0][1] < newest_ns:
@@ -77,14 +85,20 @@ def _columns(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> Insta
     columns: dict[tuple[str, int], dict[str, list[float]]] = {}
     for place, stamp_ns, message in samples:
         if place not in columns:
-            columns[place] = {field: [] for field in sorted(wanted[place[0]]) if is_number(getattr(message, field, None))}
+            columns[place] = {
+                field: []
+                for field in sorted(wanted[place[0]])
+                if is_number(getattr(message, field, None))
+            }
         stamps.setdefault(place, []).append(stamp_ns)
         for field, values in columns[place].items():
             values.append(float(getattr(message, field)))
     tables: Instances = {}
     for (name, number), lists in columns.items():
         fields = {field: np.array(values) for field, values in lists.items()}
-        tables.setdefault(name, {})[number] = table_of(np.array(stamps[name, number], dtype=np.int64), fields)
+        tables.setdefault(name, {})[number] = table_of(
+            np.array(stamps[name, number], dtype=np.int64), fields
+        )
     return tables
 
 
@@ -95,10 +109,16 @@ def is_number(value: object) -> bool:
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which stamps are near the median of the five around them: a damaged stamp is not."""
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5) if len(stamp_ns) > 2 else None
+    around = (
+        np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
+        if len(stamp_ns) > 2
+        else None
+    )
     if around is None:
         return np.ones(len(stamp_ns), dtype=bool)
-    return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(np.abs(np.diff(stamp_ns)))
+    return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(
+        np.abs(np.diff(stamp_ns))
+    )
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:

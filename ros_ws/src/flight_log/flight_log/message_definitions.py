@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions for MCAP and rosbag2: of the installed packages, else of rosbags. Needs no ROS at run time."""
+"""Message definitions for MCAP and rosbag2: of the installed packages, else of rosbags. Needs no
+ROS at run time.
+"""
 
 import json
 import os
@@ -22,11 +24,13 @@ class Definition(NamedTuple):
 
 @cache
 def definition(name: str) -> Definition:
-    """Definition of "pkg/msg/Type". Raises ParameterError when neither an installed package nor rosbags has the type.
+    """Definition of "pkg/msg/Type". Raises ParameterError when neither an installed package nor
+    rosbags has the type.
 
-    The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type" and its definition (MCAP
-    registry, schema encoding ros2msg). The hash is that of REP 2016, read from the JSON of the package.
-    rosbags knows the common types of ROS 2 Jazzy: the same fields and the same hash, without comments.
+    The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type"
+    and its definition (MCAP registry, schema encoding ros2msg). The hash is that of REP 2016, read
+    from the JSON of the package. rosbags knows the common types of ROS 2 Jazzy: the same fields and
+    the same hash, without comments.
     """
     try:
         description = json.loads(read_definition(name, "json"))
@@ -36,22 +40,33 @@ def definition(name: str) -> Definition:
         store = typestore()
         if name not in store.fielddefs:
             raise
-        return Definition(name, store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
+        return Definition(
+            name, store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)
+        )
     parts = [read_definition(name, "msg")]
     for referenced in description["type_description_msg"]["referenced_type_descriptions"]:
         package, _, kind = referenced["type_name"].partition("/msg/")
-        parts.append(f"{'=' * 80}\nMSG: {package}/{kind}\n{read_definition(referenced['type_name'], 'msg')}")
+        parts.append(
+            f"{'=' * 80}\nMSG: {package}/{kind}\n{read_definition(referenced['type_name'], 'msg')}"
+        )
     hashes = {entry["type_name"]: entry["hash_string"] for entry in description["type_hashes"]}
     return Definition(name, "\n".join(parts), hashes[name])
 
 
 def read_definition(name: str, suffix: str) -> str:
-    """The file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix. Raises ParameterError where no installed package has it."""
+    """The file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix. Raises ParameterError where no
+    installed package has it.
+    """
     package, section, kind = name.split("/")
     # The wheels install into the prefix of the interpreter and do not set AMENT_PREFIX_PATH.
-    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    prefixes = [
+        *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
+        sys.prefix,
+    ]
     for prefix in prefixes:
         path = Path(prefix) / "share" / package / section / f"{kind}.{suffix}"
         if path.is_file():
             return path.read_text(encoding="utf-8")
-    raise ParameterError(f"{name}: no {kind}.{suffix} in {', '.join(prefixes)}; install the package {package}")
+    raise ParameterError(
+        f"{name}: no {kind}.{suffix} in {', '.join(prefixes)}; install the package {package}"
+    )

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decodes the messages of a topic as named vectors. Needs no ROS.
 
-The messages of a topic usually have the same sender and channels, and differ in stamp and values only. The decoder learns
-the byte layout from a message and decodes the messages of equal layout together.
+The messages of a topic usually have the same sender and channels, and differ in stamp and values
+only. The decoder learns the byte layout from a message and decodes the messages of equal layout
+together.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -23,7 +24,8 @@ from flight_core.vectors import FloatArray
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_STATE_TYPES = {
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
+    JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] "
+    "velocity\nfloat64[] effort",
 }
 """A JointState and its header, as ROS 2 defines them."""
 
@@ -46,7 +48,9 @@ class Samples(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The content of some messages. A vector without channels stands for a missing sample and is left out."""
+    """The content of some messages. A vector without channels stands for a missing sample and is
+    left out.
+    """
 
     samples: list[Samples]
     unreadable: int
@@ -90,12 +94,16 @@ def tables(messages: Iterable[bytes]) -> Iterator[Table]:
     """Messages in their order, successive messages of equal length in a table."""
     for size, group in groupby(messages, len):
         messages_of_size = list(group)
-        yield np.frombuffer(b"".join(messages_of_size), dtype=np.uint8).reshape(len(messages_of_size), size)
+        yield np.frombuffer(b"".join(messages_of_size), dtype=np.uint8).reshape(
+            len(messages_of_size), size
+        )
 
 
 def stamp_of(data: bytes) -> int:
     """The stamp at the begin of a message, ns."""
-    return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
+    return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(
+        data[STAMP][4:], "little"
+    )
 
 
 def stamps_of(table: Table) -> NDArray[np.int64]:
@@ -105,14 +113,18 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t. None when t is not a flight time."""
+    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t. None when t is not a
+    flight time.
+    """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
 def encoded(samples: Samples) -> NDArray[np.uint8]:
-    """The samples as serialised sensor_msgs/JointState, a row a message, with empty velocity and effort.
+    """The samples as serialised sensor_msgs/JointState, a row a message, with empty velocity and
+    effort.
 
-    The first message is serialised by its definition. The further messages differ in stamp and values only.
+    The first message is serialised by its definition. The further messages differ in stamp and
+    values only.
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
@@ -120,12 +132,16 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
     time = types["builtin_interfaces/msg/Time"]
     empty = np.zeros(0)
     marks = _marks(len(samples.names))
-    message = types[JOINT_STATE](header(time(sec=0, nanosec=0), samples.sender), list(samples.names), marks, empty, empty)
+    message = types[JOINT_STATE](
+        header(time(sec=0, nanosec=0), samples.sender), list(samples.names), marks, empty, empty
+    )
     template = bytes(store.serialize_cdr(message, JOINT_STATE))
     rows = np.tile(np.frombuffer(template, dtype=np.uint8), (len(samples.stamp_ns), 1))
     seconds, nanoseconds = np.divmod(samples.stamp_ns, NANOSECONDS)
     rows[:, STAMP] = np.stack([seconds, nanoseconds], axis=1).astype("<u4").view(np.uint8)
-    rows[:, _position(template, marks)] = np.ascontiguousarray(samples.values, dtype="<f8").view(np.uint8)
+    rows[:, _position(template, marks)] = np.ascontiguousarray(samples.values, dtype="<f8").view(
+        np.uint8
+    )
     return rows
 
 
@@ -141,7 +157,9 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
 
 
 def decode_routes(table: Table) -> Decoded:
-    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT a waypoint."""
+    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels
+    WAYPOINT a waypoint.
+    """
     samples = []
     unreadable = 0
     for message in map(bytes, table):
@@ -165,7 +183,9 @@ class _JointStateDecoder:
         self._names: tuple[str, ...] = ()
         self._sender = ""
         self._template = np.zeros(0, dtype="<u4")  # the message that the layout was learnt from
-        self._constant = np.zeros(0, dtype="<u4")  # 255 for the bytes that are equal in all messages of the layout, else 0
+        self._constant = np.zeros(
+            0, dtype="<u4"
+        )  # 255 for the bytes that are equal in all messages of the layout, else 0
         self._values = slice(0, 0)
 
     def __call__(self, table: Table) -> Decoded:
@@ -189,7 +209,9 @@ class _JointStateDecoder:
                 continue
             stamp = vector.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
-            samples.append(Samples(tuple(vector.name), stamps, vector.position[None], vector.header.frame_id))
+            samples.append(
+                Samples(tuple(vector.name), stamps, vector.position[None], vector.header.frame_id)
+            )
         if unknown:
             self._learn(unknown[-1])
         return Decoded(samples, unreadable)
@@ -203,7 +225,9 @@ class _JointStateDecoder:
         return np.asarray(different.max(axis=1) == 0)
 
     def _learn(self, message: bytes) -> None:
-        """Learn the layout: serialise marked values with the same strings, and find the position of the marks."""
+        """Learn the layout: serialise marked values with the same strings, and find the position of
+        the marks.
+        """
         try:
             vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
         except SerdeError:
@@ -220,7 +244,8 @@ class _JointStateDecoder:
         marks = _marks(k)
         marked = bytes(
             self._store.serialize_cdr(
-                type(vector)(vector.header, vector.name, marks, vector.velocity, vector.effort), JOINT_STATE
+                type(vector)(vector.header, vector.name, marks, vector.velocity, vector.effort),
+                JOINT_STATE,
             )
         )
         values = _position(marked, marks)
@@ -229,7 +254,9 @@ class _JointStateDecoder:
         self._names = tuple(vector.name)
         self._values = values
         self._sender = vector.header.frame_id
-        self._template = np.frombuffer(message, dtype="<u4")  # a message without velocity and effort ends with their lengths
+        self._template = np.frombuffer(
+            message, dtype="<u4"
+        )  # a message without velocity and effort ends with their lengths
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = 0
         self._constant = constant.view("<u4")

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Opens the files of a log for every reader: MCAP and SQLite, packed files, compressed messages, several files of a bag.
+"""Opens the files of a log for every reader: MCAP and SQLite, packed files, compressed messages,
+several files of a bag.
 
 A path that is no log is refused in one sentence with what is there.
 """
@@ -23,13 +24,30 @@ from mcap.records import Channel, McapRecord, Message, Schema
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
-from flight_log.file_kinds import BEGUN, EMPTY, LOGS, LZ4, MCAP, PACKED, SQLITE, ZSTD_MAGIC, file_kind
-from flight_log.rosbag2_metadata import METADATA, PACKED_SUFFIXES, bag_files, part_number, plain_name
+from flight_log.file_kinds import (
+    BEGUN,
+    EMPTY,
+    LOGS,
+    LZ4,
+    MCAP,
+    PACKED,
+    SQLITE,
+    ZSTD_MAGIC,
+    file_kind,
+)
+from flight_log.rosbag2_metadata import (
+    METADATA,
+    PACKED_SUFFIXES,
+    bag_files,
+    part_number,
+    plain_name,
+)
 from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
 
 A_RUN = "the folder of a run or an MCAP file"
 ROSBAG2 = "rosbag2"
-"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
+"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside
+it has the attachments."""
 
 BATCH = 4096  # messages of SQLite that are grouped by channel
 NAMED = 5  # files, folders or topics that a sentence names
@@ -44,7 +62,9 @@ def log_files(run: Path) -> list[Path]:
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
-    if not any(kind in (*LOGS, *PACKED) for kind in kinds) and not (is_folder(run) and {EMPTY, BEGUN} & {*kinds}):
+    if not any(kind in (*LOGS, *PACKED) for kind in kinds) and not (
+        is_folder(run) and {EMPTY, BEGUN} & {*kinds}
+    ):
         raise ParameterError(f"{run}: found {_what_is_there(run, files, kinds)}, expected {A_RUN}")
     return files
 
@@ -52,13 +72,29 @@ def log_files(run: Path) -> list[Path]:
 def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
     """What a path without a log holds, for a sentence."""
     if files:
-        return kinds[0] if is_file(run) else _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
+        return (
+            kinds[0]
+            if is_file(run)
+            else _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
+        )
     if not is_folder(run):
         return "no such file or folder"
     content = sorted(run.iterdir())
-    runs = [folder.name for folder in content if is_folder(folder) and folder.name != ROSBAG2 and _is_bag(folder)]
-    others = [f"{path.name}, {file_kind(path)}" for path in content if is_file(path) and path.name != METADATA]
-    content_text = f"the folders of runs {_some(runs)}" if runs else _some(others or [path.name for path in content])
+    runs = [
+        folder.name
+        for folder in content
+        if is_folder(folder) and folder.name != ROSBAG2 and _is_bag(folder)
+    ]
+    others = [
+        f"{path.name}, {file_kind(path)}"
+        for path in content
+        if is_file(path) and path.name != METADATA
+    ]
+    content_text = (
+        f"the folders of runs {_some(runs)}"
+        if runs
+        else _some(others or [path.name for path in content])
+    )
     return f"no .mcap file, but {content_text}" if content_text else "no .mcap file"
 
 
@@ -78,7 +114,8 @@ def _some(names: Sequence[str]) -> str:
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
     """Names of the files of a bag that metadata.yaml names and the folder lacks.
 
-    Without metadata.yaml: those of the numbers from 0, where rosbag2 begins, to the last. Renamed files are compared by number.
+    Without metadata.yaml: those of the numbers from 0, where rosbag2 begins, to the last. Renamed
+    files are compared by number.
     """
     paths = information.get("relative_file_paths")
     named = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
@@ -97,7 +134,8 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
 
 @contextmanager
 def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
-    """The reader of a file of a log, by the first bytes; a packed file is unpacked into a temporary folder.
+    """The reader of a file of a log, by the first bytes; a packed file is unpacked into a temporary
+    folder.
 
     Raises ParameterError for a file that cannot be read.
     """
@@ -109,12 +147,18 @@ def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
         plain = Path(folder) / plain_name(file.name)
         is_complete = _unpack(file, plain, kind)
         scan = SqliteScan(plain, file) if file_kind(plain) == SQLITE else Scan(plain)
-        require(is_complete or isinstance(scan, Scan), str(file), "a packed file that is truncated", "a whole file")
+        require(
+            is_complete or isinstance(scan, Scan),
+            str(file),
+            "a packed file that is truncated",
+            "a whole file",
+        )
         yield scan
 
 
 def _unpack(file: Path, plain: Path, kind: str) -> bool:
-    """Write the content of a packed file; of a truncated file the beginning. Returns whether the file is whole.
+    """Write the content of a packed file; of a truncated file the beginning. Returns whether the
+    file is whole.
 
     Raises ParameterError.
     """
@@ -126,19 +170,28 @@ def _unpack(file: Path, plain: Path, kind: str) -> bool:
             while block := source.read1(COPY_BYTES):  # what a truncated file holds before its end
                 size += len(block)
                 unpack = UNPACK.get(file.suffix, "unpack")
-                require(size <= limit, str(file), f"more than {limit} bytes unpacked", f"them on a larger disk: {unpack}")
+                require(
+                    size <= limit,
+                    str(file),
+                    f"more than {limit} bytes unpacked",
+                    f"them on a larger disk: {unpack}",
+                )
                 target.write(block)
     except (EOFError, RuntimeError, zstandard.ZstdError):
         return False
     except OSError as error:
-        raise ParameterError(f"{file}: cannot be unpacked ({error.strerror or error}), expected {A_RUN}") from None
+        raise ParameterError(
+            f"{file}: cannot be unpacked ({error.strerror or error}), expected {A_RUN}"
+        ) from None
     return True
 
 
 def log_topics(run: Path) -> dict[str, str]:
-    """The types of the topics of a log by full name; with "in ENCODING" of messages that are no CDR.
+    """The types of the topics of a log by full name; with "in ENCODING" of messages that are no
+    CDR.
 
-    By the index of a file alone where the file has an index. Raises ParameterError for a path without a log.
+    By the index of a file alone where the file has an index. Raises ParameterError for a path
+    without a log.
     """
     topics: dict[str, str] = {}
     for file in log_files(run):
@@ -150,14 +203,17 @@ def log_topics(run: Path) -> dict[str, str]:
                 elif isinstance(record, Channel):
                     name = schemas.get(record.schema_id, "")
                     encoding = record.message_encoding
-                    topics.setdefault(record.topic, name if encoding == "cdr" else f"{name} in {encoding}")
+                    topics.setdefault(
+                        record.topic, name if encoding == "cdr" else f"{name} in {encoding}"
+                    )
                 elif topics and scan.message_counts:  # the index names all channels
                     break
     return topics
 
 
 def plain_message(data: bytes) -> bytes:
-    """A message that `ros2 bag record` may have compressed: the beginning of a compressed message is that of no CDR.
+    """A message that `ros2 bag record` may have compressed: the beginning of a compressed message
+    is that of no CDR.
 
     A damaged message stays as it is: no decoder takes it.
     """
@@ -188,7 +244,9 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
 
 
 class SqliteScan:
-    """A file of rosbag2's storage sqlite3, with the interface of `Scan`. The storage has no time of sending: it is 0."""
+    """A file of rosbag2's storage sqlite3, with the interface of `Scan`. The storage has no time of
+    sending: it is 0.
+    """
 
     def __init__(self, path: Path, shown: Path | None = None) -> None:
         self.path = path
@@ -199,7 +257,9 @@ class SqliteScan:
         self._shown = shown or path  # the packed file
 
     def records(self) -> Iterator[McapRecord]:
-        """The schemas, channels and messages. Raises ParameterError for a database that is no bag."""
+        """The schemas, channels and messages. Raises ParameterError for a database that is no
+        bag.
+        """
         for row in self._rows():
             if isinstance(row, tuple):
                 channel, log_ns, data = row
@@ -220,9 +280,9 @@ class SqliteScan:
             for channel, messages in by_channel.items():
                 for size, group in groupby(messages, lambda message: len(message[1])):
                     group_rows = list(group)
-                    table = np.frombuffer(b"".join(data for _, data in group_rows), dtype=np.uint8).reshape(
-                        len(group_rows), size
-                    )
+                    table = np.frombuffer(
+                        b"".join(data for _, data in group_rows), dtype=np.uint8
+                    ).reshape(len(group_rows), size)
                     log_ns = np.array([time_ns for time_ns, _ in group_rows], dtype=np.int64)
                     unknown = np.zeros(len(group_rows), dtype=np.int64)
                     yield MessageBatch(channel, table, log_ns, unknown, unknown)
@@ -241,13 +301,20 @@ class SqliteScan:
             self.known_end_ns = max(reader.metadata.end_time - 1, 0)
         except Exception as error:  # of SQLite or of rosbags: the content may be damaged anywhere
             reason = str(error) or type(error).__name__
-            raise ParameterError(f"{self._shown}: cannot be read ({reason}), expected a bag of rosbag2") from None
+            raise ParameterError(
+                f"{self._shown}: cannot be read ({reason}), expected a bag of rosbag2"
+            ) from None
         try:
             for connection in connections:
                 definition = connection.msgdef
                 ext = connection.ext
                 encoding = encodings.get(definition.format, "ros2msg")
-                yield Schema(id=connection.id, data=definition.data.encode(), encoding=encoding, name=connection.msgtype)
+                yield Schema(
+                    id=connection.id,
+                    data=definition.data.encode(),
+                    encoding=encoding,
+                    name=connection.msgtype,
+                )
                 serialised = str(getattr(ext, "serialization_format", "cdr"))
                 yield Channel(connection.id, connection.topic, serialised, {}, connection.id)
             for connection, log_ns, data in reader.messages(connections):

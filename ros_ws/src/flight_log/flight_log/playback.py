@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_bringup.player` sends."""
+"""Playback schedule of a log: the messages and the times to send. Needs no ROS;
+`flight_bringup.player` sends.
+"""
 
 import re
 from collections import deque
@@ -24,7 +26,9 @@ SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain may publish. They are played only by name."""
 
 MAX_LATCHED = 100  # messages of a topic; a lockstep flight keeps 20,000, which is no latch
-MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS  # a stamp further than a day from the host's clock is flight time, as in lockstep
+MAX_CLOCK_OFFSET_NS = (
+    86_400 * NANOSECONDS
+)  # a stamp further than a day from the host's clock is flight time, as in lockstep
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
 STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")
 IDL_STRUCT = re.compile(r"\bstruct\s+\w+\s*\{")  # the first is the type itself
@@ -52,34 +56,55 @@ class Playback(NamedTuple):
         return seconds(due_ns - self.start_ns)
 
 
-def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None) -> Playback:
-    """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for every topic except SHARED.
+def read_playback(
+    run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None
+) -> Playback:
+    """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for
+    every topic except SHARED.
 
-    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON, are skipped.
+    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON,
+    are skipped.
 
-    A message is due at the time of sending. In a log of a lockstep flight the host's clock has no meaning: there a message is
-    due at the stamp, but not before the messages sent earlier. Raises ParameterError when the log cannot be read, lacks a
-    topic or the namespace, or ends before the start.
+    A message is due at the time of sending. In a log of a lockstep flight the host's clock has no
+    meaning: there a message is due at the stamp, but not before the messages sent earlier. Raises
+    ParameterError when the log cannot be read, lacks a topic or the namespace, or ends before the
+    start.
     """
-    stored = sorted((message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns)
+    stored = sorted(
+        (message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns
+    )
     skipped = {message.topic: _unsendable(message) for message in stored if _unsendable(message)}
     stored = [message for message in stored if message.topic not in skipped]
     if namespace is not None:
         all_topics = {message.topic for message in stored}
-        inside = names_within(chosen_namespace(all_topics, namespace, str(run)), all_topics).keys() | {*SHARED}
+        inside = names_within(
+            chosen_namespace(all_topics, namespace, str(run)), all_topics
+        ).keys() | {*SHARED}
         stored = [message for message in stored if message.topic in inside]
     known = {message.topic: message for message in stored}
     wanted = set[str]() if topics else set(known) - set(SHARED)
     for name in topics:
         wanted.update(_matching(name, known, str(run)))
-    require(bool(wanted), str(run), f"no message{f' to play among {listed(skipped)}' if skipped else ''}", A_FLIGHT)
-    begins_stamped = {topic: begins_with_stamp(_definition(message)) for topic, message in known.items()}
-    votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE and stamp_of(message.data)]
+    require(
+        bool(wanted),
+        str(run),
+        f"no message{f' to play among {listed(skipped)}' if skipped else ''}",
+        A_FLIGHT,
+    )
+    begins_stamped = {
+        topic: begins_with_stamp(_definition(message)) for topic, message in known.items()
+    }
+    votes = [
+        _is_flight_time(message)
+        for message in stored
+        if message.type_name == JOINT_STATE and stamp_of(message.data)
+    ]
     lockstep = 2 * sum(votes) > len(votes)
     messages = []
     now_ns = 0
     for message in stored:
-        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is sent unchanged.
+        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is
+        # sent unchanged.
         stamped = begins_stamped[message.topic] and _is_flight_time(message) is lockstep
         if not lockstep:
             now_ns = _sent_ns(message)
@@ -87,23 +112,40 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
             now_ns = max(now_ns, stamp_of(message.data))
         if message.topic in wanted:
             messages.append(ScheduledMessage(now_ns, message.topic, message.data, stamped))
-    start_ns = _start_ns((message for message in stored if _is_flight_time(message) is lockstep), messages[0].due_ns)
+    start_ns = _start_ns(
+        (message for message in stored if _is_flight_time(message) is lockstep), messages[0].due_ns
+    )
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
-    require(begin_ns <= messages[-1].due_ns, "start", f"{start:g} s", f"a flight time before the end of the log, {end:g} s")
+    require(
+        begin_ns <= messages[-1].due_ns,
+        "start",
+        f"{start:g} s",
+        f"a flight time before the end of the log, {end:g} s",
+    )
     played = (
         messages
         if start <= 0.0
-        else [*_latched(messages, known, begin_ns), *(later for later in messages if later.due_ns >= begin_ns)]
+        else [
+            *_latched(messages, known, begin_ns),
+            *(later for later in messages if later.due_ns >= begin_ns),
+        ]
     )
-    return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, played, start_ns, skipped)
+    return Playback(
+        {topic: known[topic].type_name for topic in sorted(wanted)}, played, start_ns, skipped
+    )
 
 
 def _latched(
     messages: Sequence[ScheduledMessage], known: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
-    """The last messages of latched topics before the begin, as of /robot_description, for late subscribers."""
-    kept = {topic: deque[ScheduledMessage](maxlen=latched_depth(message.qos)) for topic, message in known.items()}
+    """The last messages of latched topics before the begin, as of /robot_description, for late
+    subscribers.
+    """
+    kept = {
+        topic: deque[ScheduledMessage](maxlen=latched_depth(message.qos))
+        for topic, message in known.items()
+    }
     for message in messages:
         if message.due_ns < begin_ns:
             kept[message.topic].append(message._replace(due_ns=begin_ns))
@@ -111,10 +153,16 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """The number of messages for a late subscriber, by the offered profiles of rosbag2 as YAML; 0 of a volatile topic."""
+    """The number of messages for a late subscriber, by the offered profiles of rosbag2 as YAML; 0
+    of a volatile topic.
+    """
     try:
         profiles = yaml.safe_load(qos)
-        depths = [int(each["depth"]) for each in profiles or () if each["durability"] in {1, "transient_local"}]
+        depths = [
+            int(each["depth"])
+            for each in profiles or ()
+            if each["durability"] in {1, "transient_local"}
+        ]
     except (yaml.YAMLError, KeyError, TypeError, ValueError):
         return 0
     depth = max(depths, default=0)
@@ -137,7 +185,9 @@ def _definition(message: StoredMessage) -> str:
 
 
 def begins_with_stamp(text: str) -> bool:
-    """Whether the first field of a message type is a header or a time, by the definition as text, ros2msg or ros2idl."""
+    """Whether the first field of a message type is a header or a time, by the definition as text,
+    ros2msg or ros2idl.
+    """
     if struct := IDL_STRUCT.search(text):
         text = text[struct.end() :]
     first = next((line for line in text.splitlines() if not NO_FIELD.match(line)), "")
@@ -159,7 +209,9 @@ def _is_flight_time(stored: StoredMessage) -> bool:
 
 
 def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
-    """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without both."""
+    """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without
+    both.
+    """
     first: dict[str, StoredMessage] = {}
     for message in stored:
         first.setdefault(message.topic.rpartition("/")[2], message)
@@ -170,6 +222,10 @@ def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
     if truth is None or decode is None:
         return otherwise
     for names, stamp_ns, values, _ in decode(next(tables([truth.data]))).samples:
-        if "t" in names and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))) is not None:
+        if (
+            "t" in names
+            and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")])))
+            is not None
+        ):
             return start_ns
     return otherwise

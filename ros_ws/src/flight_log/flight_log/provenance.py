@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a flight for the metadata of a log: versions, revision, host, command, as named sets of strings."""
+"""Provenance of a flight for the metadata of a log: versions, revision, host, command, as named
+sets of strings.
+"""
 
 import os
 import platform
@@ -38,7 +40,8 @@ STACK = (
     "rise_di",
     "rise_di_controller",
 )
-# The dependencies that the numbers and the bytes of a flight depend on; the middleware by the names of its wheels.
+# The dependencies that the numbers and the bytes of a flight depend on; the middleware by the names
+# of its wheels.
 DEPENDENCIES = (
     "jsbsim",
     "mcap",
@@ -58,7 +61,10 @@ GIT_TIMEOUT = 5.0  # s
 def provenance() -> dict[str, dict[str, str]]:
     """The provenance of this process now. What cannot be determined is left out."""
     return {
-        "rise_di_flight": {"start": datetime.now(UTC).isoformat(timespec="seconds"), "command": shlex.join(sys.argv)},
+        "rise_di_flight": {
+            "start": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": shlex.join(sys.argv),
+        },
         VERSIONS: versions(),
         "rise_di_revision": revision(Path(__file__).resolve()),
         "rise_di_host": host(),
@@ -71,7 +77,9 @@ def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the arithmetic of u, the installed packages of the stack and the installed main dependencies."""
+    """Versions of Python, the arithmetic of u, the installed packages of the stack and the
+    installed main dependencies.
+    """
     installed = {"python": platform.python_version(), "arithmetic": ARITHMETIC}
     for name in (*STACK, *DEPENDENCIES):
         try:
@@ -84,17 +92,23 @@ def versions() -> dict[str, str]:
 
 
 def revision(source: Path) -> dict[str, str]:
-    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed. Empty without a commit."""
+    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed. Empty
+    without a commit.
+    """
     git = shutil.which("git")
     if git is None:
         return {}
 
     def output(*arguments: str) -> str:
         command = [git, "--no-optional-locks", "-C", str(source.parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True).stdout.strip()  # noqa: S603
+        return subprocess.run(  # noqa: S603
+            command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True
+        ).stdout.strip()
 
     try:
-        output("ls-files", "--error-unmatch", source.name)  # an installed copy may be inside another project's checkout
+        output(
+            "ls-files", "--error-unmatch", source.name
+        )  # an installed copy may be inside another project's checkout
         commit = output("rev-parse", "HEAD")
         changed = output("status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
@@ -119,4 +133,7 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        platform.processor(),
+    )

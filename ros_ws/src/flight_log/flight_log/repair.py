@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a truncated or damaged bag, as a killed recorder leaves behind: every rosbag2 reader accepts the result.
+"""Repairs a truncated or damaged bag, as a killed recorder leaves behind: every rosbag2 reader
+accepts the result.
 
 Needs no ROS.
 """
@@ -48,16 +49,21 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
-    missing: tuple[str, ...] = ()  # names of the files that metadata.yaml names and the folder lacks
+    missing: tuple[
+        str, ...
+    ] = ()  # names of the files that metadata.yaml names and the folder lacks
 
 
 def repair(run: Path) -> Repair:
-    """Rebuild the damaged files in the folder of a bag: truncated files, files with damaged parts, and metadata.yaml.
+    """Rebuild the damaged files in the folder of a bag: truncated files, files with damaged parts,
+    and metadata.yaml.
 
-    A rebuilt file holds every readable record and has an index. The rebuilt file replaces the damaged file atomically; the
-    damaged file stays as *.damaged. An intact bag does not change. metadata.yaml keeps the names of missing files. The file
-    of a bag is repaired alone, without metadata.yaml. Raises ParameterError without a bag, while a recorder writes the bag, for
-    a bag without a readable message, for a metadata.yaml of another program, and for a folder that cannot be written.
+    A rebuilt file holds every readable record and has an index. The rebuilt file replaces the
+    damaged file atomically; the damaged file stays as *.damaged. An intact bag does not change.
+    metadata.yaml keeps the names of missing files. The file of a bag is repaired alone, without
+    metadata.yaml. Raises ParameterError without a bag, while a recorder writes the bag, for a bag
+    without a readable message, for a metadata.yaml of another program, and for a folder that cannot
+    be written.
     """
     files = bag_files(run) or log_files(run)  # the latter says what is there
     for file in files:
@@ -72,20 +78,30 @@ def repair(run: Path) -> Repair:
     try:
         scans = [_FileScan(file) for file in files]
         repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
-        lists_all_files = isinstance(named, list) and {file.name for file in files} == {*map(str, named)} - {*missing}
+        lists_all_files = isinstance(named, list) and {file.name for file in files} == {
+            *map(str, named)
+        } - {*missing}
         write = not is_file(run) and (not lists_all_files or any(file.damaged for file in repaired))
         if write:
             if not previous and is_file(run / METADATA):
                 _keep_damaged(run / METADATA)
-            write_file(run / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous, missing))
+            write_file(
+                run / METADATA,
+                bag_metadata_yaml([scan.contents() for scan in scans], previous, missing),
+            )
     except OSError as error:
-        raise ParameterError(f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written") from None
+        raise ParameterError(
+            f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written"
+        ) from None
     *others, last = repaired
-    return Repair((*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write, tuple(missing))
+    return Repair(
+        (*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write, tuple(missing)
+    )
 
 
 def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
-    """The content of metadata.yaml and the log time of the last message; empty and 0 for a missing or damaged file.
+    """The content of metadata.yaml and the log time of the last message; empty and 0 for a missing
+    or damaged file.
 
     Raises ParameterError for a file of another program, which must not be replaced.
     """
@@ -99,7 +115,12 @@ def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
     except ParameterError:
         return {}, 0
     foreign = bool(tree) and not (isinstance(tree, Mapping) and INFORMATION in tree)
-    require(not foreign, str(path), "a file of another program", "that of rosbag2, or none: move it elsewhere")
+    require(
+        not foreign,
+        str(path),
+        "a file of another program",
+        "that of rosbag2, or none: move it elsewhere",
+    )
     return {}, 0
 
 
@@ -108,7 +129,9 @@ class _FileScan:
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
-            require(try_lock(stream), str(path), "a recorder that is writing it", "one that has ended")
+            require(
+                try_lock(stream), str(path), "a recorder that is writing it", "one that has ended"
+            )
         self.path = path
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -119,7 +142,11 @@ class _FileScan:
         for record in scan.records():
             if isinstance(record, Message):
                 self.messages[record.channel_id] += 1
-                self.first_ns = record.log_time if self.first_ns is None else min(self.first_ns, record.log_time)
+                self.first_ns = (
+                    record.log_time
+                    if self.first_ns is None
+                    else min(self.first_ns, record.log_time)
+                )
                 self.last_ns = max(self.last_ns, record.log_time)
             elif isinstance(record, Channel):
                 self.channels[record.id] = record
@@ -132,26 +159,48 @@ class _FileScan:
         counts = []
         for identity, channel in self.channels.items():
             schema = self.schemas.get(channel.schema_id)
-            type_hash, qos = (channel.metadata.get(key, "") for key in ("topic_type_hash", "offered_qos_profiles"))
-            counts.append(TopicCount(channel.topic, schema.name if schema else "", type_hash, qos, self.messages[identity]))
+            type_hash, qos = (
+                channel.metadata.get(key, "") for key in ("topic_type_hash", "offered_qos_profiles")
+            )
+            counts.append(
+                TopicCount(
+                    channel.topic,
+                    schema.name if schema else "",
+                    type_hash,
+                    qos,
+                    self.messages[identity],
+                )
+            )
         return FileContents(self.path.name, self.first_ns or 0, self.last_ns, tuple(counts))
 
     def unchanged(self) -> FileRepair:
-        return FileRepair(self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None)
+        return FileRepair(
+            self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None
+        )
 
     def rebuild(self) -> FileRepair:
         """Write a file with the readable records, then replace the damaged file."""
-        known = {identity: count for identity, count in self.messages.items() if identity in self.channels}
+        known = {
+            identity: count
+            for identity, count in self.messages.items()
+            if identity in self.channels
+        }
         require(bool(known), str(self.path), "no message that could be read", "any")
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
-            os.fsync(stream.fileno())  # a full disk shows here at the latest: the damaged file gets no second name then
+            os.fsync(
+                stream.fileno()
+            )  # a full disk shows here at the latest: the damaged file gets no second name then
             damaged = _keep_damaged(self.path)
-        return FileRepair(self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged)
+        return FileRepair(
+            self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged
+        )
 
     def _copy(self, writer: Writer) -> None:
-        """Copy the records. Schemas and channels come first, because the index also holds the channels of a damaged chunk."""
+        """Copy the records. Schemas and channels come first, because the index also holds the
+        channels of a damaged chunk.
+        """
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {
             identity: writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -159,7 +208,10 @@ class _FileScan:
         }
         channels = {
             identity: writer.register_channel(
-                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
+                channel.topic,
+                channel.message_encoding,
+                schemas.get(channel.schema_id, 0),
+                channel.metadata,
             )
             for identity, channel in self.channels.items()
         }
@@ -167,20 +219,30 @@ class _FileScan:
             if isinstance(record, Message):
                 if record.channel_id in channels:
                     channel = channels[record.channel_id]
-                    writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+                    writer.add_message(
+                        channel, record.log_time, record.data, record.publish_time, record.sequence
+                    )
             elif isinstance(record, Attachment):
-                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+                writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
             elif isinstance(record, Metadata) and record.name != "rosbag2":
                 writer.add_metadata(record.name, record.metadata)
-        writer.add_metadata("rosbag2", {"serialized_metadata": bag_metadata_yaml([self.contents()])})
+        writer.add_metadata(
+            "rosbag2", {"serialized_metadata": bag_metadata_yaml([self.contents()])}
+        )
         writer.finish()
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name for the time after the replacement; a copy on a file system without hard links."""
+    """Give the damaged file a second name for the time after the replacement; a copy on a file
+    system without hard links.
+    """
     number = 1
     # A link to nothing also has the name.
-    while os.path.lexists(damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")):
+    while os.path.lexists(
+        damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")
+    ):
         number += 1
     try:
         damaged.hardlink_to(path)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag, version 9 of rosbag2: reading, writing as text, finding the MCAP files of a bag. Needs no ROS."""
+"""metadata.yaml of a bag, version 9 of rosbag2: reading, writing as text, finding the MCAP files of
+a bag. Needs no ROS.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -58,10 +60,11 @@ def part_number(name: str) -> int | None:
 
 
 def bag_files(run: Path) -> list[Path]:
-    """The files of a bag in the order of their numbers; the file itself when a file is given; empty without a file.
+    """The files of a bag in the order of their numbers; the file itself when a file is given; empty
+    without a file.
 
-    A file that is unpacked beside the packed file comes in place of the latter. Raises ParameterError when the files in the
-    folder are not parts of a single bag.
+    A file that is unpacked beside the packed file comes in place of the latter. Raises
+    ParameterError when the files in the folder are not parts of a single bag.
     """
     if is_file(run):
         return [run]
@@ -69,7 +72,9 @@ def bag_files(run: Path) -> list[Path]:
     try:
         content = sorted(run.iterdir()) if is_folder(run) else []
     except OSError as error:
-        raise ParameterError(f"{run}: cannot be read ({error.strerror}), expected the folder of a run") from None
+        raise ParameterError(
+            f"{run}: cannot be read ({error.strerror}), expected the folder of a run"
+        ) from None
     for file in content:  # a plain file sorts before the packed file
         name = plain_name(file.name)
         if name.endswith(SUFFIXES) and is_file(file):
@@ -99,15 +104,20 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
         duration = information["duration"]["nanoseconds"]
         end_ns = int(start) + int(duration)
     except (KeyError, OverflowError, TypeError, ValueError):
-        raise ParameterError(f"{METADATA}: found something else, expected that of rosbag2") from None
+        raise ParameterError(
+            f"{METADATA}: found something else, expected that of rosbag2"
+        ) from None
     require(abs(end_ns) < 2**63, METADATA, "an end time beyond 64 bits", "that of rosbag2")
     return information, end_ns
 
 
 def bag_metadata_yaml(
-    files: Sequence[FileContents], previous: Mapping[str, Any] | None = None, missing: Sequence[str] = ()
+    files: Sequence[FileContents],
+    previous: Mapping[str, Any] | None = None,
+    missing: Sequence[str] = (),
 ) -> str:
-    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous` content.
+    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous`
+    content.
 
     `missing` files of the previous content stay in the lists of files.
     """
@@ -138,7 +148,10 @@ def bag_metadata_yaml(
         "compression_format": previous_content.get("compression_format", ""),
         "compression_mode": previous_content.get("compression_mode", ""),
         "relative_file_paths": sorted([*described, *missing], key=_order),
-        "files": sorted([*described.values(), *_entries(previous_content, missing)], key=lambda entry: _order(entry["path"])),
+        "files": sorted(
+            [*described.values(), *_entries(previous_content, missing)],
+            key=lambda entry: _order(entry["path"]),
+        ),
         "custom_data": previous_content.get("custom_data"),
         "ros_distro": previous_content.get("ros_distro", "jazzy"),
     }

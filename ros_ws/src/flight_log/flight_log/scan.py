@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the records of an intact, truncated or damaged MCAP file: up to the truncation, without the damaged parts."""
+"""Reads the records of an intact, truncated or damaged MCAP file: up to the truncation, without the
+damaged parts.
+"""
 
 import os
 import struct
@@ -37,13 +39,30 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-# What reading raises when bytes were changed: between records, inside a record, inside a compressed chunk.
-DECODE_ERRORS = (McapError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
+# What reading raises when bytes were changed: between records, inside a record, inside a compressed
+# chunk.
+DECODE_ERRORS = (
+    McapError,
+    MemoryError,
+    OverflowError,
+    UnicodeDecodeError,
+    struct.error,
+    zstandard.ZstdError,
+)
 
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, before each message
+MESSAGE = struct.Struct(
+    "<HIQQ"
+)  # channel, sequence, log time and publish time, before each message
 HEAD = np.dtype(  # of RECORD and MESSAGE
-    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("sequence", "<u4"), ("log_ns", "<i8"), ("publish_ns", "<i8")]
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_ns", "<i8"),
+        ("publish_ns", "<i8"),
+    ]
 )
 MESSAGE_INDEX = struct.Struct(
     "<HI"
@@ -51,9 +70,13 @@ MESSAGE_INDEX = struct.Struct(
 INDEX_ENTRY = np.dtype([("log_ns", "<i8"), ("place", "<i8")])
 NO_PLACES = np.zeros(0, dtype=np.int64)
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
-CHUNK = struct.Struct("<QQQII")  # these, size and checksum of the records, length of the compression's name before this name
+CHUNK = struct.Struct(
+    "<QQQII"
+)  # these, size and checksum of the records, length of the compression's name before this name
 LENGTH = struct.Struct("<Q")  # before the records of a chunk
-FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
+FOOTER = struct.Struct(
+    "<BQQQI"
+)  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
@@ -65,7 +88,8 @@ JOINED_BYTES = 1 << 20
 AHEAD = 2  # groups of chunks that are decoded before they are asked for
 
 MAX_CHUNK_BYTES = 64 << 20
-"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any size, and hold 20 MB.
+"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any
+size, and hold 20 MB.
 
 Recorders close a chunk at about 1 MB, or after the message that exceeds it.
 """
@@ -107,7 +131,9 @@ class MessageBatch(NamedTuple):
     data: NDArray[np.uint8]  # (N, length)
     log_ns: NDArray[np.int64]  # (N,)
     publish_ns: NDArray[np.int64]  # (N,), 0 where the log has no time of sending
-    sequence: NDArray[np.int64]  # (N,), number of the message by the publisher, 0 where the log has none
+    sequence: NDArray[
+        np.int64
+    ]  # (N,), number of the message by the publisher, 0 where the log has none
 
     @property
     def sent_ns(self) -> NDArray[np.int64]:
@@ -126,8 +152,12 @@ class Scan:
         self.path = path
         self.complete = False  # it has its footer
         self.damaged = 0  # chunks and other parts that could not be read
-        self.known_end_ns = 0  # the latest log time in the index and the chunk headers, including lost messages
-        self.message_counts: dict[int, int] = {}  # by channel, as the index has them; known from the first record on
+        self.known_end_ns = (
+            0  # the latest log time in the index and the chunk headers, including lost messages
+        )
+        self.message_counts: dict[
+            int, int
+        ] = {}  # by channel, as the index has them; known from the first record on
 
     @property
     def faults(self) -> str:
@@ -139,23 +169,30 @@ class Scan:
     def records(self) -> Iterator[McapRecord]:
         """The schemas, channels, messages, attachments and metadata.
 
-        Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError for a file that cannot be
-        read, and nothing for damaged content.
+        Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError
+        for a file that cannot be read, and nothing for damaged content.
         """
         return self._read(decode_parts, 0, map)
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, many times faster: the messages of a channel in some chunks come together."""
+        """As `records`, many times faster: the messages of a channel in some chunks come
+        together.
+        """
         return self._read(decode_batches, JOINED_BYTES, map_ahead)
 
     def _read(
-        self, decode: Callable[[Sequence[Part]], Iterator[R]], joined: int, apply: Callable[..., Iterator[tuple[list[R], int]]]
+        self,
+        decode: Callable[[Sequence[Part]], Iterator[R]],
+        joined: int,
+        apply: Callable[..., Iterator[tuple[list[R], int]]],
     ) -> Iterator[R | Schema | Channel]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             index = self._index(stream, size)
             yield from (record for record in index if isinstance(record, Schema | Channel))
-            missing = sum(record.message_count for record in index if isinstance(record, Statistics))
+            missing = sum(
+                record.message_count for record in index if isinstance(record, Statistics)
+            )
             parts = _joined(_with_message_indexes(self._frames(stream, size, index)), joined)
             for records, damaged in apply(partial(_decoded, decode), parts):
                 self.damaged += damaged
@@ -165,7 +202,9 @@ class Scan:
                 self.damaged += 1
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
-        """The records of the index (the MCAP summary); empty when the file is truncated or the index damaged."""
+        """The records of the index (the MCAP summary); empty when the file is truncated or the
+        index damaged.
+        """
         position = size - FOOTER.size - len(MCAP0_MAGIC)
         if position < len(MCAP0_MAGIC):
             return []
@@ -185,7 +224,11 @@ class Scan:
         except DECODE_ERRORS:
             self.damaged += 1
             return []
-        ends = [record.message_end_time for record in index if isinstance(record, Statistics | ChunkIndex)]
+        ends = [
+            record.message_end_time
+            for record in index
+            if isinstance(record, Statistics | ChunkIndex)
+        ]
         self.known_end_ns = max(ends, default=0)
         most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that much
         self.message_counts = {}
@@ -195,8 +238,12 @@ class Scan:
                 self.message_counts |= {channel: min(count, most) for channel, count in counts}
         return index
 
-    def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of every record up to the index. After a damaged record the next record of the index follows."""
+    def _frames(
+        self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Opcode and content of every record up to the index. After a damaged record the next
+        record of the index follows.
+        """
         stream.seek(0)
         position = len(MCAP0_MAGIC)
         if stream.read(position) != MCAP0_MAGIC:
@@ -231,11 +278,14 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
     return [*sorted(start for start in starts if start < size), size]
 
 
-def frames(stream: IO[bytes], position: int, known: Sequence[int]) -> Iterator[tuple[int, int, bytes]]:
-    """Opcode, place behind the record, and content of every whole record from a place up to the end of the data.
+def frames(
+    stream: IO[bytes], position: int, known: Sequence[int]
+) -> Iterator[tuple[int, int, bytes]]:
+    """Opcode, place behind the record, and content of every whole record from a place up to the end
+    of the data.
 
-    After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last record is in ENDS, or the
-    file is truncated, or grows.
+    After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last
+    record is in ENDS, or the file is truncated, or grows.
     """
     stream.seek(position)
     size = known[-1]
@@ -272,11 +322,15 @@ def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]
 
 
 def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
-    """Successive chunks with up to `most` bytes of records together, or a larger chunk alone; every further record alone."""
+    """Successive chunks with up to `most` bytes of records together, or a larger chunk alone; every
+    further record alone.
+    """
     chunks: list[Part] = []
     size = 0
     for part in parts:
-        is_chunk = part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size  # else it is damaged
+        is_chunk = (
+            part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size
+        )  # else it is damaged
         more = CHUNK.unpack_from(part.content)[2] if is_chunk else 0
         if chunks and (not is_chunk or size + more > most):
             yield chunks
@@ -291,7 +345,9 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
         yield chunks
 
 
-def _decoded(decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Part]) -> tuple[list[R], int]:
+def _decoded(
+    decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Part]
+) -> tuple[list[R], int]:
     """The records of parts without the damaged parts, and how many these are."""
     try:
         return list(decode(parts)), 0
@@ -308,7 +364,9 @@ def _decoded(decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Pa
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """As `map`, with the next results from a thread: decompression and NumPy leave the interpreter to the caller meanwhile."""
+    """As `map`, with the next results from a thread: decompression and NumPy leave the interpreter
+    to the caller meanwhile.
+    """
     with ThreadPoolExecutor(1) as pool:
         ahead: deque[Future[R]] = deque()
         for item in items:
@@ -329,9 +387,13 @@ def split(data: bytes, only: Container[int] | None = None) -> Iterator[McapRecor
             raise McapError("a record longer than its container")
         if only is not None and opcode not in only:
             pass
-        elif opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # here, for nearly all records are messages
+        elif (
+            opcode == Opcode.MESSAGE and length >= MESSAGE.size
+        ):  # here, for nearly all records are messages
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
-            yield Message(channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence)
+            yield Message(
+                channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence
+            )
         else:
             yield from _decode_inner(opcode, data[position:end])
         position = end
@@ -342,32 +404,50 @@ def _messages_in(record: object) -> int:
 
 
 def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode` of chunks or of a single record, with the messages of a channel together. Raises DECODE_ERRORS.
+    """As `decode` of chunks or of a single record, with the messages of a channel together. Raises
+    DECODE_ERRORS.
 
     The message indexes of a chunk save most of the time. A wrong index changes nothing.
     """
     if parts[0].opcode == Opcode.CHUNK:
-        yield from _split_batches([(decompress(part.content), _places(part.message_indexes)) for part in parts])
+        yield from _split_batches(
+            [(decompress(part.content), _places(part.message_indexes)) for part in parts]
+        )
         return
     for record in decode(parts[0].opcode, parts[0].content):
         if isinstance(record, Message):
             log_ns, publish_ns = (
-                np.array([time], dtype=np.uint64).view(np.int64) for time in (record.log_time, record.publish_time)
+                np.array([time], dtype=np.uint64).view(np.int64)
+                for time in (record.log_time, record.publish_time)
             )
             number = np.array([record.sequence], dtype=np.int64)
-            yield MessageBatch(record.channel_id, np.frombuffer(record.data, dtype=np.uint8)[None], log_ns, publish_ns, number)
+            yield MessageBatch(
+                record.channel_id,
+                np.frombuffer(record.data, dtype=np.uint8)[None],
+                log_ns,
+                publish_ns,
+                number,
+            )
         else:
             yield record
 
 
 def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
     """The places of messages in a chunk in their order, by the message indexes, damaged or not."""
-    ends = (len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize for content in message_indexes)
-    entries = b"".join(content[MESSAGE_INDEX.size : end] for content, end in zip(message_indexes, ends, strict=True))
+    ends = (
+        len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize
+        for content in message_indexes
+    )
+    entries = b"".join(
+        content[MESSAGE_INDEX.size : end]
+        for content, end in zip(message_indexes, ends, strict=True)
+    )
     return np.sort(np.frombuffer(entries, INDEX_ENTRY)["place"])
 
 
-def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterator[McapRecord | MessageBatch]:
+def _split_batches(
+    chunks: Sequence[tuple[bytes, NDArray[np.int64]]],
+) -> Iterator[McapRecord | MessageBatch]:
     """The records in chunks, and then the messages by channel. Raises DECODE_ERRORS.
 
     A chunk has the places of the messages in their order, by the message indexes.
@@ -393,7 +473,11 @@ def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterato
         log_ns, publish_ns = (heads[name][first:end].copy() for name in ("log_ns", "publish_ns"))
         rows = windows[places[first:end] + HEAD.itemsize]
         yield MessageBatch(
-            int(heads["channel"][first]), rows, log_ns, publish_ns, heads["sequence"][first:end].astype(np.int64)
+            int(heads["channel"][first]),
+            rows,
+            log_ns,
+            publish_ns,
+            heads["sequence"][first:end].astype(np.int64),
         )
 
 
@@ -405,13 +489,16 @@ def _heads(data: bytes) -> NDArray[np.void]:
 def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDArray[np.int64]]:
     """The records of a chunk except messages, and the places of the messages, sorted.
 
-    The search steps over the messages at `places`, and from record to record in between. Raises DECODE_ERRORS.
+    The search steps over the messages at `places`, and from record to record in between. Raises
+    DECODE_ERRORS.
     """
     heads = _heads(data)
     if len(places) and not 0 <= places[0] <= places[-1] < len(heads):
         raise McapError("a message index beyond its chunk")
     lengths = heads["length"][places]
-    if np.any(heads["opcode"][places] != Opcode.MESSAGE) or np.any((lengths < MESSAGE.size) | (lengths > len(data))):
+    if np.any(heads["opcode"][places] != Opcode.MESSAGE) or np.any(
+        (lengths < MESSAGE.size) | (lengths > len(data))
+    ):
         raise McapError("a message index without its message")
     starts = np.append(places, len(data))
     ends = np.append(0, places + RECORD.size + lengths)
@@ -462,9 +549,14 @@ def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
 
 
 def decompress(chunk: bytes) -> bytes:
-    """The bytes of the records in the content of a chunk, limited to the stated size. Raises DECODE_ERRORS."""
+    """The bytes of the records in the content of a chunk, limited to the stated size. Raises
+    DECODE_ERRORS.
+    """
     _, _, size, crc, name_length = CHUNK.unpack_from(chunk)
-    (length,), start = LENGTH.unpack_from(chunk, CHUNK.size + name_length), CHUNK.size + name_length + LENGTH.size
+    (length,), start = (
+        LENGTH.unpack_from(chunk, CHUNK.size + name_length),
+        CHUNK.size + name_length + LENGTH.size,
+    )
     compression = chunk[CHUNK.size : CHUNK.size + name_length]
     compressed = memoryview(chunk)[start : start + length]
     if len(compressed) != length:
@@ -472,7 +564,9 @@ def decompress(chunk: bytes) -> bytes:
     if size > max(MAX_CHUNK_BYTES, len(compressed)):
         raise McapError(f"a chunk with a size of {size} bytes")
     if compression == b"zstd":
-        if zstandard.frame_content_size(compressed) > size:  # the decompressor would allocate that much
+        if (
+            zstandard.frame_content_size(compressed) > size
+        ):  # the decompressor would allocate that much
             raise McapError("a chunk that holds more than its size")
         data = _OF_THREAD.zstd.decompress(compressed, max_output_size=size)
     elif compression == b"lz4":

@@ -38,7 +38,8 @@ NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """The messages of a log in the order of writing; of a truncated or damaged file the readable messages.
+    """The messages of a log in the order of writing; of a truncated or damaged file the readable
+    messages.
 
     Raises ParameterError for a missing or unreadable log.
     """
@@ -66,14 +67,17 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
                     elif isinstance(record, Channel):
                         channels[record.id] = record
         except OSError as error:
-            raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected {A_RUN}") from None
+            raise ParameterError(
+                f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
+            ) from None
 
 
 def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
-    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to values, for `known` parameters
-    or groups of parameters. None stands for a deleted parameter. SI units.
+    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to
+    values, for `known` parameters or groups of parameters. None stands for a deleted parameter. SI
+    units.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -86,7 +90,10 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
             continue
         if event.node != node:
             continue
-        changes = {new.name: parameter_value(new.value) for new in (*event.new_parameters, *event.changed_parameters)}
+        changes = {
+            new.name: parameter_value(new.value)
+            for new in (*event.new_parameters, *event.changed_parameters)
+        }
         changes |= {deleted.name: None for deleted in event.deleted_parameters}
         values = {name: value for name, value in changes.items() if name.split(".")[0] in known}
         if values:
@@ -95,16 +102,30 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
 
 
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
-    """A message of PARAMETER_EVENTS with changes by dotted name, the inverse of `parameter_changes`; None deletes one."""
+    """A message of PARAMETER_EVENTS with changes by dotted name, the inverse of
+    `parameter_changes`; None deletes one.
+    """
     store = typestore()
-    types = {name: store.types[f"rcl_interfaces/msg/{name}"] for name in ("ParameterEvent", "Parameter", "ParameterValue")}
+    types = {
+        name: store.types[f"rcl_interfaces/msg/{name}"]
+        for name in ("ParameterEvent", "Parameter", "ParameterValue")
+    }
     texts = (bool, int, float, str)
     empty = np.zeros(0)
 
     def parameter(name: str, value: Any) -> Any:
         array = isinstance(value, (list, tuple))
-        kind = 0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
-        by_kind: dict[int, Any] = {1: False, 2: 0, 3: 0.0, 4: "", 5: empty.astype(np.uint8), 6: empty.astype(bool)}
+        kind = (
+            0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
+        )
+        by_kind: dict[int, Any] = {
+            1: False,
+            2: 0,
+            3: 0.0,
+            4: "",
+            5: empty.astype(np.uint8),
+            6: empty.astype(bool),
+        }
         by_kind |= {7: empty.astype(np.int64), 8: empty, 9: []}
         if kind:
             by_kind[kind] = np.array(value, dtype=by_kind[kind].dtype) if 6 <= kind < 9 else value
@@ -119,7 +140,8 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
 
 def parameter_value(message: Any) -> Any:
     """The value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
-    # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type, in their order from 1 on.
+    # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type,
+    # in their order from 1 on.
     kind = message.type
     names = [field.name for field in fields(message)]
     value: Any = getattr(message, names[kind]) if 0 < kind < len(names) else None

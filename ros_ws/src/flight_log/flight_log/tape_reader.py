@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a bag as a Tape, without ROS: bags of this stack and of `ros2 bag record`, also truncated ones."""
+"""Reads a bag as a Tape, without ROS: bags of this stack and of `ros2 bag record`, also truncated
+ones.
+"""
 
 import re
 import shlex
@@ -24,11 +26,28 @@ from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape, refusal_note
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
-from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES, SIMULATED_TIME, stack_topic
+from flight_log.bag import (
+    IMPORTED,
+    LOST_MESSAGES,
+    OUTCOME,
+    SCENARIO_MEDIA_TYPE,
+    SILENCES,
+    SIMULATED_TIME,
+    stack_topic,
+)
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, leap_note, recording_note, without_leaps
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
-from flight_log.flight_processes import INSTANCE, LOG, READY, ROSOUT, UNNAMED, Span, flight_processes, ready_times
+from flight_log.flight_processes import (
+    INSTANCE,
+    LOG,
+    READY,
+    ROSOUT,
+    UNNAMED,
+    Span,
+    flight_processes,
+    ready_times,
+)
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY
@@ -44,21 +63,39 @@ from flight_log.named_vectors import (
     full_name,
     stamps_of,
 )
-from flight_log.open_log import A_RUN, NAMED, ROSBAG2, log_files, missing_parts, open_scan, plain_batches
+from flight_log.open_log import (
+    A_RUN,
+    NAMED,
+    ROSBAG2,
+    log_files,
+    missing_parts,
+    open_scan,
+    plain_batches,
+)
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import MessageBatch
 
 PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
 ROUTE = "route"
-BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
+# messages that are decoded together: of 1024, the tables are so large that the memory for each is
+# new
+BATCH = 512
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
 RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
 UNSTAMPED = ("route",)  # plans, which are often published without a stamp
-AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
+AIRCRAFT_TOPICS = (
+    "y",
+    "y_m",
+    "u",
+    "u_m",
+    "internals",
+    "truth",
+)  # a namespace with one of these topics is that of an aircraft
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
-"""Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""
+"""Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path
+to another folder."""
 
 
 class StoredFile(NamedTuple):
@@ -69,12 +106,13 @@ class StoredFile(NamedTuple):
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log. `metadata` holds the named sets of strings, `attachments` the files except the scenario.
+    """The content of a log. `metadata` holds the named sets of strings, `attachments` the files
+    except the scenario.
 
-    `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft, `engagements` are the engagements of a
-    bridge; None for a log without samples of the kind, or without times of sending. The content is of the aircraft in
-    `namespace`, "" for the root. `path` is where the log was read, `topics` are the types of all topics of the log by full
-    name.
+    `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft,
+    `engagements` are the engagements of a bridge; None for a log without samples of the kind, or
+    without times of sending. The content is of the aircraft in `namespace`, "" for the root. `path`
+    is where the log was read, `topics` are the types of all topics of the log by full name.
     """
 
     tape: Tape
@@ -89,12 +127,16 @@ class RecordedRun(NamedTuple):
     age_of_u: Signal | None = None
 
     def require(self, *names: str) -> None:
-        """Raise ParameterError with the topics of the log where a topic of a flight has no sample, or every topic."""
+        """Raise ParameterError with the topics of the log where a topic of a flight has no sample,
+        or every topic.
+        """
         missing = [name for name in names if name not in self.tape]
         if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):
             where = "the log" if self.path is None else str(self.path)
             has = listed(self.topics)
-            lack = f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
+            lack = (
+                f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
+            )
             raise ParameterError(f"{where}: found {lack}, expected {A_FLIGHT}")
 
     def scenario_file(self) -> StoredFile:
@@ -102,7 +144,10 @@ class RecordedRun(NamedTuple):
         if self.scenario is None:
             where = "the log" if self.path is None else str(self.path)
             if IMPORTED in self.metadata:
-                raise ParameterError(f"{where}: found an imported log, expected a flight of the stack, which has a scenario")
+                raise ParameterError(
+                    f"{where}: found an imported log, expected a flight of the stack, which has "
+                    "a scenario"
+                )
             expected = "a run that was flown from one, or the scenario: --scenario FILE"
             raise ParameterError(f"{where}: found a log without its scenario, expected {expected}")
         return self.scenario
@@ -116,43 +161,80 @@ def listed(topics: Mapping[str, str]) -> str:
 
 
 def read_run(
-    run: FilePath, namespace: str | None = None, scenario: FilePath | None = None, remaps: Mapping[str, str] = {}
+    run: FilePath,
+    namespace: str | None = None,
+    scenario: FilePath | None = None,
+    remaps: Mapping[str, str] = {},
 ) -> RecordedRun:
-    """Read the folder or a file of a run: named vectors by topic name (without the namespace), samples by stamp.
+    """Read the folder or a file of a run: named vectors by topic name (without the namespace),
+    samples by stamp.
 
-    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several files, compressed or not. A
-    truncated MCAP file is read up to the last complete chunk, and a note of the tape says so. The file `scenario` replaces the
-    scenario in the log. `remaps` gives topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of remapped
-    nodes without these names. Raises ParameterError for a missing bag, for a bag without a sample, for several aircraft, in a
-    namespace each, of which `namespace` names none, and for a scenario file that cannot be read.
+    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several
+    files, compressed or not. A truncated MCAP file is read up to the last complete chunk, and a
+    note of the tape says so. The file `scenario` replaces the scenario in the log. `remaps` gives
+    topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of remapped nodes
+    without these names. Raises ParameterError for a missing bag, for a bag without a sample, for
+    several aircraft, in a namespace each, of which `namespace` names none, and for a scenario file
+    that cannot be read.
     """
     run = as_path(run, "run", A_RUN)
-    replacement = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
+    replacement = (
+        None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
+    )
     log = _read(run, {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()})
     filled = {
         topic: signal
         for topic, samples in log.topics.items()
         if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
-    nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
-    unset = {topic: clock.unset for topic, samples in log.topics.items() if (clock := samples.recording()).unset}
+    nothing = (
+        f"no sample of a flight among {has}"
+        if (has := listed(log.kinds))
+        else "no sample on any topic"
+    )
+    unset = {
+        topic: clock.unset
+        for topic, samples in log.topics.items()
+        if (clock := samples.recording()).unset
+    }
     lacks = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
-    lacks += [refusal_note(topic, count) for topic, samples in log.topics.items() if (count := samples.refused())]
+    lacks += [
+        refusal_note(topic, count)
+        for topic, samples in log.topics.items()
+        if (count := samples.refused())
+    ]
     require(bool(filled), str(run), "; ".join([nothing, *lacks, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
-    require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
+    require(
+        bool(names),
+        str(run),
+        f"topics that begin with no slash: {', '.join(filled)}",
+        "a recorded flight",
+    )
     stamped = names_within(aircraft, log.topics).items()
-    clocks = {printable(name): clock for topic, name in stamped if (clock := log.topics[topic].recording()).found}
+    clocks = {
+        printable(name): clock
+        for topic, name in stamped
+        if (clock := log.topics[topic].recording()).found
+    }
     stored_signals = {printable(name): filled[topic] for topic, name in names.items()}
     signals, recording, leaps = without_leaps(stored_signals, clocks)
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    refused = {printable(name): count for topic, name in stamped if (count := log.topics[topic].refused())}
+    refused = {
+        printable(name): count for topic, name in stamped if (count := log.topics[topic].refused())
+    }
     sentences = [refusal_note(name, count) for name, count in refused.items()]
     sentences += [recording_note(name, clock, start_ns) for name, clock in recording.items()]
-    sentences += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
-    notes = [*log.notes_at(end), *(leap_note(leap, start_ns) for leap in leaps), *filter(None, sentences)]
+    sentences += [
+        log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS
+    ]
+    notes = [
+        *log.notes_at(end),
+        *(leap_note(leap, start_ns) for leap in leaps),
+        *filter(None, sentences),
+    ]
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
     spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
     processes = flight_processes(spans, ready_times(log.lines), aircraft)
@@ -164,14 +246,33 @@ def read_run(
         refused=refused,
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
-    delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    stored = replacement or log.scenario or next((file for file in beside if file.name != PARAMETERS), None)
+    delays = latency(
+        {topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS}
+    )
+    stored = (
+        replacement
+        or log.scenario
+        or next((file for file in beside if file.name != PARAMETERS), None)
+    )
     ages = age_of_u(log.diagnostics, aircraft)
-    return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
+    return RecordedRun(
+        tape,
+        stored,
+        log.metadata,
+        tuple(log.attachments),
+        delays,
+        engaged,
+        aircraft,
+        run,
+        log.kinds,
+        ages,
+    )
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
-    """The span of each publisher over its topics, which are names with spans; of other programs on those of aircraft alone."""
+    """The span of each publisher over its topics, which are names with spans; of other programs on
+    those of aircraft alone.
+    """
     spans: dict[str, Span] = {}
     for name, senders in topics:
         for sender, span in senders.items():
@@ -181,39 +282,60 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
 
 
 def stored_scenario(path: Path) -> StoredFile:
-    """A scenario file as a file inside a log. Raises ParameterError for a file that cannot be read."""
+    """A scenario file as a file inside a log. Raises ParameterError for a file that cannot be
+    read.
+    """
     return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
 
 
 def files_beside(run: Path) -> list[StoredFile]:
-    """The scenario and the parameters beside a log without attachments: a single scenario by the content."""
+    """The scenario and the parameters beside a log without attachments: a single scenario by the
+    content.
+    """
     folder = run if is_folder(run) else run.parent
     files = []
     for path in sorted(folder.glob("*.yaml")):
         with suppress(ParameterError, OSError):
             stored = stored_scenario(path)
-            if path.name == PARAMETERS or all(section in stored.content for section in (b"/aircraft:", b"/controller:")):
+            if path.name == PARAMETERS or all(
+                section in stored.content for section in (b"/aircraft:", b"/controller:")
+            ):
                 files.append(stored)
     scenarios = [stored for stored in files if stored.name != PARAMETERS]
-    return files if len(scenarios) < 2 else [stored for stored in files if stored.name == PARAMETERS]
+    return (
+        files if len(scenarios) < 2 else [stored for stored in files if stored.name == PARAMETERS]
+    )
 
 
 def aircraft_namespaces(topics: Collection[str]) -> list[str]:
     """The namespaces of aircraft."""
-    return sorted({topic.rpartition("/")[0] for topic in topics if topic.rpartition("/")[2] in AIRCRAFT_TOPICS})
+    return sorted(
+        {
+            topic.rpartition("/")[0]
+            for topic in topics
+            if topic.rpartition("/")[2] in AIRCRAFT_TOPICS
+        }
+    )
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the choice of the caller."""
+    """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the
+    choice of the caller.
+    """
     aircraft = aircraft_namespaces(topics)
     known = ", ".join(name or "/" for name in aircraft) or "none"
     if namespace is None:
         require(
-            len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for: --namespace NAME"
+            len(aircraft) < 2,
+            where,
+            f"aircraft in the namespaces {known}",
+            "that one of them is asked for: --namespace NAME",
         )
         return aircraft[0] if aircraft else ""
     chosen = f"/{str(namespace).strip('/')}".rstrip("/")
-    require(chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}")
+    require(
+        chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}"
+    )
     return chosen
 
 
@@ -233,7 +355,9 @@ class _TopicSamples:
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode = decode
         self._expected = expected
-        self._batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []  # of one length; log times, steps of numbers
+        self._batch: list[
+            tuple[Table, NDArray[np.int64], NDArray[np.int64]]
+        ] = []  # of one length; log times, steps of numbers
         self._batched = 0  # messages
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
@@ -250,7 +374,9 @@ class _TopicSamples:
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
-        self._restarted = self._restarted or bool(np.any(steps < 0))  # another publisher, or a restarted one
+        self._restarted = self._restarted or bool(
+            np.any(steps < 0)
+        )  # another publisher, or a restarted one
         fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not fits:
             self._decode_batch(more=fits)
@@ -278,29 +404,41 @@ class _TopicSamples:
                 names, values = self._ordered(received, unordered)
                 finite = np.isfinite(values).all(axis=1)
                 self._refused += int(np.count_nonzero(~finite))
-                stamp_ns, values = (stamps, values) if finite.all() else (stamps[finite], values[finite])
+                stamp_ns, values = (
+                    (stamps, values) if finite.all() else (stamps[finite], values[finite])
+                )
                 if not len(stamp_ns):
                     continue
                 span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
-                self.spans[sender] = span.joined(self.spans[sender]) if sender in self.spans else span
+                self.spans[sender] = (
+                    span.joined(self.spans[sender]) if sender in self.spans else span
+                )
                 if names not in self._samples:
-                    expected = 0 if self._samples else self._expected  # other names are few, or those of a hostile log
+                    expected = (
+                        0 if self._samples else self._expected
+                    )  # other names are few, or those of a hostile log
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values)
             else:
                 self._refused += len(stamps)
 
-    def _ordered(self, names: tuple[str, ...], values: NDArray[np.float64]) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and values in the order of the first sample with these names: values are matched by name."""
+    def _ordered(
+        self, names: tuple[str, ...], values: NDArray[np.float64]
+    ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Names and values in the order of the first sample with these names: values are matched by
+        name.
+        """
         for known in self._samples:
             if known != names and sorted(known) == sorted(names):
                 return known, values[:, [names.index(name) for name in known]]
         return names, values
 
     def signal(self, name: str) -> Signal | None:
-        """The samples of a topic in the order of the stamps; None without samples that have a stamp.
+        """The samples of a topic in the order of the stamps; None without samples that have a
+        stamp.
 
-        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight time. A plan needs no stamp.
+        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight
+        time. A plan needs no stamp.
         """
         self._decode_batch(end=True)
         if not self._samples:
@@ -313,7 +451,11 @@ class _TopicSamples:
         usual = len(stamps) - 1 if name in RESTING else 1
         if zeros > usual:  # a recorder may take each message twice
             usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
-        if name not in UNSTAMPED and zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
+        if (
+            name not in UNSTAMPED
+            and zeros
+            and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS)
+        ):
             self._unset = zeros
             signal = signal.where(~zero)
             if not len(signal.stamp_ns):
@@ -322,13 +464,17 @@ class _TopicSamples:
             order = np.argsort(signal.stamp_ns, kind="stable")
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
-            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)  # of a part that is there twice
+            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(
+                axis=1
+            )  # of a part that is there twice
             keep = np.append(True, ~again)
             signal = Signal(stamps[keep], signal.names, values[keep])
         return signal
 
     def _names(self) -> tuple[str, ...]:
-        """The names of the first sample, or of the majority of samples with further names beside."""
+        """The names of the first sample, or of the majority of samples with further names
+        beside.
+        """
         first = next(iter(self._samples))
         return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
 
@@ -336,20 +482,30 @@ class _TopicSamples:
         return self._samples[names].count
 
     def conflict(self, name: str) -> str:
-        """The note on simultaneous publishers, of which the nodes accept the first; empty for successive publishers."""
+        """The note on simultaneous publishers, of which the nodes accept the first; empty for
+        successive publishers.
+        """
         spans = sorted(self.spans.items(), key=itemgetter(1))
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
             return ""
         publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
-        return f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
+        return (
+            f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
+        )
 
     def recording(self) -> Recording:
         """The stamps in the order of the recording; after `signal`."""
-        return self._clock.recording(self._unset)._replace(lost=self._lost if self._numbered and not self._restarted else None)
+        return self._clock.recording(self._unset)._replace(
+            lost=self._lost if self._numbered and not self._restarted else None
+        )
 
     def refused(self) -> int:
         """How many samples were refused: damaged, not finite, or of other channels."""
-        return self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
+        return (
+            self._refused
+            + sum(map(self._count, self._samples))
+            - (self._count(self._names()) if self._samples else 0)
+        )
 
 
 class _Log:
@@ -368,11 +524,15 @@ class _Log:
         self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
         self.lines: list[bytes] = []  # of /rosout: that a node is ready
         self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
+        self.reports: dict[
+            str, list[tuple[int, bytes]]
+        ] = {}  # of bridges by full topic name: time of sending, ns, and message
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
 
-    def reader_of(self, topic: str, type_name: str, expected: int) -> Callable[[MessageBatch], None] | None:
+    def reader_of(
+        self, topic: str, type_name: str, expected: int
+    ) -> Callable[[MessageBatch], None] | None:
         """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
         samples = self.samples_of(topic, type_name, expected)
         if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
@@ -389,9 +549,13 @@ class _Log:
         if samples is not None:
             return lambda batch: samples.add(batch.data, batch.log_ns, batch.sequence)
         if topic == ROSOUT and type_name == LOG:
-            return lambda batch: self.lines.extend(line for line in map(bytes, batch.data) if READY in line)
+            return lambda batch: self.lines.extend(
+                line for line in map(bytes, batch.data) if READY in line
+            )
         if topic == DIAGNOSTICS and type_name == DIAGNOSTIC_ARRAY:
-            return lambda batch: self.diagnostics.extend(data for data in map(bytes, batch.data) if IN_MESSAGE in data)
+            return lambda batch: self.diagnostics.extend(
+                data for data in map(bytes, batch.data) if IN_MESSAGE in data
+            )
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(
@@ -400,7 +564,9 @@ class _Log:
         return None
 
     def _time_of_stamps(self, sent_ns: np.int64) -> int:
-        """A time of sending by the clock of the stamps: the nodes keep their time when the system clock is set."""
+        """A time of sending by the clock of the stamps: the nodes keep their time when the system
+        clock is set.
+        """
         if self.times is not None:
             nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
             offset_ns = self.times.sent_ns[nearest] - self.times.stamp_ns[nearest]
@@ -411,7 +577,10 @@ class _Log:
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> _TopicSamples | None:
         """The samples of a topic; None for a type without named vectors or waypoints."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
-        if topic not in self.topics and (decode := decode_routes if is_route else decoder(type_name)) is not None:
+        if (
+            topic not in self.topics
+            and (decode := decode_routes if is_route else decoder(type_name)) is not None
+        ):
             self.topics[topic] = _TopicSamples(decode, expected)
         return self.topics.get(topic)
 
@@ -422,7 +591,9 @@ class _Log:
         elif isinstance(record, Attachment):
             name = Path(record.name).name
             if record.media_type == SCENARIO_MEDIA_TYPE:
-                self.scenario = StoredFile(name if SCENARIO_NAME.fullmatch(name) else "scenario.yaml", record.data)
+                self.scenario = StoredFile(
+                    name if SCENARIO_NAME.fullmatch(name) else "scenario.yaml", record.data
+                )
             else:
                 self.attachments.append(StoredFile(name, record.data))
 
@@ -431,9 +602,18 @@ class _Log:
         where = "" if end is None else f", t = {end:.3f} s"
         missing = seconds(self.known_end_ns - self.last_ns)
         more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
-        truncated = [f"{name} is truncated: read up to its last complete chunk{where}{more}" for name in self.truncated]
-        lost = [f"{topic}: the recorder lost {count} messages" for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()]
-        silent = [f"{topic}: the recorder received nothing {text}" for topic, text in self.metadata.get(SILENCES, {}).items()]
+        truncated = [
+            f"{name} is truncated: read up to its last complete chunk{where}{more}"
+            for name in self.truncated
+        ]
+        lost = [
+            f"{topic}: the recorder lost {count} messages"
+            for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()
+        ]
+        silent = [
+            f"{topic}: the recorder received nothing {text}"
+            for topic, text in self.metadata.get(SILENCES, {}).items()
+        ]
         simulated = []
         if (clock := self.metadata.get(SIMULATED_TIME)) is not None:
             speed = f", at {clock['speed']} times real time" if "speed" in clock else ""
@@ -453,18 +633,26 @@ def _read(run: Path, remaps: Mapping[str, str]) -> _Log:
 
 
 def _add_metadata(folder: Path, log: _Log) -> None:
-    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair command."""
+    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair
+    command.
+    """
     information: Mapping[str, Any] = {}
     try:
         information, end_ns = read_bag_metadata(folder)
         log.known_end_ns = max(log.known_end_ns, end_ns)
     except ParameterError:
         fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
-        mend = {".mcap": "rise-di report --repair", ".db3": "ros2 bag reindex"}.get(bag_files(folder)[0].suffix)
-        log.notes.append(f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}")
+        mend = {".mcap": "rise-di report --repair", ".db3": "ros2 bag reindex"}.get(
+            bag_files(folder)[0].suffix
+        )
+        log.notes.append(
+            f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}"
+        )
     if missing := missing_parts(bag_files(folder), information):
         known = f"named in {METADATA}" if information else "a number before the last"
-        log.notes.append(f"{', '.join(missing)}: {known} and missing; the log is a part of the recording")
+        log.notes.append(
+            f"{', '.join(missing)}: {known} and missing; the log is a part of the recording"
+        )
 
 
 def _read_file(file: Path, log: _Log) -> None:
@@ -488,15 +676,26 @@ def _read_file(file: Path, log: _Log) -> None:
                     type_name = schemas.get(record.schema_id, "")
                     is_cdr = record.message_encoding == "cdr"
                     topic = stack_topic(record, log.remaps)
-                    log.kinds.setdefault(topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}")
-                    if is_cdr and (take := log.reader_of(topic, full_name(type_name), expected)) is not None:
+                    log.kinds.setdefault(
+                        topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}"
+                    )
+                    if (
+                        is_cdr
+                        and (take := log.reader_of(topic, full_name(type_name), expected))
+                        is not None
+                    ):
                         channels[record.id] = take
                 else:
                     log.add(record)
     except OSError as error:
-        raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected {A_RUN}") from None
+        raise ParameterError(
+            f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
+        ) from None
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
-        log.notes.append(f"{file.name} begins before the end of the part before: the parts are out of order, or there twice")
+        log.notes.append(
+            f"{file.name} begins before the end of the part before: the parts are out of order, "
+            "or there twice"
+        )
     if not scan.complete:
         log.truncated.append(file.name)
     if scan.damaged:
@@ -505,7 +704,9 @@ def _read_file(file: Path, log: _Log) -> None:
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
-    """The duration of the whole flight by the attached parameters, s; None for a log without them."""
+    """The duration of the whole flight by the attached parameters, s; None for a log without
+    them.
+    """
     for stored in attachments:
         if stored.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
@@ -515,7 +716,9 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
-    """Stamp of flight time 0: by `truth`, else the first y_m, where commands begin; else the earliest stamp."""
+    """Stamp of flight time 0: by `truth`, else the first y_m, where commands begin; else the
+    earliest stamp.
+    """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:
         start_ns = flight_start_ns(int(truth.stamp_ns[0]), float(truth["t"][0]))
@@ -524,4 +727,6 @@ def _start_ns(signals: Mapping[str, Signal]) -> int:
     if "y_m" in signals:
         return int(signals["y_m"].stamp_ns[0])
     stamps = {name: int(signal.stamp_ns[0]) for name, signal in signals.items()}
-    return min([stamp_ns for name, stamp_ns in stamps.items() if name != ROUTE] or stamps.values())  # a route may have no stamp
+    return min(
+        [stamp_ns for name, stamp_ns in stamps.items() if name != ROUTE] or stamps.values()
+    )  # a route may have no stamp

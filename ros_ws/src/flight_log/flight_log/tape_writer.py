@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a Tape as an MCAP bag, without ROS. A flight in one process and a flight over topics leave the same kind of log."""
+"""Writes a Tape as an MCAP bag, without ROS. A flight in one process and a flight over topics leave
+the same kind of log.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +21,8 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 EXPECTED = "a folder and a disk that can"
 
 DELAY_NS = NANOSECONDS
-"""The longest delay of a sample for which messages of successive parts of a flight are in the order of their stamps."""
+"""The longest delay of a sample for which messages of successive parts of a flight are in the order
+of their stamps."""
 
 
 def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
@@ -27,7 +30,10 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
 
     Raises ParameterError where the bag cannot be written.
     """
-    with writing("", directory, EXPECTED), TapeWriter(directory, attachments, tape.start_ns) as writer:
+    with (
+        writing("", directory, EXPECTED),
+        TapeWriter(directory, attachments, tape.start_ns) as writer,
+    ):
         writer.write(tape.signals)
     return writer.path
 
@@ -35,8 +41,8 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
 class TapeWriter:
     """Writes a flight part by part as a bag. A sample becomes a message with the stamp as log time.
 
-    Messages are in the order of time: the samples of the last DELAY_NS wait for the next part. Raises OSError where the bag
-    cannot be written.
+    Messages are in the order of time: the samples of the last DELAY_NS wait for the next part.
+    Raises OSError where the bag cannot be written.
     """
 
     def __init__(self, directory: Path, attachments: LogAttachments, start_ns: int = 0) -> None:
@@ -61,15 +67,22 @@ class TapeWriter:
 
     def write(self, signals: Mapping[str, Signal]) -> None:
         """Write the samples of a part of a flight, by topic."""
-        joined = {topic: signal.after(self._waiting.get(topic)) for topic, signal in signals.items()}
-        newest_ns = max((int(signal.stamp_ns.max()) for signal in joined.values() if len(signal.stamp_ns)), default=0)
+        joined = {
+            topic: signal.after(self._waiting.get(topic)) for topic, signal in signals.items()
+        }
+        newest_ns = max(
+            (int(signal.stamp_ns.max()) for signal in joined.values() if len(signal.stamp_ns)),
+            default=0,
+        )
         due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in joined.items()}
         self._waiting = {topic: signal.where(~due[topic]) for topic, signal in joined.items()}
         self._write({topic: signal.where(due[topic]) for topic, signal in joined.items()})
 
     def write_changes(self, stamp_ns: int, node: str, changes: Mapping[str, Any]) -> None:
         """Write a change of parameters of a node in flight, as the node itself publishes it."""
-        self._write_message(PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes))
+        self._write_message(
+            PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes)
+        )
 
     def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> None:
         """Write what became of a proposal of a learner, as the controller itself publishes it."""
@@ -90,13 +103,20 @@ class TapeWriter:
         for topic in signals:
             if topic not in self._channels:
                 self._channels[topic] = self._bag.add_topic(f"/{topic}", JOINT_STATE, "")
-        messages = [encoded(Samples(part.names, part.stamp_ns, part.values, "in_process")) for part in signals.values()]
+        messages = [
+            encoded(Samples(part.names, part.stamp_ns, part.values, "in_process"))
+            for part in signals.values()
+        ]
         channels = [self._channels[topic] for topic in signals]
         counts = [len(signal.stamp_ns) for signal in signals.values()]
         stamps = np.concatenate([signal.stamp_ns for signal in signals.values()])
         columns = np.repeat(np.arange(len(counts)), counts)
         indexes = np.concatenate([np.arange(count) for count in counts])
         order = np.argsort(stamps, kind="stable")
-        for stamp_ns, column, index in zip(*(values[order].tolist() for values in (stamps, columns, indexes)), strict=True):
+        for stamp_ns, column, index in zip(
+            *(values[order].tolist() for values in (stamps, columns, indexes)), strict=True
+        ):
             channel = channels[column]
-            self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, messages[column][index].tobytes())
+            self._bag.write(
+                channel, stamp_ns, stamp_ns, channel.messages + 1, messages[column][index].tobytes()
+            )

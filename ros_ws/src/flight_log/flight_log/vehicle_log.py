@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads the logs that autopilots write: DataFlash of ArduPilot, tlogs of MAVLink, ULogs of PX4.
 
-Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MAVLink, common.xml; PX4 guide, ULog file format,
-and PX4's msg/*.msg. pymavlink and pyulog decode the files.
+Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MAVLink, common.xml;
+PX4 guide, ULog file format, and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 """
 
 import math
@@ -30,13 +30,17 @@ SERVOS = 16
 
 
 class Table(NamedTuple):
-    """The samples of a message: stamps, ns, shape (N,), ascending, and the fields by name, each of shape (N,)."""
+    """The samples of a message: stamps, ns, shape (N,), ascending, and the fields by name, each of
+    shape (N,).
+    """
 
     stamp_ns: NDArray[np.int64]
     fields: Mapping[str, FloatArray]
 
     def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a field at each of some instants, shape (n,); NaN before the first."""
+        """The newest value of a field at each of some instants, shape (n,); NaN before the
+        first.
+        """
         places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         return np.where(places < 0, np.nan, self.fields[field][places])
 
@@ -51,7 +55,9 @@ class ParameterRecord(NamedTuple):
 Parameters = Mapping[str, tuple[ParameterRecord, ...]]
 """The records of the parameters by name, in the order of the log."""
 
-PARAMETER = "PARM"  # a message of DataFlash; the samples of each format have their parameters by this name
+PARAMETER = (
+    "PARM"  # a message of DataFlash; the samples of each format have their parameters by this name
+)
 
 
 class Source(NamedTuple):
@@ -67,21 +73,32 @@ Sources = Mapping[str, tuple[Source, ...]]
 
 
 class Format(NamedTuple):
-    """A format of logs: what has y and pose in SI (body FRD; north, east, up), the transmitter's channels, the servos."""
+    """A format of logs: what has y and pose in SI (body FRD; north, east, up), the transmitter's
+    channels, the servos.
+    """
 
     sources: Sources
     sticks: Source  # its field has the number of the channel in place of {}
     servos: Source
     mode: tuple[Source, ...]
-    torques: Sources = MappingProxyType({})  # of a multicopter's rate controllers, normalised, by what responds to them
+    torques: Sources = MappingProxyType(
+        {}
+    )  # of a multicopter's rate controllers, normalised, by what responds to them
 
 
 def _sources(**places: tuple[Source, ...] | Source) -> Sources:
-    return MappingProxyType({name: (source,) if isinstance(source, Source) else source for name, source in places.items()})
+    return MappingProxyType(
+        {
+            name: (source,) if isinstance(source, Source) else source
+            for name, source in places.items()
+        }
+    )
 
 
 def _estimator(field: str, scale: float = 1.0) -> tuple[Source, ...]:
-    return tuple(Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1"))  # EKF3, EKF2, EKF2 of old releases
+    return tuple(
+        Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1")
+    )  # EKF3, EKF2, EKF2 of old releases
 
 
 DATAFLASH = Format(
@@ -89,7 +106,11 @@ DATAFLASH = Format(
         q=Source("IMU", "GyrY"),
         p=Source("IMU", "GyrX"),
         r=Source("IMU", "GyrZ"),
-        V=(Source("ARSP", "Airspeed"), Source("CTUN", "As"), Source("CTUN", "Aspd")),  # equivalent: _true_airspeed
+        V=(
+            Source("ARSP", "Airspeed"),
+            Source("CTUN", "As"),
+            Source("CTUN", "Aspd"),
+        ),  # equivalent: _true_airspeed
         phi=Source("ATT", "Roll", DEGREE),
         theta=Source("ATT", "Pitch", DEGREE),
         psi=Source("ATT", "Yaw", DEGREE),
@@ -104,7 +125,10 @@ DATAFLASH = Format(
     servos=Source("RCOU", "C{}"),
     mode=(Source("MODE", "ModeNum"), Source("MODE", "Mode")),
     torques=_sources(
-        q=Source("RATE", "POut"), p=Source("RATE", "ROut"), r=Source("RATE", "YOut"), climb=Source("RATE", "AOut")
+        q=Source("RATE", "POut"),
+        p=Source("RATE", "ROut"),
+        r=Source("RATE", "YOut"),
+        climb=Source("RATE", "AOut"),
     ),
 )
 TLOG = Format(
@@ -130,7 +154,9 @@ TLOG = Format(
 
 
 def _rate(axis: int) -> tuple[Source, ...]:
-    return Source("vehicle_angular_velocity", f"xyz[{axis}]"), Source("sensor_combined", f"gyro_rad[{axis}]")  # before 1.10
+    return Source("vehicle_angular_velocity", f"xyz[{axis}]"), Source(
+        "sensor_combined", f"gyro_rad[{axis}]"
+    )  # before 1.10
 
 
 ULOG_SOURCES = _sources(
@@ -151,11 +177,17 @@ ULOG_SOURCES = _sources(
 
 
 ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
-    {("vehicle_torque_setpoint", f"xyz[{axis}]"): Source("actuator_controls_0", f"control[{axis}]") for axis in range(3)}
+    {
+        ("vehicle_torque_setpoint", f"xyz[{axis}]"): Source(
+            "actuator_controls_0", f"control[{axis}]"
+        )
+        for axis in range(3)
+    }
     | {("vehicle_thrust_setpoint", "xyz[0]"): Source("actuator_controls_0", "control[3]")}
     | {("vehicle_thrust_setpoint", "xyz[2]"): Source("actuator_controls_0", "control[3]", -1.0)}
 )
-"""Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch, yaw, thrust)."""
+"""Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch,
+yaw, thrust)."""
 
 PLANE = "plane"
 COPTER = "multicopter"
@@ -165,7 +197,9 @@ class Choice(NamedTuple):
     """What a user takes of a log, and the kind of vehicle of the map."""
 
     system: int | None = None  # of a tlog; None: the system that flew
-    instances: Mapping[str, int] = MappingProxyType({})  # by message; else the sensor or the part that flew
+    instances: Mapping[str, int] = MappingProxyType(
+        {}
+    )  # by message; else the sensor or the part that flew
     vehicle: str = PLANE
 
 
@@ -173,15 +207,21 @@ ANY = Choice()
 
 
 class VehicleLog(NamedTuple):
-    """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's topics."""
+    """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's
+    topics.
+    """
 
     kind: str
     tables: Mapping[str, Table]
     parameters: Parameters
     format: Format | None
     vehicle: str = PLANE  # "": the log does not say
-    manual: int = 0  # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane (mode.h)
-    taken: tuple[tuple[str, str], ...] = ()  # of several systems, sensors or instances: what is taken, and why
+    # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
+    # (mode.h)
+    manual: int = 0
+    taken: tuple[
+        tuple[str, str], ...
+    ] = ()  # of several systems, sensors or instances: what is taken, and why
 
     def source(self, quantity: str) -> Source | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""
@@ -194,7 +234,9 @@ class VehicleLog(NamedTuple):
         return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
 
     def parameters_at(self, stamp_ns: int) -> dict[str, float]:
-        """The values of the parameters at an instant, without parameters whose first record comes later."""
+        """The values of the parameters at an instant, without parameters whose first record comes
+        later.
+        """
         values: dict[str, float] = {}
         for name, records in self.parameters.items():
             known = [record.value for record in records if record.stamp_ns <= stamp_ns]
@@ -207,7 +249,9 @@ class VehicleLog(NamedTuple):
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a place at each of some instants, shape (n,); NaN before the first."""
+        """The newest value of a place at each of some instants, shape (n,); NaN before the
+        first.
+        """
         return source.scale * self.tables[source.message].at(source.field, stamp_ns)
 
 
@@ -217,7 +261,8 @@ EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """Read the log of an autopilot.
 
-    Raises ParameterError for another file, where no message can be decoded, and where two systems or sensors may have flown.
+    Raises ParameterError for another file, where no message can be decoded, and where two systems
+    or sensors may have flown.
     """
     from flight_log.vehicle_readers import READERS  # noqa: PLC0415 - the readers need the types of this module
 
@@ -235,15 +280,25 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
         raise
     except Exception as error:  # pymavlink raises Exception itself for a damaged format
         reason = str(error) or type(error).__name__
-        raise ParameterError(f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}") from None
-    require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
+        raise ParameterError(
+            f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}"
+        ) from None
+    require(
+        bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight"
+    )
     return log
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a message, from C too."""
-    with redirect_stdout(StringIO()) as text, redirect_stderr(text), Path(os.devnull).open("wb") as null:
+    """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a
+    message, from C too.
+    """
+    with (
+        redirect_stdout(StringIO()) as text,
+        redirect_stderr(text),
+        Path(os.devnull).open("wb") as null,
+    ):
         try:
             stderr = os.dup(2)
         except OSError:  # it is closed
@@ -258,23 +313,30 @@ def _silent() -> Iterator[None]:
 
 
 LIMITS = (5.0, 6.0)
-"""Processor time of the decoding, s, and s a megabyte of the log: pymavlink takes 1.2 s a megabyte of DataFlash here."""
+"""Processor time of the decoding, s, and s a megabyte of the log: pymavlink takes 1.2 s a megabyte
+of DataFlash here."""
 
 MEMORY = (1 << 30, 100)
 """Data of the decoding, bytes, and bytes a byte of the log: pymavlink takes some 35."""
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
-    """`read_vehicle_log` in an isolated process: a log of a few bytes may claim billions of values. Raises ParameterError."""
+    """`read_vehicle_log` in an isolated process: a log of a few bytes may claim billions of values.
+    Raises ParameterError.
+    """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     size = path.stat().st_size
     timeout = LIMITS[0] + LIMITS[1] * size / 1e6
     memory = MEMORY[0] + MEMORY[1] * size
     plain = choice._replace(instances=dict(choice.instances))
     try:
-        return isolated.call(_read_absolute, str(path.absolute()), plain, timeout=timeout, memory=memory)
+        return isolated.call(
+            _read_absolute, str(path.absolute()), plain, timeout=timeout, memory=memory
+        )
     except isolated.IsolatedCallError as error:
-        raise ParameterError(f"{path}: found {file_kind(path)} whose decoding {error}, expected {EXPECTED}") from None
+        raise ParameterError(
+            f"{path}: found {file_kind(path)} whose decoding {error}, expected {EXPECTED}"
+        ) from None
 
 
 def _read_absolute(path: str, choice: tuple[int | None, Mapping[str, int], str]) -> VehicleLog:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decodes the formats of autopilots' logs: the system, the sensors and the clock that flew.
 
-Sources: as of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization (the sequence of a link).
+Sources: as of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization (the
+sequence of a link).
 """
 
 import re
@@ -21,7 +22,17 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 from flight_log.flown_instance import flown, moved
-from flight_log.log_samples import LARGEST, SETTING, Instances, Sample, is_number, near, parameters_of, table_of, tables_of
+from flight_log.log_samples import (
+    LARGEST,
+    SETTING,
+    Instances,
+    Sample,
+    is_number,
+    near,
+    parameters_of,
+    table_of,
+    tables_of,
+)
 from flight_log.vehicle_log import (
     COPTER,
     DATAFLASH,
@@ -43,7 +54,9 @@ AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID, of a ground station and of other components
 ULOG_HEAD = 16  # bytes: magic, version and time
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
-FIRMWARES = MappingProxyType({"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"})
+FIRMWARES = MappingProxyType(
+    {"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"}
+)
 MAV_TYPES: Mapping[int, str] = MappingProxyType(
     dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), PLANE)  # fixed wing, VTOL
     | dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), COPTER)
@@ -59,8 +72,11 @@ ROTORS = 1  # vehicle_type of vehicle_status: as a multicopter; 2 as a plane
 OLD_NAMES = MappingProxyType({"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "ASP2": ("ARSP", 1)})
 """Messages of the second and the third sensor of ArduPilot before 4.0: name and instance."""
 
-FLAGS: Mapping[str, set[str]] = MappingProxyType({"ARSP": {"H", "U", "Pri"}, "IMU": {"GH"}, "CTUN": {"E2T"}})
-"""Further fields of DataFlash: flags of the sensors, and the ratio of true to equivalent airspeed."""
+FLAGS: Mapping[str, set[str]] = MappingProxyType(
+    {"ARSP": {"H", "U", "Pri"}, "IMU": {"GH"}, "CTUN": {"E2T"}}
+)
+"""Further fields of DataFlash: flags of the sensors, and the ratio of true to equivalent
+airspeed."""
 
 
 def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
@@ -73,24 +89,39 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
     def samples() -> Iterator[Sample]:
         stamp_us = 0.0
-        reader = DFReader.DFReader_text(str(path)) if "text" in kind else DFReader.DFReader_binary(str(path))
+        reader = (
+            DFReader.DFReader_text(str(path))
+            if "text" in kind
+            else DFReader.DFReader_binary(str(path))
+        )
         with closing(reader):
-            while (message := reader.recv_match(type=[*wanted, *OLD_NAMES, PARAMETER, "MSG"])) is not None:
+            while (
+                message := reader.recv_match(type=[*wanted, *OLD_NAMES, PARAMETER, "MSG"])
+            ) is not None:
                 name = message.get_type()
                 if name == "MSG":
                     firmwares.update(dict.fromkeys(FIRMWARE.findall(str(message.Message))))
                     continue
                 # Logs of 2014 and before have ms, and MODE has no time: that of the message before.
-                stamp_us = getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us))
+                stamp_us = getattr(
+                    message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us)
+                )
                 stamp_ns = min(round(1e3 * stamp_us), LARGEST)
-                number = int(getattr(message, "I", 0) or getattr(message, "C", 0))  # of the sensor or the core
+                number = int(
+                    getattr(message, "I", 0) or getattr(message, "C", 0)
+                )  # of the sensor or the core
                 if name == PARAMETER:
                     yield SETTING, stamp_ns, (message.Name, float(message.Value))
                 else:
                     yield OLD_NAMES.get(name, (name, number)), stamp_ns, message
             columns = {form.name: form.columns for form in reader.formats.values()}
             is_old = "StartTime" in columns.get("TIME", ()) or "GyroX" in columns.get("IMU", ())
-            require(not is_old, str(path), "a log of PX4 before 2017 (sdlog2)", "a ULog: that of PX4 since then")
+            require(
+                not is_old,
+                str(path),
+                "a log of PX4 before 2017 (sdlog2)",
+                "a ULog: that of PX4 since then",
+            )
 
     instances, parameters, parts = tables_of(samples(), wanted)
     tables, taken = flown(instances, read, parameters, choice)
@@ -126,7 +157,9 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
 
     wanted = _wanted(TLOG)
-    autopilots: dict[int, tuple[int, int]] = {}  # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
+    autopilots: dict[
+        int, tuple[int, int]
+    ] = {}  # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
     received: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
     with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name
@@ -137,8 +170,12 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
                 if name == "HEARTBEAT" and message.autopilot != NO_AUTOPILOT:
                     autopilots.setdefault(system, (message.autopilot, message.type))
                 stamp_ns = min(round(NANOSECONDS * message._timestamp), LARGEST)
-                received.setdefault(system, []).append(Received(name, message.get_seq(), stamp_ns, message))
-    system, taken = _flown_system({number: received[number] for number in autopilots}, choice.system)
+                received.setdefault(system, []).append(
+                    Received(name, message.get_seq(), stamp_ns, message)
+                )
+    system, taken = _flown_system(
+        {number: received[number] for number in autopilots}, choice.system
+    )
     instances, parameters, parts = tables_of(_dated(received.get(system, [])), wanted)
     tables, _ = flown(instances, wanted, parameters, choice)
     autopilot, mav_type = autopilots.get(system, (0, -1))
@@ -147,8 +184,12 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     return VehicleLog(kind + parts, tables, parameters, TLOG, vehicle, manual, taken)
 
 
-def _flown_system(received: Mapping[int, list[Received]], chosen: int | None) -> tuple[int, tuple[tuple[str, str], ...]]:
-    """The flying system of a tlog, and a row on the choice. Raises ParameterError where two systems moved."""
+def _flown_system(
+    received: Mapping[int, list[Received]], chosen: int | None
+) -> tuple[int, tuple[tuple[str, str], ...]]:
+    """The flying system of a tlog, and a row on the choice. Raises ParameterError where two systems
+    moved.
+    """
     numbers = " and ".join(map(str, received)) or "none with a heartbeat"
     if chosen is not None:
         require(chosen in received, "--system", chosen, f"one of {numbers}")
@@ -156,35 +197,45 @@ def _flown_system(received: Mapping[int, list[Received]], chosen: int | None) ->
     motions = {}
     for system, messages in received.items():
         attitudes = [message.content for message in messages if message.name == "ATTITUDE"]
-        rates = [[attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed] for attitude in attitudes]
+        rates = [
+            [attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed] for attitude in attitudes
+        ]
         motions[system] = float(np.std(rates, axis=0).sum()) if rates else 0.0
     if not received:
         return 0, ()
     moving = moved(motions)
     if len(moving) > 1:
         ways_out = " or ".join(f"--system {system}" for system in moving)
-        raise ParameterError(f"the log: found motion of the systems {' and '.join(map(str, moving))}, expected {ways_out}")
+        raise ParameterError(
+            f"the log: found motion of the systems {' and '.join(map(str, moving))}, expected "
+            f"{ways_out}"
+        )
     reason = f"{moving[0]} of {numbers}: it alone moves"
     return moving[0], (("system", reason),) * (len(received) > 1)
 
 
-LEAST_TIMES = 0.1  # of the messages with a time of their own: with fewer different times the clock stands still
+# of the messages with a time of their own: with fewer different times the clock stands still
+LEAST_TIMES = 0.1
 RECENT = 16  # messages with a time, of which one tells the time of a message without
 AGAIN_NS = 30 * NANOSECONDS
 
 
 def _dated(received: list[Received]) -> Iterator[Sample]:
-    """The samples by the clock of the autopilot: a radio may bunch messages, a second link repeats messages later.
+    """The samples by the clock of the autopilot: a radio may bunch messages, a second link repeats
+    messages later.
 
-    A message without a time gets the time of the message before on the same link, the nearest by the sequence. Stamps count
-    from the first arrival. Without a clock in the messages the arrival is the time.
+    A message without a time gets the time of the message before on the same link, the nearest by
+    the sequence. Stamps count from the first arrival. Without a clock in the messages the arrival
+    is the time.
     """
     timed = [message for message in received if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in timed}
     by_arrival = len(times) <= LEAST_TIMES * len(timed)
     offset_ns = 0 if not timed else timed[0].arrival_ns - 1_000_000 * timed[0].content.time_boot_ms
     newest_ns = timed[0].arrival_ns if timed else 0
-    recent = deque[tuple[int, int | None]](maxlen=RECENT)  # sequences and stamps; None of a message that came before
+    recent = deque[tuple[int, int | None]](
+        maxlen=RECENT
+    )  # sequences and stamps; None of a message that came before
     arrivals: dict[tuple[str, int], int] = {}  # by name and time
     for name, sequence, arrival_ns, content in received:
         stamp_ns: int | None
@@ -200,10 +251,16 @@ def _dated(received: list[Received]) -> Iterator[Sample]:
             newest_ns = newest_ns if stamp_ns is None else stamp_ns
             recent.appendleft((sequence, stamp_ns))
         else:
-            link = min(recent, key=lambda place: (sequence - place[0]) % 256, default=(0, newest_ns))
+            link = min(
+                recent, key=lambda place: (sequence - place[0]) % 256, default=(0, newest_ns)
+            )
             stamp_ns = link[1]
         if name == "PARAM_VALUE":
-            yield SETTING, newest_ns if stamp_ns is None else stamp_ns, (content.param_id, float(content.param_value))
+            yield (
+                SETTING,
+                newest_ns if stamp_ns is None else stamp_ns,
+                (content.param_id, float(content.param_value)),
+            )
         elif stamp_ns is not None:
             yield (name, 0), stamp_ns, content
 
@@ -241,7 +298,9 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     parameters = parameters_of(records)
     tables, taken = flown(instances, _ulog_fields(), parameters, choice)
     if (attitude := tables.get("vehicle_attitude")) is not None:
-        tables["vehicle_attitude"] = Table(attitude.stamp_ns, {**attitude.fields, **_angles(attitude)})
+        tables["vehicle_attitude"] = Table(
+            attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}
+        )
     return VehicleLog(kind, tables, parameters, None, vehicle, taken=tuple(taken))
 
 
@@ -256,7 +315,9 @@ def _angles(attitude: Table) -> dict[str, FloatArray]:
 
 
 def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """The kind of vehicle by `vehicle_status`, "" where unknown, and whether the vehicle is a VTOL."""
+    """The kind of vehicle by `vehicle_status`, "" where unknown, and whether the vehicle is a
+    VTOL.
+    """
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
         return "", False
@@ -267,13 +328,18 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
     if fields.get("is_vtol", np.zeros(1)).any():
         return "", True
     number = int(np.median(fields.get("vehicle_type", np.zeros(1))))
-    return {0: "", ROTORS: COPTER, ROTORS + 1: PLANE, 3: "rover"}.get(number, f"vehicle of vehicle_type {number}"), False
+    return {0: "", ROTORS: COPTER, ROTORS + 1: PLANE, 3: "rover"}.get(
+        number, f"vehicle of vehicle_type {number}"
+    ), False
 
 
 def _ulog_fields() -> dict[str, set[str]]:
     """The fields of a ULog for the comparison of instances, by topic."""
     fields: dict[str, set[str]] = {}
-    places = [(source.message, source.field) for source in chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())]
+    places = [
+        (source.message, source.field)
+        for source in chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
+    ]
     for topic, field in (*places, *ULOG_TORQUES):
         fields.setdefault(topic, set()).add(field)
     return fields
@@ -284,7 +350,9 @@ def _wanted(log_format: Format) -> dict[str, set[str]]:
     sources = (*log_format.sources.values(), *log_format.torques.values(), log_format.mode)
     places = [*chain.from_iterable(sources)]
     for source, count in ((log_format.sticks, STICKS), (log_format.servos, SERVOS)):
-        places += [Source(source.message, source.field.format(number)) for number in range(1, count + 1)]
+        places += [
+            Source(source.message, source.field.format(number)) for number in range(1, count + 1)
+        ]
     wanted: dict[str, set[str]] = {}
     for source in places:
         wanted.setdefault(source.message, set()).add(source.field)
@@ -296,7 +364,9 @@ ULOG_VALUES = 65535
 
 
 def _require_short(formats: Mapping[str, Any]) -> None:
-    """Raise ValueError for a format with more values than a message holds: pyulog makes a field of each value."""
+    """Raise ValueError for a format with more values than a message holds: pyulog makes a field of
+    each value.
+    """
     counts: dict[str, int] = {}
 
     def count(name: str) -> int:

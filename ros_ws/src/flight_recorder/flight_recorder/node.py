@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: records the topics of a flight, as serialised messages, to a single MCAP bag."""
+"""The recorder's node: records the topics of a flight, as serialised messages, to a single MCAP
+bag.
+"""
 
 import sys
 import time
@@ -21,7 +23,16 @@ from flight_core.files import dump_yaml, is_file, link_latest, read_file, writin
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
-from flight_log.bag import LOST_MESSAGES, OUTCOME, OUTCOME_FILE, SILENCES, SIMULATED_TIME, BagChannel, BagWriter, LogAttachments
+from flight_log.bag import (
+    LOST_MESSAGES,
+    OUTCOME,
+    OUTCOME_FILE,
+    SILENCES,
+    SIMULATED_TIME,
+    BagChannel,
+    BagWriter,
+    LogAttachments,
+)
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderConfig
@@ -48,14 +59,23 @@ from flight_ros.topics import (
     Y,
 )
 
-FLUSH_PERIOD_NS = nanoseconds(0.1)  # the longest loss when the recorder is killed; also the period of the graph checks
+FLUSH_PERIOD_NS = nanoseconds(
+    0.1
+)  # the longest loss when the recorder is killed; also the period of the graph checks
 DISK_PERIOD_NS = NANOSECONDS
 MEGABYTE = 1e6
 
 LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
-STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)  # topics that no mode of a flight stops while the publisher runs
+STEADY = (
+    Y,
+    Y_M,
+    U,
+    INTERNALS,
+    TRUTH,
+    POSE,
+)  # topics that no mode of a flight stops while the publisher runs
 # a topic is steady after so many messages at such intervals
 STEADY_MESSAGES = 20
 STEADY_INTERVAL_NS = NANOSECONDS // 5
@@ -73,7 +93,8 @@ class _RecordedTopic:
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
     publisher: str | None = None  # of the last message
-    shared: bool = False  # the sequence of one name went back: of a second publisher under that name, or of a new one
+    # the sequence of one name went back: of a second publisher under that name, or of a new one
+    shared: bool = False
     publishers: int = 0  # number of publishers at the last check
     first_ns: int = 0  # monotonic time of the first and the last message
     heard_ns: int = 0
@@ -101,7 +122,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._bag = self._open_bag()
         self._topics: list[_RecordedTopic] = []
         for topic in FLIGHT:
-            qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD  # ROS 2 keeps the lines of the log
+            qos = (
+                RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
+            )  # ROS 2 keeps the lines of the log
             self._topics.append(self._record(self._poll(topic, qos), [PUBLISH]))
         recorded = {topic.name for topic in self._topics}
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
@@ -120,7 +143,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             validate_topic_name(name)
             return str(self.resolve_topic_name(name))
         except InvalidTopicNameException:
-            raise ParameterError(f"recorder.topics: found {name!r}, expected the name of a topic") from None
+            raise ParameterError(
+                f"recorder.topics: found {name!r}, expected the name of a topic"
+            ) from None
 
     def _open_bag(self) -> BagWriter:
         """The bag with its attachments. Raises ParameterError when the bag cannot be written."""
@@ -146,7 +171,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return bag
 
     def _free_folder(self, directory: Path) -> Path:
-        """The folder; another one beside it where it holds the log of a simulation that ended before this one."""
+        """The folder; another one beside it where it holds the log of a simulation that ended
+        before this one.
+        """
         numbered = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         taken = self.simulated is not None and any(directory.glob("*.mcap"))
         return next(folder for folder in numbered if not folder.exists()) if taken else directory
@@ -155,7 +182,11 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """The sentence about too little free space; empty with enough."""
         free = free_bytes(directory) / MEGABYTE
         least = self.parameters.min_free
-        return "" if free >= least else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
+        return (
+            ""
+            if free >= least
+            else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
+        )
 
     def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
         """The recorded topics among `topics`; `heard`: with messages."""
@@ -165,10 +196,14 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _poll(self, topic: Topic, qos: QoSProfile) -> PolledSubscription:
         return PolledSubscription(self, topic, qos, raw=True)
 
-    def _record(self, subscription: PolledSubscription, offered: Sequence[QoSProfile]) -> _RecordedTopic:
+    def _record(
+        self, subscription: PolledSubscription, offered: Sequence[QoSProfile]
+    ) -> _RecordedTopic:
         qos = dump_yaml(rosbag2_profiles(offered), flow=False)
         before_remap = self.resolve_topic_name(subscription.topic.name, only_expand=True)
-        channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos, before_remap)
+        channel = self._bag.add_topic(
+            subscription.name, type_name(subscription.topic.type), qos, before_remap
+        )
         return _RecordedTopic(subscription, channel)
 
     def period_ns(self) -> int:
@@ -178,10 +213,14 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return [topic.subscription for topic in self._among(LOOP)]
 
     def runs_in_lockstep(self) -> bool:
-        return False  # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the progress
+        # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the
+        # progress
+        return False
 
     def advance(self) -> bool:
-        """In a process with further nodes: write at ticks between the steps of the nodes, without delay of a node."""
+        """In a process with further nodes: write at ticks between the steps of the nodes, without
+        delay of a node.
+        """
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
         return False
@@ -190,7 +229,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._write()
 
     def _write(self) -> None:
-        """Drain the subscriptions. Every FLUSH_PERIOD_NS also flush, and check the graph and the disk."""
+        """Drain the subscriptions. Every FLUSH_PERIOD_NS also flush, and check the graph and the
+        disk.
+        """
         now_ns = self._drained_ns = time.monotonic_ns()
         self._drain_subscriptions()
         if now_ns - self._flushed_ns < FLUSH_PERIOD_NS:
@@ -216,7 +257,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._end(f"min_free: {sentence}")
 
     def _drain_subscriptions(self) -> None:
-        """Write the received messages. In lockstep publish the stamp of the newest sample of `truth` in the bag."""
+        """Write the received messages. In lockstep publish the stamp of the newest sample of
+        `truth` in the bag.
+        """
         recorded = b""
         if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
             return
@@ -244,10 +287,14 @@ class RecorderNode(FlightNode[RecorderConfig]):
             silent_ns = now_ns - topic.silent_ns
             topic.silent_ns = 0
             self.silent[topic.name] += silent_ns
-            self.get_logger().info(f"{topic.name}: received again after {silent_ns / NANOSECONDS:.1f} s")
+            self.get_logger().info(
+                f"{topic.name}: received again after {silent_ns / NANOSECONDS:.1f} s"
+            )
 
     def _publish_span(self) -> None:
-        """In real time: the stamp up to which y, y_m and u are in the log. A flight ends once these span it."""
+        """In real time: the stamp up to which y, y_m and u are in the log. A flight ends once these
+        span it.
+        """
         stamps = [topic.stamp_ns for topic in self._among(LOOP)]
         if not self.parameters.lockstep and min(stamps) >= 0:
             self._publish_recorded(instant(min(stamps)))
@@ -255,7 +302,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write = self._bag.write
         channel = topic.channel
-        # The sequences of several publishers interleave: a gap between publishers is no loss. Foreign topics name no publisher.
+        # The sequences of several publishers interleave: a gap between publishers is no loss.
+        # Foreign topics name no publisher.
         counted = not topic.foreign and not topic.shared
         for message, sent_ns, received_ns, sequence in received:
             if self.simulated is not None:
@@ -268,12 +316,16 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count
-                    self.get_logger().warning(f"{topic.name}: {count} messages lost", throttle_duration_sec=2.0)
+                    self.get_logger().warning(
+                        f"{topic.name}: {count} messages lost", throttle_duration_sec=2.0
+                    )
                 topic.publisher = publisher
             topic.next_sequence = sequence + 1
 
     def _write_or_end(self, write: Callable[[], None]) -> None:
-        """Write to the bag. On an error or a full disk end the bag; the node goes on, because a flight waits for it."""
+        """Write to the bag. On an error or a full disk end the bag; the node goes on, because a
+        flight waits for it.
+        """
         try:
             write()
         except OSError as error:
@@ -290,10 +342,15 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _close_bag(self) -> str:
         """Finish the bag. Return the error text when the bag cannot be finished."""
         try:
-            self._bag.add_metadata(LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()})
+            self._bag.add_metadata(
+                LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()}
+            )
             self._add_silences()
             if self.simulated is not None and self.simulated.known():
-                values = {"topic": self.simulated.subscription.name, "speed": f"{self.simulated.speed():.3g}"}
+                values = {
+                    "topic": self.simulated.subscription.name,
+                    "speed": f"{self.simulated.speed():.3g}",
+                }
                 self._bag.add_metadata(SIMULATED_TIME, values)
             if outcome := self._told_outcome():
                 self._bag.add_metadata(OUTCOME, {"outcome": outcome})
@@ -305,12 +362,15 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _add_silences(self) -> None:
         """Store the silences of topics, also those that last."""
         now_ns = self._flight_time.monotonic_ns()
-        lasting = {topic.name: now_ns - topic.silent_ns for topic in self._topics if topic.silent_ns}
+        lasting = {
+            topic.name: now_ns - topic.silent_ns for topic in self._topics if topic.silent_ns
+        }
         silent = Counter(self.silent)
         silent.update(lasting)
         if silent:
             texts = {
-                name: f"for {length_ns / NANOSECONDS:.1f} s{', to the end' if name in lasting else ''}"
+                name: f"for {length_ns / NANOSECONDS:.1f} "
+                f"s{', to the end' if name in lasting else ''}"
                 for name, length_ns in silent.items()
             }
             self._bag.add_metadata(SILENCES, texts)
@@ -319,7 +379,11 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """The outcome that the flight left for the log; empty without one."""
         file = self._bag.directory / OUTCOME_FILE
         try:
-            outcome = read_file(file, OUTCOME_FILE, "a text").decode(errors="replace") if is_file(file) else ""
+            outcome = (
+                read_file(file, OUTCOME_FILE, "a text").decode(errors="replace")
+                if is_file(file)
+                else ""
+            )
             file.unlink(missing_ok=True)
         except (OSError, ParameterError):
             return ""
@@ -340,18 +404,25 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self._subscribe(name, offered[0].topic_type)
         if self._missing and now_ns > self._warn_missing_ns:
             self._warn_missing_ns = now_ns + 10 * NO_PUBLISHER_WARNING_NS
-            self.get_logger().warning(f"no publisher of {', '.join(self._missing)}; recording starts with the first publisher")
+            self.get_logger().warning(
+                f"no publisher of {', '.join(self._missing)}; recording starts with the first "
+                "publisher"
+            )
 
     def _warn_of_a_part(self) -> None:
-        """Warn of a log with some of y, y_m and u: a flight has y, y_m and u, but discovery may fail on a busy domain."""
+        """Warn of a log with some of y, y_m and u: a flight has y, y_m and u, but discovery may
+        fail on a busy domain.
+        """
         silent = [topic for topic in self._among(LOOP) if not topic.channel.messages]
         for topic in silent if len(silent) < len(LOOP) else ():
             self.warn_no_publisher(topic.subscription)
 
     def _warn_of_silence(self, now_ns: int) -> None:
-        """Warn, once, when y, y_m and u have stopped: the publishers have ended, or this process receives nothing.
+        """Warn, once, when y, y_m and u have stopped: the publishers have ended, or this process
+        receives nothing.
 
-        Fast DDS can block the receiving threads during the removal of a leaving participant (eProsima/Fast-DDS, issue 6502).
+        Fast DDS can block the receiving threads during the removal of a leaving participant
+        (eProsima/Fast-DDS, issue 6502).
         """
         heard = sum(topic.channel.messages for topic in self._among(LOOP))
         if heard != self._heard:
@@ -360,73 +431,101 @@ class RecorderNode(FlightNode[RecorderConfig]):
         elif heard and now_ns - self._heard_ns > SILENCE_NS:
             self._heard_ns = sys.maxsize
             self.get_logger().warning(
-                f"no y, y_m or u for {SILENCE_NS / NANOSECONDS:g} s: if their nodes still publish, the middleware of this "
-                "process is blocked: start the recorder again"
+                f"no y, y_m or u for {SILENCE_NS / NANOSECONDS:g} s: if their nodes still "
+                "publish, the middleware of this process is blocked: start the recorder again"
             )
 
     def _warn_of_topic_silence(self, now_ns: int) -> None:
-        """Warn of a steady topic without messages, while the publisher is there and further topics go on.
+        """Warn of a steady topic without messages, while the publisher is there and further topics
+        go on.
 
-        A reader may miss all of a topic: a full queue, or a message of the middleware that was forged.
+        A reader may miss all of a topic: a full queue, or a message of the middleware that was
+        forged.
         """
         steady = self._among(STEADY, heard=True)
         newest_ns = max((topic.heard_ns for topic in steady), default=0)
         for topic in steady:
             count = topic.channel.messages
-            rested = count < STEADY_MESSAGES or topic.heard_ns - topic.first_ns > count * STEADY_INTERVAL_NS
+            rested = (
+                count < STEADY_MESSAGES
+                or topic.heard_ns - topic.first_ns > count * STEADY_INTERVAL_NS
+            )
             if rested or topic.silent_ns or newest_ns - topic.heard_ns < TOPIC_SILENCE_NS:
                 continue
             if now_ns - newest_ns < TOPIC_SILENCE_NS and self.count_publishers(topic.name):
                 topic.silent_ns = topic.heard_ns
                 why = "the publisher has stopped, or this process receives nothing more of it"
-                self.get_logger().warning(f"{topic.name}: no message for 1 s while others go on: {why}")
+                self.get_logger().warning(
+                    f"{topic.name}: no message for 1 s while others go on: {why}"
+                )
 
     def _subscribe(self, name: str, message_type: str) -> None:
         topic = Topic(name, message_type, EXTERNAL)
         try:
             definition(type_name(topic.type))
         except (ImportError, AttributeError, ParameterError):
-            self.get_logger().warning(bounded(f"{name} is not recorded: its type {message_type} is not installed"))
+            self.get_logger().warning(
+                bounded(f"{name} is not recorded: its type {message_type} is not installed")
+            )
             return
         offered = self._offered(name, message_type)
         self._topics.append(self._record(self._poll(topic, strongest_compatible(offered)), offered))
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        return [*super().graph_checks(), *(partial(self._check_publishers, topic) for topic in self._topics)]
+        return [
+            *super().graph_checks(),
+            *(partial(self._check_publishers, topic) for topic in self._topics),
+        ]
 
     def _check_publishers(self, topic: _RecordedTopic) -> None:
         self._weaken_qos(topic)
         self.endpoints.check_publishers(topic.subscription)
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:
-        return [peer.qos_profile for peer in self.get_publishers_info_by_topic(name) if peer.topic_type == message_type]
+        return [
+            peer.qos_profile
+            for peer in self.get_publishers_info_by_topic(name)
+            if peer.topic_type == message_type
+        ]
 
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
-        """Subscribe again with a weaker QoS where the publishers of a topic offer less than is requested.
+        """Subscribe again with a weaker QoS where the publishers of a topic offer less than is
+        requested.
 
-        A weaker publisher beside one of the stack does not lower the QoS: EndpointMonitor logs the mismatch.
+        A weaker publisher beside one of the stack does not lower the QoS: EndpointMonitor logs the
+        mismatch.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)
-        lacking = [qos_check_compatible(profile, subscription.qos)[0] == QoSCompatibility.ERROR for profile in offered]
+        lacking = [
+            qos_check_compatible(profile, subscription.qos)[0] == QoSCompatibility.ERROR
+            for profile in offered
+        ]
         if not any(lacking) or not (topic.foreign or all(lacking)):
             return
         # Volatile, because the transient-local samples have been recorded already.
-        weaker = QoSProfile(depth=subscription.qos.depth, reliability=strongest_compatible(offered).reliability)
+        weaker = QoSProfile(
+            depth=subscription.qos.depth, reliability=strongest_compatible(offered).reliability
+        )
         self._drain_subscriptions()
         self.destroy_subscription(subscription.entity)
         topic.subscription = self._poll(subscription.topic, weaker)
         self.get_logger().info(
-            f"{topic.name}: now recorded as {weaker.reliability.short_key} and volatile: its publishers offer no more"
+            f"{topic.name}: now recorded as {weaker.reliability.short_key} and volatile: its "
+            "publishers offer no more"
         )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        figures: dict[str, object] = {f"messages {channel.topic}": channel.messages for channel in self._bag.channels}
+        figures: dict[str, object] = {
+            f"messages {channel.topic}": channel.messages for channel in self._bag.channels
+        }
         figures |= {f"lost {name}": count for name, count in self.lost.items()}
         figures |= {f"missing {name}": "no publisher" for name in self._missing}
         if self._ended:
             return DiagnosticStatus.ERROR, self._ended, figures
-        figures |= {f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns}
+        figures |= {
+            f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns
+        }
         level = (
             DiagnosticStatus.WARN
             if self.lost or self._missing or any(topic.silent_ns for topic in self._topics)
@@ -435,7 +534,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return level, f"recording to {self._bag.path}", figures
 
     def _drain(self) -> None:
-        """Write the messages that were sent before the end: this process may be seconds behind on a busy host."""
+        """Write the messages that were sent before the end: this process may be seconds behind on a
+        busy host.
+        """
         end_ns = time.monotonic_ns()
         sent_ns = time.time_ns()
         heard_ns = end_ns
@@ -457,7 +558,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self.get_logger().error(f"{self._ended}{sentence}")
         for name in self._missing:
             self.get_logger().warning(f"{name} is not in the log: it had no publisher")
-        self.get_logger().info(bounded(f"{self._bag.contents().messages} messages in {self._bag.path}"))
+        self.get_logger().info(
+            bounded(f"{self._bag.contents().messages} messages in {self._bag.path}")
+        )
 
 
 def _file(name: str, key: str) -> Path | None:

@@ -14,9 +14,15 @@ class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(description="rate of writing, Hz")
-    directory: str = Field(default="", description="folder of the bag; empty: runs/<UTC stamp>-recording")
+    directory: str = Field(
+        default="", description="folder of the bag; empty: runs/<UTC stamp>-recording"
+    )
     topics: OptionalNames = Field(default=(), description="further topics to record, of any type")
-    min_free: NonNegative = Field(default=100.0, description="free disk space below which recording ends, MB; 0: no check")
+    min_free: NonNegative = Field(
+        default=100.0, description="free disk space below which recording ends, MB; 0: no check"
+    )
     attach: OptionalNames = Field(default=(), description="further files to attach to the log")
-    metadata_file: str = Field(default="", description="YAML file of named sets of strings, the records of the log")
+    metadata_file: str = Field(
+        default="", description="YAML file of named sets of strings, the records of the log"
+    )
     scenario_file: str = Field(default="", description="scenario file to attach to the log")

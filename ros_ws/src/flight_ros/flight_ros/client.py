@@ -21,27 +21,40 @@ NODES = ("controller", "guidance", "bridge", "aircraft")  # of an aircraft
 
 
 def start_middleware() -> None:
-    """Start rclpy in the default context. Raises ParameterError with the reason where the middleware does not start."""
+    """Start rclpy in the default context. Raises ParameterError with the reason where the
+    middleware does not start.
+    """
     transport.prepare()
     try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # the command handles SIGINT, not rclpy
+        rclpy.init(
+            signal_handler_options=SignalHandlerOptions.NO
+        )  # the command handles SIGINT, not rclpy
     except ARGUMENT_ERRORS as error:
-        raise ParameterError(f"ROS 2: does not start ({' '.join(str(error).split())}), expected its environment") from None
+        raise ParameterError(
+            f"ROS 2: does not start ({' '.join(str(error).split())}), expected its environment"
+        ) from None
 
 
 class Client:
-    """A node in the default context, or that of a `parent`, whose cancellation ends the waits of both.
+    """A node in the default context, or that of a `parent`, whose cancellation ends the waits of
+    both.
 
     A context manager: the middleware always shuts down.
     """
 
-    def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None, *, rosout: bool = True) -> None:
-        self._started = parent is None and not rclpy.ok()  # the first client of a process starts and ends the middleware
+    def __init__(
+        self, name: str, namespace: str = "", parent: "Client | None" = None, *, rosout: bool = True
+    ) -> None:
+        self._started = (
+            parent is None and not rclpy.ok()
+        )  # the first client of a process starts and ends the middleware
         if parent is None:
             if self._started:
                 start_middleware()
             try:
-                node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False, enable_rosout=rosout)
+                node = rclpy.create_node(
+                    name, namespace=namespace, start_parameter_services=False, enable_rosout=rosout
+                )
             except (NameValidationException, *ARGUMENT_ERRORS) as error:
                 self._shut_down()
                 key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
@@ -63,29 +76,46 @@ class Client:
         if self._started:
             rclpy.try_shutdown()
 
-    def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
+    def _spin_until(
+        self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT
+    ) -> None:
         begin = time.monotonic()
         while not condition():
             if self._cancelled.is_set():
                 raise ParameterError("cancelled by a later request")
-            if (waited := time.monotonic() - begin) > min(timeout, DISCOVERY_TIMEOUT) and (elsewhere := self._elsewhere()):
-                raise ParameterError(f"{message}; aircraft fly in {', '.join(elsewhere)}: --namespace")
+            if (waited := time.monotonic() - begin) > min(timeout, DISCOVERY_TIMEOUT) and (
+                elsewhere := self._elsewhere()
+            ):
+                raise ParameterError(
+                    f"{message}; aircraft fly in {', '.join(elsewhere)}: --namespace"
+                )
             if waited > timeout:
                 raise ParameterError(message)
             rclpy.spin_once(self._node, timeout_sec=0.02)
 
     def _elsewhere(self) -> list[str]:
-        """The namespaces of the aircraft in the graph where none is in this namespace; "/" is the root."""
-        seen = {namespace for name, namespace in self._node.get_node_names_and_namespaces() if name in NODES}
+        """The namespaces of the aircraft in the graph where none is in this namespace; "/" is the
+        root.
+        """
+        seen = {
+            namespace
+            for name, namespace in self._node.get_node_names_and_namespaces()
+            if name in NODES
+        }
         return [] if self._node.get_namespace() in seen else sorted(seen)
 
     def _call(self, kind: Any, name: str, request: Any, expected: str = "a flight") -> Any:
         client = self._node.create_client(kind, name)
         try:
             service = f"service {client.srv_name}"
-            self._spin_until(client.service_is_ready, f"{service} not available, expected {expected} in this domain")
+            self._spin_until(
+                client.service_is_ready,
+                f"{service} not available, expected {expected} in this domain",
+            )
             future = client.call_async(request)
-            self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
+            self._spin_until(
+                future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s"
+            )
             return future.result()
         finally:
             self._node.destroy_client(client)

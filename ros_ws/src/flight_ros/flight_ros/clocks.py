@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of the nodes of an aircraft on several hosts: offset and delay, measured in both directions.
+"""Clocks of the nodes of an aircraft on several hosts: offset and delay, measured in both
+directions.
 
-A node i publishes once a second, on `clocks`, the least difference D_ij = (clock of i at the reception) - (clock of the sender)
-of the messages of a node j. With the delay d of a message and theta_j, the clock of j less that of i,
+A node i publishes once a second, on `clocks`, the least difference D_ij = (clock of i at the
+reception) - (clock of the sender) of the messages of a node j. With the delay d of a message and
+theta_j, the clock of j less that of i,
 
-    D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2   where d_ij = d_ji.
+    D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2
+        where d_ij = d_ji.
 
-Half of the difference of the two delays is the error. Source: D. L. Mills et al., RFC 5905 (2010), section 8.
+Half of the difference of the two delays is the error. Source: D. L. Mills et al., RFC 5905 (2010),
+section 8.
 
-Nodes of a host share the monotonic clock. So a node also sends the identity of the host, and the lead of the clock of the node
-over the monotonic clock: theta_j is then exact, and a busy host that delays messages shifts no clock.
+Nodes of a host share the monotonic clock. So a node also sends the identity of the host, and the
+lead of the clock of the node over the monotonic clock: theta_j is then exact, and a busy host that
+delays messages shifts no clock.
 """
 
 import time
@@ -33,8 +38,8 @@ WINDOW = 8  # differences of a node, of which the least has the least delay
 PEERS = 100  # nodes at most: names can be forged
 FORGET_NS = 5 * NANOSECONDS  # a node that is silent so long is forgotten
 DIFFERS = 0.005
-"""s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a local network. A larger offset
-is told: it is in every age, and of a clock ahead it delays u."""
+"""s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a
+local network. A larger offset is told: it is in every age, and of a clock ahead it delays u."""
 # Channels of `clocks` beside the names of nodes, which begin with a slash.
 HOST = "host"  # a number of the boot of the host; 0 is unknown
 AHEAD = "ahead"  # clock of the node less the monotonic clock, s
@@ -60,7 +65,9 @@ class ClockOfPeer(NamedTuple):
 
 
 class Peers:
-    """The differences of clocks as a node sees them, and as its peers report them. Times in s and ns."""
+    """The differences of clocks as a node sees them, and as its peers report them. Times in s and
+    ns.
+    """
 
     def __init__(self, own_name: str, host: float = 0.0) -> None:
         self.ahead = 0.0  # of the own clock
@@ -71,14 +78,20 @@ class Peers:
         self._on_host: dict[str, float] = {}  # offsets of the nodes of this host
         self._heard_ns: dict[str, int] = {}
 
-    def receive(self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]) -> None:
+    def receive(
+        self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]
+    ) -> None:
         """Take a message of another node, with the instants on both clocks."""
-        for name in [name for name, heard_ns in self._heard_ns.items() if received_ns - heard_ns > FORGET_NS]:
+        for name in [
+            name for name, heard_ns in self._heard_ns.items() if received_ns - heard_ns > FORGET_NS
+        ]:
             self.forget(name)
         if sender == self._own or (sender not in self._seen and len(self._seen) >= PEERS):
             return
         self._heard_ns[sender] = received_ns
-        self._seen.setdefault(sender, deque(maxlen=WINDOW)).append((received_ns - sent_ns) / NANOSECONDS)
+        self._seen.setdefault(sender, deque(maxlen=WINDOW)).append(
+            (received_ns - sent_ns) / NANOSECONDS
+        )
         if self._own in reported:
             self._reported[sender] = reported[self._own]
             if self._host and reported.get(HOST) == self._host:
@@ -90,8 +103,12 @@ class Peers:
             known.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """The report of a node: the least difference of every peer, and the figures for nodes of this host."""
-        return {HOST: self._host, AHEAD: self.ahead} | {name: min(seen) for name, seen in self._seen.items()}
+        """The report of a node: the least difference of every peer, and the figures for nodes of
+        this host.
+        """
+        return {HOST: self._host, AHEAD: self.ahead} | {
+            name: min(seen) for name, seen in self._seen.items()
+        }
 
     def clocks(self) -> dict[str, ClockOfPeer]:
         """The clocks of the nodes that have reported."""
@@ -100,7 +117,10 @@ class Peers:
             name: ClockOfPeer((reported - seen[name]) / 2.0, (reported + seen[name]) / 2.0)
             for name, reported in self._reported.items()
         }
-        return clocks | {name: ClockOfPeer(offset, seen[name] + offset, RESTART) for name, offset in self._on_host.items()}
+        return clocks | {
+            name: ClockOfPeer(offset, seen[name] + offset, RESTART)
+            for name, offset in self._on_host.items()
+        }
 
 
 class PeerClocks:
@@ -115,7 +135,9 @@ class PeerClocks:
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
-        """Once a second: take the reports, send a report. `ahead_ns`: the system clock less the time of the node."""
+        """Once a second: take the reports, send a report. `ahead_ns`: the system clock less the
+        time of the node.
+        """
         self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
         for received in self._subscription.take():
             try:
@@ -123,7 +145,9 @@ class PeerClocks:
                 sample = self._decoder.decode(received.message)
             except ChannelError:
                 continue
-            self._peers.receive(sample.sender, sample.stamp_ns, received.received_ns - ahead_ns, sample.channels)
+            self._peers.receive(
+                sample.sender, sample.stamp_ns, received.received_ns - ahead_ns, sample.channels
+            )
         differences = self._peers.differences()
         encoder = Encoder([*differences], self._instance)
         self._publish(encoder.encode(time.time_ns() - ahead_ns, np.array([*differences.values()])))
@@ -137,15 +161,24 @@ class PeerClocks:
         return self._peers.clocks()
 
     def told_of(self, sender: str) -> str:
-        """The end of a sentence on a stamp of a node whose clock differs; empty without a known difference."""
+        """The end of a sentence on a stamp of a node whose clock differs; empty without a known
+        difference.
+        """
         clock = self.clocks().get(sender)
-        return bounded(f": the clock of {sender} is {clock}") if clock is not None and abs(clock.offset) > DIFFERS else ""
+        return (
+            bounded(f": the clock of {sender} is {clock}")
+            if clock is not None and abs(clock.offset) > DIFFERS
+            else ""
+        )
 
     def report(self) -> dict[str, object]:
         """For the diagnostics."""
         report: dict[str, object] = {}
         for name, clock in sorted(self.clocks().items()):
-            report |= {f"clock of {name} (s)": f"{clock.offset:+.4f}", f"delay of {name} (s)": f"{clock.delay:.4f}"}
+            report |= {
+                f"clock of {name} (s)": f"{clock.offset:+.4f}",
+                f"delay of {name} (s)": f"{clock.delay:.4f}",
+            }
         return report
 
     def news(self) -> list[str]:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compatibility of the publishers and subscribers of a topic: message type and quality of service (QoS)."""
+"""Compatibility of the publishers and subscribers of a topic: message type and quality of service
+(QoS).
+"""
 
 from collections.abc import Sequence
 
@@ -23,12 +25,16 @@ def type_name(message: type) -> str:
 
 
 def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:
-    """Why a peer exchanges no messages with a local endpoint of this message type and QoS; empty if both match."""
+    """Why a peer exchanges no messages with a local endpoint of this message type and QoS; empty if
+    both match.
+    """
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
     verb = "publishes" if publishes else "subscribes"
     if peer.topic_type != message_type:
-        return f"{node} {verb}{'' if publishes else ' to'} {peer.topic_type}, expected {message_type}"
+        return (
+            f"{node} {verb}{'' if publishes else ' to'} {peer.topic_type}, expected {message_type}"
+        )
     offered, requested = (peer.qos_profile, qos) if publishes else (qos, peer.qos_profile)
     compatibility, reason = qos_check_compatible(offered, requested)
     is_refused = compatibility == QoSCompatibility.ERROR
@@ -43,7 +49,9 @@ class EndpointMonitor:
         self._throttle = Throttle(LOG_PERIOD_NS)
 
     def mismatches(self, subscription: PolledSubscription) -> list[str]:
-        """A sentence for every publisher with a type or QoS unfit for a subscription of the node."""
+        """A sentence for every publisher with a type or QoS unfit for a subscription of the
+        node.
+        """
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
@@ -53,13 +61,19 @@ class EndpointMonitor:
         self._log(subscription.name, self.mismatches(subscription))
 
     def check_subscribers(self, publisher: Publisher) -> None:
-        """Log an error for each subscriber of a topic that does not match a publisher of the node."""
+        """Log an error for each subscriber of a topic that does not match a publisher of the
+        node.
+        """
         topic = publisher.topic_name
-        # The graph reports the QoS of both sides in the same terms. A new publisher is not in it yet.
+        # The graph reports the QoS of both sides in the same terms. A new publisher is not in it
+        # yet.
         for endpoint in self._node.get_publishers_info_by_topic(topic):
             if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)
-                self._log(topic, [mismatch(peer, endpoint.topic_type, endpoint.qos_profile) for peer in peers])
+                self._log(
+                    topic,
+                    [mismatch(peer, endpoint.topic_type, endpoint.qos_profile) for peer in peers],
+                )
                 return
 
     def _log(self, topic: str, sentences: Sequence[str]) -> None:

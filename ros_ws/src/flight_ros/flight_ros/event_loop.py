@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps; services in between, clean shutdown."""
+"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps; services in
+between, clean shutdown.
+"""
 
 import gc
 import sys
@@ -24,18 +26,29 @@ from flight_core.signals import handle_shutdown
 from flight_core.text import bounded
 from flight_ros import transport
 from flight_ros.flight_node import MAX_START_AGE_NS, FlightNode
-from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
+from flight_ros.rclpy_private import (
+    ARGUMENT_ERRORS,
+    Participant,
+    WaitSet,
+    destroy_participant,
+    ready_callback,
+)
 from flight_ros.simulated_time import ClockRestarted
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
-PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
+PEER_TIMEOUT_NS = (
+    30 * NANOSECONDS
+)  # of a lockstep flight that never begins, or that waits after a refused sample
 
-SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep, and of several nodes
+SERVICE_POLL_PERIOD = (
+    0.1  # s, between two checks of liveliness and service calls in lockstep, and of several nodes
+)
 
 LATE_REQUEST_PAUSE = 10
-"""Time without requests after one that delayed a tick, over its duration. The middleware blocks for 0.1 s before a reply whose
-reader does not match (rmw_fastrtps, `wait_for_subscription`), so that a client could take all of the time."""
+"""Time without requests after one that delayed a tick, over its duration. The middleware blocks for
+0.1 s before a reply whose reader does not match (rmw_fastrtps, `wait_for_subscription`), so that a
+client could take all of the time."""
 
 LONGEST_PAUSE_NS = NANOSECONDS
 
@@ -47,7 +60,9 @@ IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service cal
 
 
 class _Stop:
-    """Set by a signal handler. It has no lock: that of an Event deadlocks when a second signal interrupts the first handler."""
+    """Set by a signal handler. It has no lock: that of an Event deadlocks when a second signal
+    interrupts the first handler.
+    """
 
     requested = False
 
@@ -55,14 +70,19 @@ class _Stop:
         self.requested = True
 
 
-def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None) -> None:
-    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP. The exit status is then 0.
+def run(
+    *make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None
+) -> None:
+    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP. The exit status is
+    then 0.
 
-    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an unexpected exception. The
-    `early_participant` of flight_ros.startup is destroyed once the nodes exist.
+    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an
+    unexpected exception. The `early_participant` of flight_ros.startup is destroyed once the nodes
+    exist.
 
-    Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep there are no ticks: a node
-    advances when its input has arrived. The executor serves parameters and services after a tick and never blocks.
+    Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep
+    there are no ticks: a node advances when its input has arrived. The executor serves parameters
+    and services after a tick and never blocks.
     """
     stop = _Stop()
     handle_shutdown(stop.request)
@@ -75,7 +95,9 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         rclpy.try_shutdown()
 
 
-def _make_nodes(makes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None) -> list[FlightNode[Any]]:
+def _make_nodes(
+    makes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None
+) -> list[FlightNode[Any]]:
     try:
         transport.prepare()
         if not rclpy.ok():
@@ -84,18 +106,27 @@ def _make_nodes(makes: Sequence[Callable[[], FlightNode[Any]]], early_participan
         if early_participant is not None:
             destroy_participant(early_participant)
     except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
-        is_stack_error = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
-        print(f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr)
+        is_stack_error = isinstance(
+            error, ParameterError | FlightEnded
+        )  # one sentence; those of rclpy have several lines
+        print(
+            f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr
+        )
         sys.exit(STATUS_ENDED_EARLY if isinstance(error, FlightEnded) else STATUS_BAD_INPUT)
     return nodes
 
 
 def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
-    """Whether the nodes ended for good; otherwise nodes with the same parameters are to begin again."""
+    """Whether the nodes ended for good; otherwise nodes with the same parameters are to begin
+    again.
+    """
     node = nodes[0]
     try:
         if sockets := transport.open_to_network():
-            node.get_logger().error(f"the loopback profile has no effect: sockets open to the network: {', '.join(sockets)}")
+            node.get_logger().error(
+                "the loopback profile has no effect: sockets open to the network: "
+                f"{', '.join(sockets)}"
+            )
         if node.runs_in_lockstep():
             _run_lockstep(nodes, stop)
         else:
@@ -127,7 +158,9 @@ def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: in
             return
         try:
             execute()
-        except Exception as error:  # rclpy cannot serve the request, e.g. an invalid lifecycle transition
+        except (
+            Exception
+        ) as error:  # rclpy cannot serve the request, e.g. an invalid lifecycle transition
             node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
         if time.monotonic_ns() >= until_ns:
             return
@@ -175,9 +208,11 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 
 
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
-    """Raise FlightEnded where a lockstep flight waits for ever: for a sample that was refused, or for its first one.
+    """Raise FlightEnded where a lockstep flight waits for ever: for a sample that was refused, or
+    for its first one.
 
-    `advance_ns`: when it last advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
+    `advance_ns`: when it last advanced. A flight that began waits for a peer that is stopped, for
+    instance in a debugger.
     """
     for node in nodes:
         awaited = node.awaited_topic()
@@ -186,7 +221,9 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool
             raise FlightEnded(f"timed out waiting for {awaited}: a sample was refused: {sentence}")
     if not began:
         awaited = nodes[0].awaited_topic()
-        raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
+        raise FlightEnded(
+            f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s"
+        )
 
 
 class RealTime:
@@ -196,7 +233,9 @@ class RealTime:
         host = node.host
         if (age := host.time_ns() - start_ns) > MAX_START_AGE_NS:
             key = f"{node.get_name()}.start_time"
-            raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
+            raise ParameterError(
+                f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0"
+            )
         begin_ns = host.monotonic_ns() + start_ns - host.time_ns()
         node.time_offset_ns = start_ns - begin_ns
         self.node = node
@@ -216,7 +255,9 @@ class RealTime:
         return True
 
     def report(self) -> None:
-        """Do the next reports. After each tick some of them: all of them together may exceed a period of 2 ms."""
+        """Do the next reports. After each tick some of them: all of them together may exceed a
+        period of 2 ms.
+        """
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + NANOSECONDS
@@ -231,7 +272,9 @@ class RealTime:
             self._reports.popleft()()
 
 
-def _start_instants(nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop) -> list[int]:
+def _start_instants(
+    nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
+) -> list[int]:
     """The start of each node, ns of the system clock, once all are known; none after a signal."""
     known: dict[FlightNode[Any], int] = {}
     awaiting = [node for node in nodes if node.waits_for_start()]
@@ -252,10 +295,15 @@ def _start_instants(nodes: Sequence[FlightNode[Any]], executor: SingleThreadedEx
 
 
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    """Run nodes in one thread, a tick at a time: of several that are due the first node's, by the order of the nodes."""
+    """Run nodes in one thread, a tick at a time: of several that are due the first node's, by the
+    order of the nodes.
+    """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)
-    running = [RealTime(node, start_ns, spin=len(nodes) == 1) for node, start_ns in zip(nodes, starts, strict=False)]
+    running = [
+        RealTime(node, start_ns, spin=len(nodes) == 1)
+        for node, start_ns in zip(nodes, starts, strict=False)
+    ]
     serve_ns = time.monotonic_ns()
     period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()

@@ -48,20 +48,28 @@ S = TypeVar("S", bound=Sample)
 
 NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one after another
 
-ACKNOWLEDGE_TIMEOUT = Duration(seconds=0.5)  # at the end of a lockstep flight, for the last messages to arrive
+ACKNOWLEDGE_TIMEOUT = Duration(
+    seconds=0.5
+)  # at the end of a lockstep flight, for the last messages to arrive
 
 WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without samples
 
-MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
+MAX_START_AGE_NS = (
+    10 * NANOSECONDS
+)  # a late node catches up with its missed ticks, but not with hours
 
 SIM_TIME = "use_sim_time"
 AT_START = "no change: a node chooses its clock when it starts"
 
-CLOCK_STEP_NS = NANOSECONDS // 20  # slewing moves a clock by less than 0.01 s in the second between two checks
+CLOCK_STEP_NS = (
+    NANOSECONDS // 20
+)  # slewing moves a clock by less than 0.01 s in the second between two checks
 
 
 class FlightNode(Node, Generic[P]):
-    """A node that runs at fixed ticks or in lockstep. A subclass defines its rate and the work of one tick or step."""
+    """A node that runs at fixed ticks or in lockstep. A subclass defines its rate and the work of
+    one tick or step.
+    """
 
     def __init__(self, name: str, schema: type[P]) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
@@ -75,16 +83,28 @@ class FlightNode(Node, Generic[P]):
         simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
         self.simulated = SimulatedTime(self) if simulated else None
         self.host: HostTime = self.simulated or time  # the time of the ticks
-        self.clocks = None if simulated or self.parameters.lockstep else PeerClocks(self, self.instance)
+        self.clocks = (
+            None if simulated or self.parameters.lockstep else PeerClocks(self, self.instance)
+        )
         self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
-        self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
-        self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS))
-        self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, offered(NODE_STATE))
-        is_start_awaited = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
-        self._start_subscription = PolledSubscription(self, START, offered(START), raw=True) if is_start_awaited else None
+        self._waiting: dict[
+            str, tuple[int, int]
+        ] = {}  # by topic: last call, and when to log it next
+        self._diagnostics = self.create_publisher(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS)
+        )
+        self._node_state = self.create_publisher(
+            NODE_STATE.type, NODE_STATE.name, offered(NODE_STATE)
+        )
+        is_start_awaited = (
+            getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
+        )
+        self._start_subscription = (
+            PolledSubscription(self, START, offered(START), raw=True) if is_start_awaited else None
+        )
         self._matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()
@@ -110,9 +130,11 @@ class FlightNode(Node, Generic[P]):
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
-        """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic `start`, None before its message.
+        """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic
+        `start`, None before its message.
 
-        Where that is 0 the next whole period of the system clock, so that nodes of equal rates tick together.
+        Where that is 0 the next whole period of the system clock, so that nodes of equal rates tick
+        together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
         if start_time < 0.0:
@@ -124,11 +146,15 @@ class FlightNode(Node, Generic[P]):
         raise NotImplementedError
 
     def advance(self) -> bool:
-        """Lockstep: take every step that the received messages allow. Returns whether there was one."""
+        """Lockstep: take every step that the received messages allow. Returns whether there was
+        one.
+        """
         raise NotImplementedError
 
     def awaited_topic(self) -> str:
-        """Lockstep: the topic whose next message this node waits for; empty if it waits for none."""
+        """Lockstep: the topic whose next message this node waits for; empty if it waits for
+        none.
+        """
         return ""
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
@@ -139,7 +165,9 @@ class FlightNode(Node, Generic[P]):
         """Called once when the node ends, also after an error."""
 
     def on_parameters(self, parameters: P) -> None:
-        """Called with a valid new set in flight, before it becomes `self.parameters`. A ParameterError refuses it."""
+        """Called with a valid new set in flight, before it becomes `self.parameters`. A
+        ParameterError refuses it.
+        """
 
     # Used by a subclass
 
@@ -150,14 +178,18 @@ class FlightNode(Node, Generic[P]):
         return now_ns - now_ns % period_ns + period_ns
 
     def advertise(self, topic: Topic) -> Callable[[bytes], None]:
-        """Create a publisher of serialised messages on a topic of the flight. Returns the function that publishes one."""
+        """Create a publisher of serialised messages on a topic of the flight. Returns the function
+        that publishes one.
+        """
         qos = LOCKSTEP if self.parameters.lockstep else publisher_qos(self.period_ns())
         publisher = self.create_publisher(topic.type, topic.name, qos)
         self._flight_publishers.append(publisher)
         return publisher.publish
 
     def subscribe(self, topic: Topic, qos: QoSProfile | None = None) -> PolledSubscription:
-        """Create a subscription that is polled at the tick, as bytes. Its publishers are checked once a second."""
+        """Create a subscription that is polled at the tick, as bytes. Its publishers are checked
+        once a second.
+        """
         default = LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES
         subscription = PolledSubscription(self, topic, qos or default, raw=True)
         self.polled_subscriptions.append(subscription)
@@ -174,9 +206,19 @@ class FlightNode(Node, Generic[P]):
         qos: QoSProfile | None = None,
         max_size: int | None = None,
     ) -> Receiver[S]:
-        """Create a subscription with its `Receiver`. Overruns of this node are no silence of the publisher."""
+        """Create a subscription with its `Receiver`. Overruns of this node are no silence of the
+        publisher.
+        """
         subscription = self.subscribe(topic, qos)
-        receiver = Receiver(subscription, self.refusals, decode, take, lock=lock, max_age_ns=max_age_ns, max_size=max_size)
+        receiver = Receiver(
+            subscription,
+            self.refusals,
+            decode,
+            take,
+            lock=lock,
+            max_age_ns=max_age_ns,
+            max_size=max_size,
+        )
         self.receivers.append(receiver)
         return receiver
 
@@ -185,19 +227,29 @@ class FlightNode(Node, Generic[P]):
         return Encoder(names, self.instance)
 
     def now_ns(self) -> int:
-        """The time of the ticks, ns: the system clock at the start plus the monotonic time since then."""
+        """The time of the ticks, ns: the system clock at the start plus the monotonic time since
+        then.
+        """
         return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
-        """How far the system clock is ahead of the time of the ticks; 0 for less than CLOCK_STEP_NS, which is no step."""
+        """How far the system clock is ahead of the time of the ticks; 0 for less than
+        CLOCK_STEP_NS, which is no step.
+        """
         step_ns = self.host.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
-        """Replace the parameters by a valid set that this node chose itself: one parameter event, without another check."""
-        before, after = (dict(flatten(values.model_dump())) for values in (self.parameters, parameters))
+        """Replace the parameters by a valid set that this node chose itself: one parameter event,
+        without another check.
+        """
+        before, after = (
+            dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
+        )
         changes = [
-            Parameter(name, value=list(value) if isinstance(value := after.get(name), tuple) else value)
+            Parameter(
+                name, value=list(value) if isinstance(value := after.get(name), tuple) else value
+            )
             for name in before | after
             if before.get(name) != after.get(name)
         ]
@@ -212,8 +264,11 @@ class FlightNode(Node, Generic[P]):
         """The end of a sentence on the stamp of a node whose clock differs; else empty."""
         return "" if self.clocks is None else self.clocks.told_of(sender)
 
-    def warn_no_publisher(self, subscription: PolledSubscription, lack: str = "no publisher") -> None:
-        """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s.
+    def warn_no_publisher(
+        self, subscription: PolledSubscription, lack: str = "no publisher"
+    ) -> None:
+        """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2
+        s.
 
         `lack` is the cause where the topic has no publisher.
         """
@@ -221,18 +276,26 @@ class FlightNode(Node, Generic[P]):
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
         if now_ns - last_ns > NANOSECONDS:  # the first call after a sample
             log_ns = now_ns + NO_PUBLISHER_WARNING_NS
-        self._waiting[subscription.name] = now_ns, log_ns if now_ns < log_ns else now_ns + WAITING_PERIOD_NS
+        self._waiting[subscription.name] = (
+            now_ns,
+            log_ns if now_ns < log_ns else now_ns + WAITING_PERIOD_NS,
+        )
         if now_ns < log_ns:
             return
         cause = lack
         if self.count_publishers(subscription.name):
-            cause = "; ".join(self.endpoints.mismatches(subscription)) or "no sample of its publisher arrives"
+            cause = (
+                "; ".join(self.endpoints.mismatches(subscription))
+                or "no sample of its publisher arrives"
+            )
         if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
             cause = refused
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        """Accept a change of tunable parameters as a whole, or reject it with a sentence and change nothing."""
+        """Accept a change of tunable parameters as a whole, or reject it with a sentence and change
+        nothing.
+        """
         if self._adopted is not None:
             self.parameters = self._adopted
             self._adopted = None
@@ -258,12 +321,24 @@ class FlightNode(Node, Generic[P]):
         """The instant on the topic `start`, ns. One long ago belongs to another flight."""
         messages = () if self._start_subscription is None else self._start_subscription.take()
         instants = (stamp_of(received.message) for received in messages)
-        return next((stamp_ns for stamp_ns in instants if stamp_ns > self.host.time_ns() - MAX_START_AGE_NS), None)
+        return next(
+            (
+                stamp_ns
+                for stamp_ns in instants
+                if stamp_ns > self.host.time_ns() - MAX_START_AGE_NS
+            ),
+            None,
+        )
 
     def match(self) -> None:
         """Real time: publish once that each input has a publisher."""
-        awaited = [*self.inputs(), *([self._start_subscription] if self._start_subscription is not None else [])]
-        if not self._matched and all(subscription.entity.get_publisher_count() for subscription in awaited):
+        awaited = [
+            *self.inputs(),
+            *([self._start_subscription] if self._start_subscription is not None else []),
+        ]
+        if not self._matched and all(
+            subscription.entity.get_publisher_count() for subscription in awaited
+        ):
             self._matched = True
             self.publish_state(NodeState.MATCHED)
 
@@ -277,16 +352,27 @@ class FlightNode(Node, Generic[P]):
         self._tick_times.end()
 
     def check_clock(self) -> None:
-        """Log an error after a step of the system clock. This node keeps its time; a node that starts now has another time."""
+        """Log an error after a step of the system clock. This node keeps its time; a node that
+        starts now has another time.
+        """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
             restored = abs(step_ns) <= CLOCK_STEP_NS
-            advice = "it is correct again" if restored else "this node keeps its own time; restart all nodes or none"
-            self.get_logger().error(f"the system clock was set by {seconds(step_ns - self._clock_step_ns):+.3f} s: {advice}")
+            advice = (
+                "it is correct again"
+                if restored
+                else "this node keeps its own time; restart all nodes or none"
+            )
+            self.get_logger().error(
+                f"the system clock was set by {seconds(step_ns - self._clock_step_ns):+.3f} s: "
+                f"{advice}"
+            )
             self._clock_step_ns = step_ns
 
     def compare_clocks(self) -> None:
-        """Exchange the clocks of the nodes. Log a warning for each that begins to differ from this one, and once it agrees."""
+        """Exchange the clocks of the nodes. Log a warning for each that begins to differ from this
+        one, and once it agrees.
+        """
         if self.clocks is not None:
             self.clocks.exchange(time.time_ns() - self.now_ns())
             for sentence in self.clocks.news():
@@ -298,13 +384,21 @@ class FlightNode(Node, Generic[P]):
             self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Checks of the graph, a topic each: to ask the middleware for all topics takes about a period of 2 ms.
+        """Checks of the graph, a topic each: to ask the middleware for all topics takes about a
+        period of 2 ms.
 
-        They log an error for each peer with another message type or incompatible QoS: its topic would stay silent.
+        They log an error for each peer with another message type or incompatible QoS: its topic
+        would stay silent.
         """
         return [
-            *(partial(self.endpoints.check_subscribers, publisher) for publisher in self._flight_publishers),
-            *(partial(self.endpoints.check_publishers, subscription) for subscription in self.polled_subscriptions),
+            *(
+                partial(self.endpoints.check_subscribers, publisher)
+                for publisher in self._flight_publishers
+            ),
+            *(
+                partial(self.endpoints.check_publishers, subscription)
+                for subscription in self.polled_subscriptions
+            ),
         ]
 
     def runs_in_lockstep(self) -> bool:
@@ -312,7 +406,8 @@ class FlightNode(Node, Generic[P]):
         return self.parameters.lockstep
 
     def require_flight(self) -> None:
-        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to the other peers.
+        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to
+        the other peers.
 
         In simulated time raise ClockRestarted after a jump of /clock.
         """
@@ -332,12 +427,17 @@ class FlightNode(Node, Generic[P]):
     def publish_state(self, state: NodeState) -> None:
         """Publish the state of this node on `node_state`.
 
-        The key contains the process number, also in lockstep, so that a subscriber can distinguish the nodes of two flights.
+        The key contains the process number, also in lockstep, so that a subscriber can distinguish
+        the nodes of two flights.
         """
-        self._node_state.publish(KeyValue(key=f"{self.get_fully_qualified_name()}#{os.getpid()}", value=state))
+        self._node_state.publish(
+            KeyValue(key=f"{self.get_fully_qualified_name()}#{os.getpid()}", value=state)
+        )
 
     def publish_diagnostics(self) -> None:
-        """Publish the 1 Hz report: loop period, compute time, missed ticks (overruns), rejected samples and more."""
+        """Publish the 1 Hz report: loop period, compute time, missed ticks (overruns), rejected
+        samples and more.
+        """
         level, sentence, further = self.status()
         if conflict := self.refusals.conflict():
             level = DiagnosticStatus.ERROR
@@ -353,7 +453,8 @@ class FlightNode(Node, Generic[P]):
                 level=level,
                 name=self.get_fully_qualified_name(),
                 message=sentence,
-                hardware_id=self.get_fully_qualified_name(),  # stable: an aggregator sees one device after a restart
+                # stable: an aggregator sees one device after a restart
+                hardware_id=self.get_fully_qualified_name(),
                 values=[KeyValue(key=key, value=str(value)) for key, value in report.items()],
             )
         ]

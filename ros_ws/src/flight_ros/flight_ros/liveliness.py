@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Liveliness monitor of a lockstep flight: detects the loss of a peer by DDS liveliness, a watchdog inside the middleware."""
+"""Liveliness monitor of a lockstep flight: detects the loss of a peer by DDS liveliness, a watchdog
+inside the middleware.
+"""
 
 import time
 from functools import partial
@@ -15,10 +17,12 @@ from flight_ros.rclpy_private import take_messages
 from flight_ros.topics import LIVELINESS, NODES
 
 SHUTDOWN_GRACE_NS = 600_000_000
-"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another cause sends no report."""
+"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another
+cause sends no report."""
 
 REPORT_TIMEOUT = Duration(seconds=0.2)
-"""Longest wait until all peers have a report, after which the node ends. The lost peer never acknowledges it."""
+"""Longest wait until all peers have a report, after which the node ends. The lost peer never
+acknowledges it."""
 
 ROLES = NODES[:-1]  # a bridge flies in real time alone
 
@@ -26,9 +30,10 @@ ROLES = NODES[:-1]  # a bridge flies in real time alone
 class LivelinessMonitor:
     """Asserts the liveliness of a node on `alive/<role>` and monitors that of the other roles.
 
-    The middleware sends the heartbeats. It reports the end of a process within the lease duration of `LIVELINESS`, or within
-    that of the participant, two seconds, if the process ended before its first heartbeat. A role that never appeared is not
-    lost: a flight can run without a recorder. The only message of a role is its report: the name of the role that it lost.
+    The middleware sends the heartbeats. It reports the end of a process within the lease duration
+    of `LIVELINESS`, or within that of the participant, two seconds, if the process ended before its
+    first heartbeat. A role that never appeared is not lost: a flight can run without a recorder.
+    The only message of a role is its report: the name of the role that it lost.
     """
 
     def __init__(self, node: Node, role: str) -> None:
@@ -44,7 +49,8 @@ class LivelinessMonitor:
                 self._on_report,
                 LIVELINESS,
                 event_callbacks=SubscriptionEventCallbacks(
-                    liveliness=partial(self._on_liveliness, peer), matched=partial(self._on_matched, peer)
+                    liveliness=partial(self._on_liveliness, peer),
+                    matched=partial(self._on_matched, peer),
                 ),
             )
             for peer in ROLES
@@ -54,9 +60,12 @@ class LivelinessMonitor:
     def lost(self) -> str:
         """The role that was lost; empty if none was.
 
-        A role that shut down cleanly is lost after SHUTDOWN_GRACE_NS, unless a report names the role that ended first.
+        A role that shut down cleanly is lost after SHUTDOWN_GRACE_NS, unless a report names the
+        role that ended first.
         """
-        for subscription in self._subscriptions:  # the executor may serve a report later than the end of its publisher
+        for subscription in (
+            self._subscriptions
+        ):  # the executor may serve a report later than the end of its publisher
             for message, _ in take_messages(subscription, 1):
                 self._on_report(message)
         if self._dead or not self._left or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:

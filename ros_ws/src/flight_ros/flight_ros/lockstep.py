@@ -10,7 +10,9 @@ from flight_core.vectors import StampedVector
 
 
 class Instant(NamedTuple):
-    """An instant of y. `others`: the samples of the second signal up to it that were not in an earlier one."""
+    """An instant of y. `others`: the samples of the second signal up to it that were not in an
+    earlier one.
+    """
 
     now_ns: int
     due: bool  # whether the node steps at this instant
@@ -19,7 +21,9 @@ class Instant(NamedTuple):
 
 
 class LockstepInputs:
-    """y and a second signal, brought together. A step waits for the y of its instant and the second signal up to it."""
+    """y and a second signal, brought together. A step waits for the y of its instant and the second
+    signal up to it.
+    """
 
     def __init__(
         self,
@@ -47,7 +51,11 @@ class LockstepInputs:
         while self._y_due:
             now_ns = self._number * self._y_period_ns
             due = now_ns % self._period_ns == 0
-            if due and not (self._others_due and self._others_due[-1].stamp_ns >= now_ns and self._is_ready(now_ns)):
+            if due and not (
+                self._others_due
+                and self._others_due[-1].stamp_ns >= now_ns
+                and self._is_ready(now_ns)
+            ):
                 return
             self._number += 1
             others = []

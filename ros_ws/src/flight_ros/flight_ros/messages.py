@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as messages: sensor_msgs/JointState with name = channels, position = values, stamp = the sample's instant.
+"""Named vectors as messages: sensor_msgs/JointState with name = channels, position = values, stamp
+= the sample's instant.
 
-The channels are constant during a flight. So the bytes of a message are laid out once, and each sample changes only its stamp
-and its values. This is several times faster than the serialisation of the middleware. It is also repeatable to the byte: the
-middleware leaves uninitialised memory between two strings.
+The channels are constant during a flight. So the bytes of a message are laid out once, and each
+sample changes only its stamp and its values. This is several times faster than the serialisation of
+the middleware. It is also repeatable to the byte: the middleware leaves uninitialised memory
+between two strings.
 """
 
 import math
@@ -22,20 +24,27 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
-ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
-BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType({b"\x00\x00": "big", b"\x00\x01": "little"})
+ENCAPSULATION = (
+    b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
+)
+BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
+    {b"\x00\x00": "big", b"\x00\x01": "little"}
+)
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
 LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 MAX_SIZE = 16_384
-"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest of a flight, has 1,844."""
+"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest
+of a flight, has 1,844."""
 
 NO_CHANNELS: FloatArray = np.zeros(0)
 
 
-def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str) -> JointState:
+def to_message(
+    stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str
+) -> JointState:
     """A named vector as a message. `frame_id` carries the publisher's instance."""
     message = JointState()
     message.header.stamp = Time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
@@ -46,7 +55,9 @@ def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id
 
 
 def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
-    """The wanted channels of a message. Raises ChannelError for invalid names, lengths or values."""
+    """The wanted channels of a message. Raises ChannelError for invalid names, lengths or
+    values.
+    """
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
     return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, message.header.frame_id)
@@ -55,9 +66,9 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
 class Encoder:
     """Encodes the samples of one publisher as the bytes of a message.
 
-    Without names the message is a vector without channels: in lockstep, no sample exists at that instant. Layout: CDR (OMG
-    Common Object Request Broker Architecture, 9.3). The offset of each value from the encapsulation is a multiple of its size;
-    padding bytes are 0.
+    Without names the message is a vector without channels: in lockstep, no sample exists at that
+    instant. Layout: CDR (OMG Common Object Request Broker Architecture, 9.3). The offset of each
+    value from the encapsulation is a multiple of its size; padding bytes are 0.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str) -> None:
@@ -71,7 +82,9 @@ class Encoder:
             self._align(8)
         self.place = len(self._bytes)  # offset of the values
         self._values = slice(self.place, self.place + 8 * len(names))
-        self._bytes += bytes(8 * len(names) + 2 * COUNT.size)  # an empty velocity and an empty effort follow
+        self._bytes += bytes(
+            8 * len(names) + 2 * COUNT.size
+        )  # an empty velocity and an empty effort follow
 
     def _align(self, size: int) -> None:
         self._bytes += bytes(-(len(self._bytes) - len(ENCAPSULATION)) % size)
@@ -104,7 +117,9 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """The sample; None for a vector without channels. Raises ChannelError for an invalid message."""
+        """The sample; None for a vector without channels. Raises ChannelError for an invalid
+        message.
+        """
         if not self._fixed or self._fixed_part(raw) != self._fixed:
             message = _message(raw)
             if not message.name and not message.position:
@@ -114,8 +129,12 @@ class Decoder:
             return sample
         seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
         value = np.frombuffer(raw, "<f8", len(self._names), self._place)[self._order]
-        if not math.isfinite(value.sum()) and not np.isfinite(value).all():  # the sum of finite values can overflow
-            raise ChannelError("finite", f"{', '.join(self._wanted)} = {value.tolist()} is not finite")
+        if (
+            not math.isfinite(value.sum()) and not np.isfinite(value).all()
+        ):  # the sum of finite values can overflow
+            raise ChannelError(
+                "finite", f"{', '.join(self._wanted)} = {value.tolist()} is not finite"
+            )
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
     def _fixed_part(self, raw: bytes) -> bytes:
@@ -125,7 +144,10 @@ class Decoder:
     def _learn_layout(self, message: JointState, raw: bytes) -> None:
         encoder = Encoder(message.name, message.header.frame_id)
         stamp = message.header.stamp
-        if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
+        if (
+            encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position))
+            != raw
+        ):
             return  # more than a named vector: the middleware decodes it each time
         self._names = list(message.name)
         self._place = encoder.place
@@ -143,7 +165,9 @@ class NamedSample(NamedTuple):
 
 
 class NamedDecoder:
-    """Decodes all channels of the messages of a topic whose channels vary; several times slower than Decoder."""
+    """Decodes all channels of the messages of a topic whose channels vary; several times slower
+    than Decoder.
+    """
 
     def decode(self, raw: bytes) -> NamedSample:
         """The sample. Raises ChannelError for an invalid message."""
@@ -152,7 +176,9 @@ class NamedDecoder:
         names = list(message.name)
         if len(set(names)) < len(names):
             raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
-        return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
+        return NamedSample(
+            sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender
+        )
 
 
 def sender_of(raw: bytes) -> str | None:

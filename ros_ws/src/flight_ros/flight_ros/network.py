@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Profile of the middleware for nodes on several hosts: unicast over UDP between the addresses of the hosts alone."""
+"""Profile of the middleware for nodes on several hosts: unicast over UDP between the addresses of
+the hosts alone.
+"""
 
 import ipaddress
 import re
@@ -11,8 +13,8 @@ from flight_ros.transport import LOOPBACK_PROFILE
 
 PEER_RANGE = 20  # participants of each host that are found
 ANNOUNCEMENT_NS = 500_000_000
-"""A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the loopback profile five nodes
-would send 1000 packets a second to each host."""
+"""A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the
+loopback profile five nodes would send 1000 packets a second to each host."""
 FIRST_PORT = 7400  # DDSI-RTPS 2.3
 PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
@@ -24,17 +26,24 @@ def addresses(text: str) -> tuple[str, ...]:
         try:
             host = ipaddress.IPv4Address(address)
         except ValueError:
-            raise ParameterError(f"--peers: found {address!r}, expected IPv4 addresses, as in 10.0.0.1,10.0.0.2") from None
+            raise ParameterError(
+                f"--peers: found {address!r}, expected IPv4 addresses, as in 10.0.0.1,10.0.0.2"
+            ) from None
         usable = not (host.is_unspecified or host.is_multicast or host.is_loopback)
         require(usable, "--peers", repr(address), "the address of a host on the network")
     require(
-        len(set(hosts)) == len(hosts) >= 2, "--peers", repr(text), "two or more addresses, each once, this host's among them"
+        len(set(hosts)) == len(hosts) >= 2,
+        "--peers",
+        repr(text),
+        "two or more addresses, each once, this host's among them",
     )
     return hosts
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """The address of this host among the peers, by the addresses of its interfaces. Raises ParameterError."""
+    """The address of this host among the peers, by the addresses of its interfaces. Raises
+    ParameterError.
+    """
     matches = [address for address in peers if address in local]
     named = ", ".join(sorted(local)) or "none"
     require(
@@ -47,17 +56,30 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 
 
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
-    """The loopback profile with the address of this host in place of 127.0.0.1, and the hosts as initial peers."""
+    """The loopback profile with the address of this host in place of 127.0.0.1, and the hosts as
+    initial peers.
+    """
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
-    locators = "".join(f"<locator><udpv4><address>{address}</address></udpv4></locator>" for address in peers)
+    locators = "".join(
+        f"<locator><udpv4><address>{address}</address></udpv4></locator>" for address in peers
+    )
     hosts = ", ".join(peers)
-    about = f"<!-- Fast DDS over UDP, unicast alone, bound to {own_host}, for hosts {hosts}; written by rise-di network. -->"
+    about = (
+        f"<!-- Fast DDS over UDP, unicast alone, bound to {own_host}, for hosts {hosts}; "
+        "written by rise-di network. -->"
+    )
     for pattern, value in (
         (r"<!--.*?-->", about),
         (r"(?s)(?<=<initialPeersList>).*?(?=</initialPeersList>)", locators),
-        (r"(?s)(?<=<interfaceWhiteList>).*?(?=</interfaceWhiteList>)", f"<address>{own_host}</address>"),
+        (
+            r"(?s)(?<=<interfaceWhiteList>).*?(?=</interfaceWhiteList>)",
+            f"<address>{own_host}</address>",
+        ),
         (r"(?<=<maxInitialPeersRange>)\d+", str(PEER_RANGE)),
-        (r"(?s)(?<=<leaseAnnouncement>)(\s*<sec>0</sec>\s*<nanosec>)\d+", rf"\g<1>{ANNOUNCEMENT_NS}"),
+        (
+            r"(?s)(?<=<leaseAnnouncement>)(\s*<sec>0</sec>\s*<nanosec>)\d+",
+            rf"\g<1>{ANNOUNCEMENT_NS}",
+        ),
         ("udp_loopback", "udp_network"),
         ('profile_name="loopback"', 'profile_name="network"'),
     ):

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters of a node as a validated set. The overrides are validated as a whole; then each parameter is declared."""
+"""ROS parameters of a node as a validated set. The overrides are validated as a whole; then each
+parameter is declared.
+"""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,9 +22,11 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrid
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
-    """Validate the overrides of a node created with automatically_declare_parameters_from_overrides. Raises ParameterError.
+    """Validate the overrides of a node created with
+    automatically_declare_parameters_from_overrides. Raises ParameterError.
 
-    Then every parameter of the set is declared with its description, read-only unless it is tunable.
+    Then every parameter of the set is declared with its description, read-only unless it is
+    tunable.
     """
     _require_no_octal(sys.argv)
     overrides = nest(_overrides(node))
@@ -32,22 +36,33 @@ def read_parameters(node: Node, schema: type[P]) -> P:
         if overrides:
             raise
         expected = f"a section for {node.get_fully_qualified_name()} in a file of --params-file"
-        raise ParameterError(f"{node.get_name()}: found no parameters, expected {expected}: {error}") from None
+        raise ParameterError(
+            f"{node.get_name()}: found no parameters, expected {expected}: {error}"
+        ) from None
     tunable = parameters.tunable()
-    descriptions = {name: field.description or "" for name, field in type(parameters).model_fields.items()}
+    descriptions = {
+        name: field.description or "" for name, field in type(parameters).model_fields.items()
+    }
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
         read_only = group not in tunable and name not in tunable
         # dynamic_typing: the set validates the types and accepts an integer as a float
-        descriptor = ParameterDescriptor(description=descriptions.get(group, ""), read_only=read_only, dynamic_typing=True)
+        descriptor = ParameterDescriptor(
+            description=descriptions.get(group, ""), read_only=read_only, dynamic_typing=True
+        )
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     for name in sorted(tunable):
-        # an optional parameter without an override, which may be set in flight; a group that has parameters is none itself
+        # an optional parameter without an override, which may be set in flight; a group that has
+        # parameters is none itself
         if not node.has_parameter(name) and not node.get_parameters_by_prefix(name):
-            node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
+            node.declare_parameter(
+                name,
+                None,
+                ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True),
+            )
     return parameters
 
 
@@ -62,7 +77,11 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
     """The set with some parameters changed, validated as a whole. Raises ParameterError."""
-    values = {change.name: _as_list(change.value) for change in changes if change.name.split(".")[0] not in ROS_PARAMETERS}
+    values = {
+        change.name: _as_list(change.value)
+        for change in changes
+        if change.name.split(".")[0] not in ROS_PARAMETERS
+    }
     return type(parameters).validate_mapping(nest(_overrides(node) | values), node.get_name())
 
 
@@ -76,4 +95,8 @@ def _overrides(node: Node) -> dict[str, Any]:
 
 def _as_list(value: Any) -> Any:
     """A sequence as a list; any other value unchanged."""
-    return value if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__") else list(value)
+    return (
+        value
+        if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__")
+        else list(value)
+    )

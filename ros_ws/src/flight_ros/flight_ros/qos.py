@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's form of offered profiles."""
+"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's form
+of offered profiles.
+"""
 
 from collections.abc import Sequence
 
@@ -16,7 +18,9 @@ INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
 def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
     """The strongest profile that is compatible with all offered ones."""
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
-    durable = reliable and all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
+    durable = reliable and all(
+        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered
+    )
     return QoSProfile(
         depth=RECORD.depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -43,5 +47,7 @@ def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
 
 
 def _duration(duration: Duration) -> dict[str, int]:
-    sec, nsec = divmod(duration.nanoseconds or INFINITE_NS, NANOSECONDS)  # 0 stands for an unset duration
+    sec, nsec = divmod(
+        duration.nanoseconds or INFINITE_NS, NANOSECONDS
+    )  # 0 stands for an unset duration
     return {"sec": sec, "nsec": nsec}

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""All private names of rclpy 7.1 that the stack uses; tests/ros/flight_ros/test_rclpy_private.py checks them."""
+"""All private names of rclpy 7.1 that the stack uses; tests/ros/flight_ros/test_rclpy_private.py
+checks them.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -17,14 +19,23 @@ from flight_core.text import bounded
 
 Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
 
-DeserializationError = _rclpy.RMWError  # the exception of `deserialize_message` for bytes that are not a message of the type
+DeserializationError = (
+    _rclpy.RMWError
+)  # the exception of `deserialize_message` for bytes that are not a message of the type
 
-ARGUMENT_ERRORS = (ParameterException, _rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
+ARGUMENT_ERRORS = (
+    ParameterException,
+    _rclpy.RCLError,
+    _rclpy.RCLInvalidROSArgsError,
+    _rclpy.UnknownROSArgsError,
+)
 """The exceptions of rclpy for invalid arguments and parameter files."""
 
 
 def create_participant(name: str, context: Context) -> Participant:
-    """Create a node without topics, parameters or services, so that its process has a DDS participant."""
+    """Create a node without topics, parameters or services, so that its process has a DDS
+    participant.
+    """
     with context.handle:
         return _rclpy.Node(name, "", context.handle, None, False, False)
 
@@ -35,7 +46,9 @@ def destroy_participant(participant: Participant) -> None:
 
 
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
-    """At most `limit` messages (or their bytes) with their metadata, oldest first, without an executor."""
+    """At most `limit` messages (or their bytes) with their metadata, oldest first, without an
+    executor.
+    """
     handle = subscription.handle
     kind = subscription.msg_type
     raw = subscription.raw
@@ -56,7 +69,9 @@ class WaitSet:
         self._wait_set = _rclpy.WaitSet(len(self._handles), 0, 0, 0, 0, 0, context.handle)
 
     def wait(self, timeout_ns: int) -> bool:
-        """Wait for a message on one of them or for the timeout. Returns whether there is a message."""
+        """Wait for a message on one of them or for the timeout. Returns whether there is a
+        message.
+        """
         wait_set = self._wait_set
         wait_set.clear_entities()
         for handle in self._handles:
@@ -66,7 +81,9 @@ class WaitSet:
 
 
 def answer_invalid_transitions(node: Node) -> None:
-    """Let a lifecycle node answer a request for an invalid transition with success false. rclpy raises, and sends no answer."""
+    """Let a lifecycle node answer a request for an invalid transition with success false. rclpy
+    raises, and sends no answer.
+    """
     service = node._service_change_state
     change_state = service.callback
 
@@ -84,26 +101,38 @@ def answer_invalid_transitions(node: Node) -> None:
 def refuse_foreign_parameters(node: Node) -> None:
     """Let a node refuse a request to set parameters of which it lacks one, as a whole.
 
-    `ros2 param load` joins the sections of all nodes of a file. Without the refusal a node takes the values of names that it
-    shares with another node, such as an age limit.
+    `ros2 param load` joins the sections of all nodes of a file. Without the refusal a node takes
+    the values of names that it shares with another node, such as an age limit.
     """
-    (service,) = (service for service in node.services if service.srv_name.endswith("/set_parameters"))
+    (service,) = (
+        service for service in node.services if service.srv_name.endswith("/set_parameters")
+    )
     set_parameters = service.callback
 
     def answer(request: Any, response: Any) -> Any:
-        foreign = [parameter.name for parameter in request.parameters if not node.has_parameter(parameter.name)]
+        foreign = [
+            parameter.name
+            for parameter in request.parameters
+            if not node.has_parameter(parameter.name)
+        ]
         if not foreign:
             return set_parameters(request, response)
         owner = node.get_fully_qualified_name()
-        reason = bounded(f"found {', '.join(foreign)}, expected parameters of {owner} alone; nothing is set")
-        response.results = [SetParametersResult(successful=False, reason=reason) for _ in request.parameters]
+        reason = bounded(
+            f"found {', '.join(foreign)}, expected parameters of {owner} alone; nothing is set"
+        )
+        response.results = [
+            SetParametersResult(successful=False, reason=reason) for _ in request.parameters
+        ]
         return response
 
     service.callback = answer
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
-    """A callback that is ready, None if there is none, without blocking. Its call raises what the callback raises."""
+    """A callback that is ready, None if there is none, without blocking. Its call raises what the
+    callback raises.
+    """
     try:
         handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)
     except TimeoutException:

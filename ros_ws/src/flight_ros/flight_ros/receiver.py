@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Receivers: the samples of a topic, checked and taken at a tick. Refused samples are counted and logged."""
+"""Receivers: the samples of a topic, checked and taken at a tick. Refused samples are counted and
+logged.
+"""
 
 import time
 from collections import Counter, deque
@@ -20,8 +22,8 @@ from flight_ros.topics import Topic
 
 LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one topic and reason
 GROWTH = 2
-"""Size of a message over that of the longest valid one. A publisher may leave channels out, as a bridge those of a pose that
-are not fresh: three of seven channels have half of the bytes."""
+"""Size of a message over that of the longest valid one. A publisher may leave channels out, as a
+bridge those of a pose that are not fresh: three of seven channels have half of the bytes."""
 
 RECENT = 9  # samples, of which the median interval is taken
 FEWEST = 3  # samples within an age limit: one of them may be late, and one lost
@@ -53,9 +55,13 @@ class Refusals:
     """The refused samples of a node."""
 
     def __init__(self, node: Node, clock_of: Callable[[str], str] = lambda sender: "") -> None:
-        self.clock_of = clock_of  # the end of a sentence on the stamp of a sender whose clock differs
+        self.clock_of = (
+            clock_of  # the end of a sentence on the stamp of a sender whose clock differs
+        )
         self.counts: Counter[str] = Counter()  # by "topic: reason"
-        self.last: dict[str, tuple[int, str]] = {}  # by full topic: instant on the monotonic clock, and sentence
+        self.last: dict[
+            str, tuple[int, str]
+        ] = {}  # by full topic: instant on the monotonic clock, and sentence
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
         self._conflict = ""
@@ -78,16 +84,22 @@ class Refusals:
             self._node.get_logger().warning(f"{subscription.name}: sample refused: {sentence}")
 
     def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
-        """The last refusal of a topic since an instant of the monotonic clock, with age and count; empty without one."""
+        """The last refusal of a topic since an instant of the monotonic clock, with age and count;
+        empty without one.
+        """
         refused_ns, sentence = self.last.get(subscription.name, (0, ""))
         if not sentence or refused_ns < begin_ns:
             return ""
-        count = sum(n for key, n in self.counts.items() if key.startswith(f"{subscription.topic.name}: "))
+        count = sum(
+            n for key, n in self.counts.items() if key.startswith(f"{subscription.topic.name}: ")
+        )
         age = (time.monotonic_ns() - refused_ns) / NANOSECONDS
         return f"{count} samples refused, the last {age:.1f} s ago: {sentence}"
 
     def conflict(self) -> str:
-        """The last sample of a conflicting publisher since the last call, as a sentence; empty without a conflict."""
+        """The last sample of a conflicting publisher since the last call, as a sentence; empty
+        without a conflict.
+        """
         sentence = self._conflict
         self._conflict = ""
         return sentence
@@ -96,12 +108,14 @@ class Refusals:
 class Receiver(Generic[S]):
     """The samples of one topic. Checks go from cheap to costly: size, publisher, content, stamp.
 
-    A message that is too long, or of a conflicting publisher, is refused without decoding names and values: a flood of these
-    messages costs no more than as many right ones. Under the name of the locked publisher, too long is GROWTH times its longest
-    valid message, until the publisher times out. `decode` returns None for a vector without channels. `take` gets a sample
-    and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
-    the lead over the clock; None is for a sender without the clock of the flight. `max_size` in bytes is for a topic of
-    reports, whose lengths differ by more than GROWTH; None is for one of samples. Refusals are raised as ChannelError.
+    A message that is too long, or of a conflicting publisher, is refused without decoding names and
+    values: a flood of these messages costs no more than as many right ones. Under the name of the
+    locked publisher, too long is GROWTH times its longest valid message, until the publisher times
+    out. `decode` returns None for a vector without channels. `take` gets a sample and the present
+    instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of
+    a stamp and the lead over the clock; None is for a sender without the clock of the flight.
+    `max_size` in bytes is for a topic of reports, whose lengths differ by more than GROWTH; None is
+    for one of samples. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -132,8 +146,13 @@ class Receiver(Generic[S]):
         return self.subscription.name
 
     def poll(self, now_ns: int, limit: int | None = None) -> list[bool]:
-        """Take the messages since the last call, at most `limit`. Returns whether each message was valid."""
-        return [self.take_message(received.message, now_ns) for received in self.subscription.take(limit)]
+        """Take the messages since the last call, at most `limit`. Returns whether each message was
+        valid.
+        """
+        return [
+            self.take_message(received.message, now_ns)
+            for received in self.subscription.take(limit)
+        ]
 
     def take_message(self, raw: bytes, now_ns: int) -> bool:
         """Check and take a message. Returns whether the message was valid."""
@@ -143,7 +162,11 @@ class Receiver(Generic[S]):
                 if (sender := sender_of(raw)) is None:
                     raise ChannelError("malformed", "a message without a header in plain CDR")
                 self.lock.check(sender, now_ns)
-                if not self._grows and len(raw) > GROWTH * self._longest and self.lock.holds(sender, now_ns):
+                if (
+                    not self._grows
+                    and len(raw) > GROWTH * self._longest
+                    and self.lock.holds(sender, now_ns)
+                ):
                     require_size(raw, GROWTH * self._longest)
             if (sample := self._decode(raw)) is not None:
                 self._accept(sample, now_ns)
@@ -154,17 +177,30 @@ class Receiver(Generic[S]):
         return True
 
     def slowness(self, max_age_ns: int) -> str:
-        """Why samples at their rate exceed an age limit at times, as a sentence; empty where FEWEST of them fit."""
-        if len(self._stamps_ns) < RECENT or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0:
+        """Why samples at their rate exceed an age limit at times, as a sentence; empty where FEWEST
+        of them fit.
+        """
+        if (
+            len(self._stamps_ns) < RECENT
+            or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0
+        ):
             return ""
         fit = max_age_ns / period_ns
         max_age = max_age_ns / NANOSECONDS
-        mend = f"send {FEWEST / max_age:.3g} a second or more, or set max_age to {FEWEST * period_ns / NANOSECONDS:.2g} or more"
-        slow = f"{NANOSECONDS / period_ns:.3g} samples a second, of which {fit:.1f} fit into max_age = {max_age:g} s"
+        mend = (
+            f"send {FEWEST / max_age:.3g} a second or more, or set max_age to "
+            f"{FEWEST * period_ns / NANOSECONDS:.2g} or more"
+        )
+        slow = (
+            f"{NANOSECONDS / period_ns:.3g} samples a second, of which {fit:.1f} fit into "
+            f"max_age = {max_age:g} s"
+        )
         return f"{slow}: {mend}" if fit < FEWEST else ""
 
     def receive(self) -> list[S | None]:
-        """Lockstep: decode the messages since the last call, for `accept`. None: without channels, or refused."""
+        """Lockstep: decode the messages since the last call, for `accept`. None: without channels,
+        or refused.
+        """
         samples: list[S | None] = []
         for received in self.subscription.take():
             try:
@@ -191,7 +227,9 @@ class Receiver(Generic[S]):
                 require_not_future(sample.stamp_ns, now_ns, max_age_ns)
                 require_not_old(sample.stamp_ns, now_ns, max_age_ns)
             except ChannelError as error:
-                raise ChannelError(error.reason, f"{error}{self._refusals.clock_of(sample.sender)}") from None
+                raise ChannelError(
+                    error.reason, f"{error}{self._refusals.clock_of(sample.sender)}"
+                ) from None
         self._take(sample, now_ns)
         self._stamps_ns.append(sample.stamp_ns)
         if self.lock is not None:

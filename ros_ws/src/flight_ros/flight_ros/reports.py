@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reports as messages: diagnostic_msgs/DiagnosticArray with a stamp, a sentence and named values, which are JSON."""
+"""Reports as messages: diagnostic_msgs/DiagnosticArray with a stamp, a sentence and named values,
+which are JSON.
+"""
 
 import json
 from collections.abc import Mapping
@@ -30,11 +32,15 @@ class Report(NamedTuple):
 def encode(report: Report, name: str) -> bytes:
     """The message of a report; `name` is that of its status."""
     message = DiagnosticArray()
-    message.header.stamp = Time(sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS)
+    message.header.stamp = Time(
+        sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS
+    )
     message.header.frame_id = report.sender
     level = DiagnosticStatus.WARN if report.warns else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=json.dumps(value)) for key, value in report.values.items()]
-    message.status = [DiagnosticStatus(level=level, name=name, message=report.sentence, values=values)]
+    message.status = [
+        DiagnosticStatus(level=level, name=name, message=report.sentence, values=values)
+    ]
     return serialize_message(message)
 
 
@@ -44,7 +50,11 @@ def decode(raw: bytes) -> Report:
         message = deserialize_message(raw, DiagnosticArray)
         (status,) = message.status
         values = {item.key: json.loads(item.value) for item in status.values}
-    except (DeserializationError, ValueError, RecursionError) as error:  # ValueError: of json, or not one status
+    except (
+        DeserializationError,
+        ValueError,
+        RecursionError,
+    ) as error:  # ValueError: of json, or not one status
         raise ChannelError("malformed", " ".join(str(error).split())) from None
     stamp = message.header.stamp
     sender = message.header.frame_id

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated time: the time of the topic /clock, in place of the clocks of the host.
 
-Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the simulator, and a pause of /clock
-is a pause of the flight. What concerns the process stays in the time of the host: diagnostics, services and log lines.
+Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the
+simulator, and a pause of /clock is a pause of the flight. What concerns the process stays in the
+time of the host: diagnostics, services and log lines.
 """
 
 import time
@@ -17,7 +18,9 @@ from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
 
-LARGEST_JUMP_NS = 60 * NANOSECONDS  # /clock may be lost for so long; a node then catches up with its missed ticks
+LARGEST_JUMP_NS = (
+    60 * NANOSECONDS
+)  # /clock may be lost for so long; a node then catches up with its missed ticks
 LONGEST_WAIT_NS = NANOSECONDS // 50  # so that signals and service calls are handled in a pause
 SILENT_NS = NANOSECONDS  # without a message of /clock, before a node says that it waits
 HISTORY = 4096  # messages of /clock, by which the instants of other messages are known
@@ -55,25 +58,35 @@ class SimulatedTime:
     monotonic_ns = time_ns
 
     def sleep(self, duration: float, /) -> None:
-        """Wait for the next message, at most LONGEST_WAIT_NS of the host: a duration of simulated time has no length there."""
+        """Wait for the next message, at most LONGEST_WAIT_NS of the host: a duration of simulated
+        time has no length there.
+        """
         self._wait_set = self._wait_set or WaitSet([self.subscription.entity], self._context)
         self._wait_set.wait(LONGEST_WAIT_NS)
 
     def at(self, system_ns: int) -> int:
-        """The simulated time at an instant of the system clock, between two messages in proportion."""
+        """The simulated time at an instant of the system clock, between two messages in
+        proportion.
+        """
         received_ns = self._received_ns
         instants_ns = self._instants_ns
         place = min(max(bisect_right(received_ns, system_ns), 1), len(received_ns) - 1)
         if place == 0 or system_ns >= received_ns[place]:
             return instants_ns[-1]
         step_ns = instants_ns[place] - instants_ns[place - 1]
-        share = max(system_ns - received_ns[place - 1], 0) / max(received_ns[place] - received_ns[place - 1], 1)
+        share = max(system_ns - received_ns[place - 1], 0) / max(
+            received_ns[place] - received_ns[place - 1], 1
+        )
         return instants_ns[place - 1] + round(share * step_ns)
 
     def speed(self) -> float:
         """Simulated time over that of the host, since the first message."""
         instant_ns, received_ns = self._first
-        return (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1) if self.known() else 0.0
+        return (
+            (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1)
+            if self.known()
+            else 0.0
+        )
 
     @property
     def restarted(self) -> bool:
@@ -85,7 +98,10 @@ class SimulatedTime:
         if self.restarted:
             publishers = self.subscription.entity.get_publisher_count()
             which = f" ({publishers} nodes publish it, expected one)" if publishers > 1 else ""
-            raise ClockRestarted(f"/clock jumped by {seconds(self._jump_ns):+.3f} s{which}: another simulation begins")
+            raise ClockRestarted(
+                f"/clock jumped by {seconds(self._jump_ns):+.3f} s{which}: another simulation "
+                "begins"
+            )
 
     def _take(self) -> None:
         for received in self.subscription.take():

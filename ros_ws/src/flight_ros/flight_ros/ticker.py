@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticker: a fixed rate with absolute deadlines, without drift: on the monotonic clock, or in simulated time."""
+"""Ticker: a fixed rate with absolute deadlines, without drift: on the monotonic clock, or in
+simulated time.
+"""
 
 import math
 import time
@@ -8,7 +10,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-SPIN_TIME = 2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+SPIN_TIME = (
+    2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+)
 MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
 
 
@@ -39,12 +43,15 @@ class Tick(NamedTuple):
 
 
 class Ticker:
-    """Deadlines start + k period, in ns of host.monotonic_ns(); `host` is the module `time` by default.
+    """Deadlines start + k period, in ns of host.monotonic_ns(); `host` is the module `time` by
+    default.
 
     Without `spin` a wait does not busy-wait.
     """
 
-    def __init__(self, period_ns: int, start_ns: int, host: HostTime | None = None, *, spin: bool = True) -> None:
+    def __init__(
+        self, period_ns: int, start_ns: int, host: HostTime | None = None, *, spin: bool = True
+    ) -> None:
         self._host: HostTime = host or time
         self.period_ns = period_ns
         self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9) if spin else 0.0  # s
@@ -53,10 +60,14 @@ class Ticker:
 
     def remaining(self) -> float:
         """Time to the next deadline in s, negative when it has passed."""
-        return (self._start_ns + (self._last + 1) * self.period_ns - self._host.monotonic_ns()) / 1e9
+        return (
+            self._start_ns + (self._last + 1) * self.period_ns - self._host.monotonic_ns()
+        ) / 1e9
 
     def wait(self, most: float) -> None:
-        """Sleep until the next deadline, at most `most` s. The last part before the deadline is a busy-wait."""
+        """Sleep until the next deadline, at most `most` s. The last part before the deadline is a
+        busy-wait.
+        """
         pause = self.remaining()
         if pause > self._spin_time:
             self._host.sleep(min(pause - self._spin_time, most))
@@ -74,7 +85,9 @@ class Ticker:
 
 
 class TickTimes:
-    """Periods and compute times of the ticks since the last report, and the number of missed ticks."""
+    """Periods and compute times of the ticks since the last report, and the number of missed
+    ticks.
+    """
 
     def __init__(self) -> None:
         self._periods: list[int] = []  # ns
@@ -100,7 +113,9 @@ class TickTimes:
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:
                 values = np.sort(times) * 1e-9
-                nearest = math.ceil(0.99 * len(values)) - 1  # np.percentile would import numpy.ma inside a tick
+                nearest = (
+                    math.ceil(0.99 * len(values)) - 1
+                )  # np.percentile would import numpy.ma inside a tick
                 report |= {
                     f"{key} mean (s)": f"{values.mean():.6f}",
                     f"{key} p99 (s)": f"{values[nearest]:.6f}",

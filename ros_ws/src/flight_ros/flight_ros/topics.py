@@ -14,36 +14,46 @@ from flight_core.topics import *  # noqa: F403 - a node imports both from here
 
 def kept(depth: int) -> QoSProfile:
     """A reliable profile with the last `depth` messages for a late subscriber."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
 
 
-# Publishers are reliable and keep their last samples, so that a recorder that is matched late or delayed loses none. The depth
-# is two seconds at 1 kHz, as that of the recorder; see `publisher_qos`.
+# Publishers are reliable and keep their last samples, so that a recorder that is matched late or
+# delayed loses none. The depth is two seconds at 1 kHz, as that of the recorder; see
+# `publisher_qos`.
 PUBLISH = RECORD = kept(2000)
-# Control loops use the newest samples and no retransmissions. The depth covers the samples of y_m between two ticks, from which
-# y_m is aligned to the stamp of y, and those of a conflicting publisher at 10 kHz, which would otherwise displace a u.
+# Control loops use the newest samples and no retransmissions. The depth covers the samples of y_m
+# between two ticks, from which y_m is aligned to the stamp of y, and those of a conflicting
+# publisher at 10 kHz, which would otherwise displace a u.
 NEWEST_SAMPLES = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT)
-# A lockstep flight needs every sample from the first one on, also of a subscriber that is matched late. The depth is for speed:
-# with a full history, Fast DDS requests an acknowledgement of each sample.
+# A lockstep flight needs every sample from the first one on, also of a subscriber that is matched
+# late. The depth is for speed: with a full history, Fast DDS requests an acknowledgement of each
+# sample.
 LOCKSTEP = kept(20_000)
-# The middleware reports the loss of liveliness. It asserts it every two thirds of the lease, so a process that the host stops
-# for less than the other third, 0.6 s, is never lost. With a lease of 1 s, 2 of 20 stops of 0.4 s lost the process. The lease
-# is shorter than that of the participant, 2 s, which does not tell a kill from a clean end. The only message of a node is the
-# name of the role that it lost, before it ends.
+# The middleware reports the loss of liveliness. It asserts it every two thirds of the lease, so a
+# process that the host stops for less than the other third, 0.6 s, is never lost. With a lease of 1
+# s, 2 of 20 stops of 0.4 s lost the process. The lease is shorter than that of the participant, 2
+# s, which does not tell a kill from a clean end. The only message of a node is the name of the role
+# that it lost, before it ends.
 LIVELINESS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     liveliness=LivelinessPolicy.AUTOMATIC,
     liveliness_lease_duration=Duration(seconds=1.8),
 )
-# For topics of other publishers, which may not keep samples. If a publisher offers less, the recorder requests less.
+# For topics of other publishers, which may not keep samples. If a publisher offers less, the
+# recorder requests less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
-# A proposal is rare, so none may be lost. One from before the start of the controller is void. The depth is as that of
-# NEWEST_SAMPLES.
+# A proposal is rare, so none may be lost. One from before the start of the controller is void. The
+# depth is as that of NEWEST_SAMPLES.
 PROPOSALS = QoSProfile(depth=128, reliability=ReliabilityPolicy.RELIABLE)
 
-# A late subscriber gets the last state of each node. The queue of a subscriber holds the states of many nodes.
+# A late subscriber gets the last state of each node. The queue of a subscriber holds the states of
+# many nodes.
 STATE = kept(1)
 STATES = kept(100)
 
@@ -59,15 +69,18 @@ def offered(topic: table.Topic) -> QoSProfile:
 def publisher_qos(period_ns: int) -> QoSProfile:
     """PUBLISH at a rate, with a history of two seconds.
 
-    A longer history would delay the flight when a recorder joins: the threads that send new samples send the history at once.
+    A longer history would delay the flight when a recorder joins: the threads that send new samples
+    send the history at once.
     """
     return kept(min(max(HISTORY_NS // period_ns, 1), PUBLISH.depth))
 
 
 class NodeState(StrEnum):
-    """State of a node on `node_state`, in order. READY: its event loop runs. MATCHED, in real time: each input has a publisher.
+    """State of a node on `node_state`, in order. READY: its event loop runs. MATCHED, in real time:
+    each input has a publisher.
 
-    FLYING: the aircraft has taken the first u of a flight in real time. COMPLETED: it has completed a lockstep flight.
+    FLYING: the aircraft has taken the first u of a flight in real time. COMPLETED: it has completed
+    a lockstep flight.
     """
 
     READY = "ready"

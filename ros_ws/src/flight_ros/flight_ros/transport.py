@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transport of the middleware: loopback only, unless the user configures a profile.
 
-Fast DDS silently falls back to all interfaces if it cannot read its profile. So the file is checked before rclpy starts and the
-sockets afterwards.
+Fast DDS silently falls back to all interfaces if it cannot read its profile. So the file is checked
+before rclpy starts and the sockets afterwards.
 """
 
 import os
@@ -18,7 +18,9 @@ LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 
 
 def environment() -> dict[str, str]:
-    """Environment variables that select the loopback transport; empty if the user has configured a profile."""
+    """Environment variables that select the loopback transport; empty if the user has configured a
+    profile.
+    """
     if PROFILE_VARIABLE in os.environ:
         return {}
     # SYSTEM_DEFAULT leaves discovery to the profile; LOCALHOST would add shared memory to it.
@@ -26,7 +28,8 @@ def environment() -> dict[str, str]:
 
 
 def prepare() -> None:
-    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read as XML.
+    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read
+    as XML.
 
     Raises as `require_ros_environment`, too.
     """
@@ -38,16 +41,26 @@ def prepare() -> None:
     except (OSError, ElementTree.ParseError) as error:
         from flight_core.parameters import ParameterError  # noqa: PLC0415 - see flight_ros.startup
 
-        raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
+        raise ParameterError(
+            f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile"
+        ) from None
 
 
 def open_to_network() -> list[str]:
-    """UDP sockets of this process on all interfaces in spite of the loopback profile; there should be none."""
+    """UDP sockets of this process on all interfaces in spite of the loopback profile; there should
+    be none.
+    """
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
     import psutil  # noqa: PLC0415 - see flight_ros.startup
 
     process = psutil.Process()
-    connections = getattr(process, "net_connections", None) or process.connections  # before psutil 6: Ubuntu 24.04 has 5.9
+    connections = (
+        getattr(process, "net_connections", None) or process.connections
+    )  # before psutil 6: Ubuntu 24.04 has 5.9
     sockets = connections(kind="udp")
-    return [f"{s.laddr.ip}:{s.laddr.port}" for s in sockets if s.laddr and s.laddr.ip in ("0.0.0.0", "::")]  # noqa: S104 - compared, not bound
+    return [
+        f"{s.laddr.ip}:{s.laddr.port}"
+        for s in sockets
+        if s.laddr and s.laddr.ip in ("0.0.0.0", "::")  # noqa: S104 - compared, not bound
+    ]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The background of the map: lines and points of a GeoJSON of the user, in the plane of the flight."""
+"""The background of the map: lines and points of a GeoJSON of the user, in the plane of the
+flight.
+"""
 
 from pathlib import Path
 
@@ -18,12 +20,19 @@ MAX_POINTS = 20_000
 def read_background(path: Path, origin: Origin | None) -> list[Line]:
     """The lines of a GeoJSON, each ring of a polygon among them.
 
-    Raises ParameterError for an unreadable file, a coordinate system other than WGS84, a geometry of another type, no origin,
-    and more than MAX_POINTS positions.
+    Raises ParameterError for an unreadable file, a coordinate system other than WGS84, a geometry
+    of another type, no origin, and more than MAX_POINTS positions.
     """
     if origin is None:
-        raise ParameterError("origin: found none, expected the latitude and longitude where north and east are 0")
+        raise ParameterError(
+            "origin: found none, expected the latitude and longitude where north and east are 0"
+        )
     lines = placed_lines(read_file(path, str(path), "a GeoJSON"), str(path), origin)
     count = sum(map(len, lines))
-    require(count <= MAX_POINTS, str(path), f"{count} positions", f"at most {MAX_POINTS}: ogr2ogr -simplify leaves some out")
+    require(
+        count <= MAX_POINTS,
+        str(path),
+        f"{count} positions",
+        f"at most {MAX_POINTS}: ogr2ogr -simplify leaves some out",
+    )
     return lines

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control of a flight from the page: permission, range and order of commands, without ROS.
 
-A `Link` reaches the nodes. A single page at a time holds the lease. Requests run in sequence on a separate thread;
-to deactivate the controller or disengage the bridge ends the running request.
+A `Link` reaches the nodes. A single page at a time holds the lease. Requests run in sequence on a
+separate thread; to deactivate the controller or disengage the bridge ends the running request.
 """
 
 import asyncio
@@ -37,13 +37,17 @@ GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without argu
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
-SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, stamps of a lockstep flight begin at 0
+SYSTEM_TIME_NS = (
+    10**17
+)  # stamps above are of the system clock, stamps of a lockstep flight begin at 0
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
 
 class Link(Protocol):
-    """What reaches the nodes of a flight. Methods return why something is refused, or "", and may raise ParameterError."""
+    """What reaches the nodes of a flight. Methods return why something is refused, or "", and may
+    raise ParameterError.
+    """
 
     def nodes(self) -> list[str]:
         """Nodes under command: the running nodes among aircraft, bridge, controller, guidance."""
@@ -166,12 +170,14 @@ class Control:
             self._require_rate()
         if not isinstance(action, str) or action not in {*self._actions, "check"}:
             raise RefusedError(
-                HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
+                HTTPStatus.BAD_REQUEST,
+                f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}",
             )
         # A later flight in this domain is a new flight.
         if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:
             raise RefusedError(
-                HTTPStatus.CONFLICT, "the flight of this page is over: rise-di watch --control shows a later one"
+                HTTPStatus.CONFLICT,
+                "the flight of this page is over: rise-di watch --control shows a later one",
             )
         self._take_lease(lease)
         loop = asyncio.get_running_loop()
@@ -180,7 +186,9 @@ class Control:
         if action in AT_ONCE:  # also while a request waits, or waits for its turn
             self._cancellations += 1
             self._link.cancel()
-        return await loop.run_in_executor(self._worker, self._carry_out, action, request, self._cancellations)
+        return await loop.run_in_executor(
+            self._worker, self._carry_out, action, request, self._cancellations
+        )
 
     def close(self) -> None:
         """End the running request, and take no further request."""
@@ -194,24 +202,32 @@ class Control:
         """Refuse a wrong key. For KEY_PERIOD after a wrong key, accept only the page in control."""
         holds = bool(self._lease) and hmac.compare_digest(lease.encode(), self._lease.encode())
         if not holds and self._now() - self._wrong_key < KEY_PERIOD:
-            raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"a wrong key less than {KEY_PERIOD:g} s ago")
+            raise RefusedError(
+                HTTPStatus.TOO_MANY_REQUESTS, f"a wrong key less than {KEY_PERIOD:g} s ago"
+            )
         if not hmac.compare_digest(_plain(key), _plain(self._key)):
             self._wrong_key = self._now()
-            raise RefusedError(HTTPStatus.FORBIDDEN, "the control key is wrong: type the one that rise-di watch printed")
+            raise RefusedError(
+                HTTPStatus.FORBIDDEN,
+                "the control key is wrong: type the one that rise-di watch printed",
+            )
 
     def _require_rate(self) -> None:
         now = self._now()
         self._requests = min(self._requests + RATE * (now - self._refilled), BURST)
         self._refilled = now
         if self._requests < 1.0:
-            raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"more than {RATE:g} requests a second")
+            raise RefusedError(
+                HTTPStatus.TOO_MANY_REQUESTS, f"more than {RATE:g} requests a second"
+            )
         self._requests -= 1.0
 
     def _take_lease(self, lease: str) -> None:
         now = self._now()
         if now < self._lease_end and not hmac.compare_digest(lease.encode(), self._lease.encode()):
             raise RefusedError(
-                HTTPStatus.LOCKED, f"another page controls the flight; its lease ends {LEASE:g} s after it is closed"
+                HTTPStatus.LOCKED,
+                f"another page controls the flight; its lease ends {LEASE:g} s after it is closed",
             )
         if now >= self._lease_end:
             self._lease = secrets.token_urlsafe(16)
@@ -219,8 +235,12 @@ class Control:
 
     # What may be commanded
 
-    def _carry_out(self, action: str, request: Mapping[str, Any], cancellations: int) -> dict[str, Any]:
-        """Carry out a request and write a line in the log. Refused after a cancellation later than `cancellations`."""
+    def _carry_out(
+        self, action: str, request: Mapping[str, Any], cancellations: int
+    ) -> dict[str, Any]:
+        """Carry out a request and write a line in the log. Refused after a cancellation later than
+        `cancellations`.
+        """
         self._link.resume()
         self._link.keep_link()
         before = dict(self._values)
@@ -237,25 +257,48 @@ class Control:
             raise
         if action != "state":
             changes = {
-                name: f"{before.get(name)} -> {value}" for name, value in self._values.items() if before.get(name) != value
+                name: f"{before.get(name)} -> {value}"
+                for name, value in self._values.items()
+                if before.get(name) != value
             }
             self._link.note(f"control: {short_repr(what | changes)}")
         with _refusing():
             return self.state()
 
     def state(self) -> dict[str, Any]:
-        """State for the page: lease, nodes, gains with their ranges, digests, faults, the bridge."""
+        """State for the page: lease, nodes, gains with their ranges, digests, faults, the
+        bridge.
+        """
         nodes = self._link.nodes()
         scenario = self._flight.scenario
-        shown: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
-        known = scenario is not None and self._digest and "controller" in nodes  # the digest is that of a refresh
+        shown: dict[str, Any] = {
+            "lease": self._lease,
+            "nodes": nodes,
+            "undo": len(self._undo),
+            "targets": list(TARGETS),
+        }
+        known = (
+            scenario is not None and self._digest and "controller" in nodes
+        )  # the digest is that of a refresh
         if scenario is not None and known and gains_of(scenario.controller):
-            shown |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
+            shown |= {
+                "gains": self._gains(scenario),
+                "digest": f"{self._digest:012x}",
+                "logged": f"{self._flight.digest:012x}",
+            }
         if scenario is not None and "aircraft" in nodes:
             channels = scenario.aircraft.channels()
             truth = self._flight.samples.get("truth")
-            axes = [] if truth is None else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
-            shown["aircraft"] = {"outputs": list(channels.outputs), "inputs": list(channels.inputs), "axes": axes}
+            axes = (
+                []
+                if truth is None
+                else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
+            )
+            shown["aircraft"] = {
+                "outputs": list(channels.outputs),
+                "inputs": list(channels.inputs),
+                "axes": axes,
+            }
             shown["faults"] = self._faults
         if "bridge" in nodes:
             shown["bridge"] = {"map": self._map(), "sends": self._sends()}
@@ -263,7 +306,9 @@ class Control:
 
     def _controller(self) -> ControllerConfig:
         if self._flight.scenario is None:
-            raise RefusedError(HTTPStatus.CONFLICT, "the log has no scenario, so the gains have no range")
+            raise RefusedError(
+                HTTPStatus.CONFLICT, "the log has no scenario, so the gains have no range"
+            )
         return self._flight.scenario.controller
 
     def _gains(self, scenario: Scenario) -> list[dict[str, Any]]:
@@ -274,8 +319,13 @@ class Control:
         return gains
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
-        """Read the faults; at first, and where the digest in the log differs, also the controller's parameters."""
-        stale = not self._digest or self._flight.digest not in {0, self._digest}  # 0 before the first tick
+        """Read the faults; at first, and where the digest in the log differs, also the controller's
+        parameters.
+        """
+        stale = not self._digest or self._flight.digest not in {
+            0,
+            self._digest,
+        }  # 0 before the first tick
         scenario = self._flight.scenario
         nodes = self._link.nodes()
         if scenario is not None and "controller" in nodes and stale:
@@ -301,7 +351,10 @@ class Control:
         chosen = {}
         for name, value in values.items():
             if name not in gains:
-                raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}")
+                raise RefusedError(
+                    HTTPStatus.BAD_REQUEST,
+                    f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}",
+                )
             chosen[name] = _like(name, gains[name], value)
             _require_range(name, chosen[name], gains[name])
         return self._apply(request, chosen, undo=True)
@@ -320,7 +373,8 @@ class Control:
         self._read()
         if request.get("digest") != f"{self._digest:012x}":
             raise RefusedError(
-                HTTPStatus.CONFLICT, "the parameters have been changed meanwhile: look at them, then apply again"
+                HTTPStatus.CONFLICT,
+                "the parameters have been changed meanwhile: look at them, then apply again",
             )
         before = {name: self._values[name] for name in values if name in self._values}
         digest = self._with({**self._values, **values}).digest()
@@ -338,7 +392,9 @@ class Control:
             return {}
         values = _mapping(request, "values")
         gains = gains_of(self._controller())
-        chosen = {name: _like(name, gains[name], value) for name, value in values.items() if name in gains}
+        chosen = {
+            name: _like(name, gains[name], value) for name, value in values.items() if name in gains
+        }
         with _refusing():
             return self._assess(self._flight.scenario, self._with(self._values | chosen))
 
@@ -353,11 +409,14 @@ class Control:
     def _require_simulated(self) -> None:
         if not self._real and "bridge" in self._link.nodes() and self._sends():
             raise RefusedError(
-                HTTPStatus.FORBIDDEN, "the bridge sends to an autopilot: gains need rise-di watch --control --set real"
+                HTTPStatus.FORBIDDEN,
+                "the bridge sends to an autopilot: gains need rise-di watch --control --set real",
             )
 
     def _activate(self, *, active: bool) -> str:
-        """Activate or deactivate the controller. With a bridge this is refused: the bridge does so with engagement."""
+        """Activate or deactivate the controller. With a bridge this is refused: the bridge does so
+        with engagement.
+        """
         if "bridge" in self._link.nodes():
             return "the bridge activates and deactivates the controller: engage or disengage it"
         return self._link.activate(active=active)
@@ -369,7 +428,10 @@ class Control:
         values = _mapping(request, "values")
         for name in values:
             if name not in known:
-                raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no fault, expected one of {', '.join(known)}")
+                raise RefusedError(
+                    HTTPStatus.BAD_REQUEST,
+                    f"{short_repr(name)}: no fault, expected one of {', '.join(known)}",
+                )
         chosen = {name: _numbers(name, value) for name, value in values.items()}
         if not (refusal := self._link.set_parameters("aircraft", chosen)):
             self._faults |= chosen
@@ -377,13 +439,23 @@ class Control:
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = request.get("axis")
-        if not isinstance(axis, str) or not axis.isidentifier():  # ROS has no name for half a surrogate pair
-            raise RefusedError(HTTPStatus.BAD_REQUEST, f"axis: found {short_repr(axis)}, expected the name of an axis")
+        if (
+            not isinstance(axis, str) or not axis.isidentifier()
+        ):  # ROS has no name for half a surrogate pair
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST,
+                f"axis: found {short_repr(axis)}, expected the name of an axis",
+            )
         speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS
-        start = GUST_LEAD + ((time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end)
-        values = {f"gusts.{axis}.{key}": value for key, value in (("start", start), ("speed", speed), ("length", length))}
+        start = GUST_LEAD + (
+            (time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end
+        )
+        values = {
+            f"gusts.{axis}.{key}": value
+            for key, value in (("start", start), ("speed", speed), ("length", length))
+        }
         return self._link.set_parameters("aircraft", values)
 
     def _send_target(self, request: Mapping[str, Any]) -> str:
@@ -391,31 +463,49 @@ class Control:
         for name in values:
             if name not in TARGETS:
                 raise RefusedError(
-                    HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no target, expected one of {', '.join(TARGETS)}"
+                    HTTPStatus.BAD_REQUEST,
+                    f"{short_repr(name)}: no target, expected one of {', '.join(TARGETS)}",
                 )
-        return self._link.send_target({name: _number(name, value) for name, value in values.items()})
+        return self._link.send_target(
+            {name: _number(name, value) for name, value in values.items()}
+        )
 
     def _send_route(self, request: Mapping[str, Any]) -> str:
         points = request.get("points")
         if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
-            raise RefusedError(HTTPStatus.BAD_REQUEST, f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude")
-        if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in points):
-            raise RefusedError(HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each")
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST,
+                f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude",
+            )
+        if any(
+            not isinstance(point, list) or len(point) != len(("north", "east", "altitude"))
+            for point in points
+        ):
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each"
+            )
         coordinate = partial(_number, "points")
         return self._link.send_route([[*map(coordinate, point)] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
         if request.get("map") != (name := self._map()):
             raise RefusedError(
-                HTTPStatus.BAD_REQUEST, f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge"
+                HTTPStatus.BAD_REQUEST,
+                f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge",
             )
         return self._link.engage()
 
 
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
-    """The numeric parameters of a law tunable in flight, by name: a number, or a number per channel."""
+    """The numeric parameters of a law tunable in flight, by name: a number, or a number per
+    channel.
+    """
     fields = type(controller).model_fields
-    tunable = [name for name in fields if name not in ControllerConfig.model_fields and name in controller.tunable()]
+    tunable = [
+        name
+        for name in fields
+        if name not in ControllerConfig.model_fields and name in controller.tunable()
+    ]
     values = {name: getattr(controller, name) for name in tunable}
     return {name: value for name, value in values.items() if _is_numeric(value)}
 
@@ -426,7 +516,9 @@ def _is_numeric(value: object) -> bool:
 
 def _faults_of(scenario: Scenario) -> list[str]:
     """The parameters of the aircraft tunable in flight, without the gusts and the drift."""
-    return sorted(name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift.")))
+    return sorted(
+        name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift."))
+    )
 
 
 def _plain(key: str) -> bytes:
@@ -447,7 +539,8 @@ def _require_range(name: str, value: Any, base: Any) -> None:
         if not low <= number <= high:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST,
-                f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to {RANGE[1]:g} times the scenario's",
+                f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to "
+                f"{RANGE[1]:g} times the scenario's",
             )
 
 
@@ -456,7 +549,9 @@ def _like(name: str, base: Any, value: Any) -> Any:
     values = _as_list(_numbers(name, value))
     expected = len(_as_list(base))
     if len(values) != expected:
-        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}")
+        raise RefusedError(
+            HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}"
+        )
     return values if isinstance(base, tuple) else values[0]
 
 
@@ -469,11 +564,18 @@ def _mapping(request: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 def _number(name: str, value: Any) -> float:
     try:
-        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+        number = (
+            float(value)
+            if isinstance(value, int | float) and not isinstance(value, bool)
+            else math.nan
+        )
     except OverflowError:  # an integer of hundreds of digits
         number = math.inf
     if not math.isfinite(number):
-        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: found {short_repr(value)}, expected a number")
+        raise RefusedError(
+            HTTPStatus.BAD_REQUEST,
+            f"{short_repr(name)}: found {short_repr(value)}, expected a number",
+        )
     return number
 
 

@@ -16,9 +16,11 @@ from flight_ros.client import Client
 
 
 class ControlClient(Client):
-    """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait, and is called by one thread.
+    """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait,
+    and is called by one thread.
 
-    Methods return why something is refused, or "". They raise ParameterError where a node or its answer is missing.
+    Methods return why something is refused, or "". They raise ParameterError where a node or its
+    answer is missing.
     """
 
     NODES = ("aircraft", "bridge", "controller", "guidance")
@@ -31,22 +33,35 @@ class ControlClient(Client):
     def nodes(self) -> list[str]:
         """The nodes of the flight that can be commanded and are in the graph."""
         namespace = self._node.get_namespace()
-        running = {name for name, where in self._node.get_node_names_and_namespaces() if where == namespace}
+        running = {
+            name for name, where in self._node.get_node_names_and_namespaces() if where == namespace
+        }
         return [name for name in self.NODES if name in running]
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
         """Values of a node's parameters, without the parameters that are not set."""
-        values = self._call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=list(names))).values
-        read = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=False)}
+        values = self._call(
+            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=list(names))
+        ).values
+        read = {
+            name: parameter_value_to_python(value)
+            for name, value in zip(names, values, strict=False)
+        }
         return {
-            name: value.tolist() if hasattr(value, "tolist") else value for name, value in read.items() if value is not None
+            name: value.tolist() if hasattr(value, "tolist") else value
+            for name, value in read.items()
+            if value is not None
         }
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
-        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        result = self._call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+        request.parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        result = self._call(
+            SetParametersAtomically, f"{node}/set_parameters_atomically", request
+        ).result
         return "" if result.successful else str(result.reason)
 
     def activate(self, *, active: bool) -> str:
@@ -54,7 +69,11 @@ class ControlClient(Client):
         number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         request = ChangeState.Request(transition=Transition(id=number))
         response = self._call(ChangeState, "controller/change_state", request)
-        return "" if response.success else f"the controller is {'active' if active else 'inactive'} already"
+        return (
+            ""
+            if response.success
+            else f"the controller is {'active' if active else 'inactive'} already"
+        )
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di guide`."""
@@ -65,7 +84,9 @@ class ControlClient(Client):
         return self._operator().send_route(points)
 
     def keep_link(self) -> None:
-        """Tell guidance, where there is one, that an operator is there: `guidance.home.link_timeout` counts from now."""
+        """Tell guidance, where there is one, that an operator is there:
+        `guidance.home.link_timeout` counts from now.
+        """
         if "guidance" in self.nodes():
             self._operator().keep_link()
 

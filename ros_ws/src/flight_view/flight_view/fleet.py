@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The places of all aircraft of a fleet, for the map of a page with the flight of a single aircraft."""
+"""The places of all aircraft of a fleet, for the map of a page with the flight of a single
+aircraft.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,17 +24,27 @@ class Fleet:
     @property
     def samples(self) -> dict[str, Series]:
         """The poses by number of the aircraft."""
-        return {str(k): flight.samples[POSE] for k, flight in enumerate(self.flights) if POSE in flight.samples}
+        return {
+            str(k): flight.samples[POSE]
+            for k, flight in enumerate(self.flights)
+            if POSE in flight.samples
+        }
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0 of the first aircraft that has begun: the clock of the stamps is common."""
+        """Stamp of flight time 0 of the first aircraft that has begun: the clock of the stamps is
+        common.
+        """
         return min((flight.start_ns for flight in self.flights if flight.samples), default=0)
 
     @property
     def description(self) -> dict[str, Any]:
         """Name and flight time 0 of each aircraft, by the clock of the stamps, s."""
-        return {"aircraft": [[flight.aircraft, flight.start_ns / NANOSECONDS] for flight in self.flights]}
+        return {
+            "aircraft": [
+                [flight.aircraft, flight.start_ns / NANOSECONDS] for flight in self.flights
+            ]
+        }
 
     @property
     def described(self) -> int:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Follows the log of a run, live or recorded: samples by topic, events, and the state of the recording."""
+"""Follows the log of a run, live or recorded: samples by topic, events, and the state of the
+recording.
+"""
 
 import math
 import time
@@ -21,7 +23,13 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import ModelSpan, known_entries, settling_bands
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.run_folder import log_account
-from flight_analysis.report.summary import NO_UNIT, display_unit, display_units, model_rows, pulse_edges
+from flight_analysis.report.summary import (
+    NO_UNIT,
+    display_unit,
+    display_units,
+    model_rows,
+    pulse_edges,
+)
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -37,7 +45,15 @@ from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, stamped_sentence
-from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
+from flight_log.named_vectors import (
+    JOINT_STATE,
+    Decoder,
+    Samples,
+    decoder,
+    flight_start_ns,
+    tables,
+    typestore,
+)
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
 from flight_view.background import Line
@@ -45,8 +61,13 @@ from flight_view.series import Series
 
 LEARNED = "learned"  # entries of A and B, as identified in flight
 RATE = 50.0  # Hz
-RATES = {"internals": math.inf, LEARNED: math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}
-"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
+RATES = {
+    "internals": math.inf,
+    LEARNED: math.inf,
+    **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE),
+}
+"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples
+would be hidden."""
 
 IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
 
@@ -82,7 +103,8 @@ SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
 ROUTE = "route"
 ROUTE_TYPE = "nav_msgs/msg/Path"
-LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
+# bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
+LIVE_BACKLOG = 200_000
 MAX_EVENTS = 5000
 MAX_NOTES = 50
 MAX_CHANNELS = 200
@@ -123,8 +145,8 @@ class _Flown(NamedTuple):
 class Flight:
     """A flight in a log. `update` reads new messages.
 
-    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the scenario in the log. `background`:
-    lines of the map, of `background.read_background`.
+    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the
+    scenario in the log. `background`: lines of the map, of `background.read_background`.
     """
 
     def __init__(
@@ -145,7 +167,8 @@ class Flight:
             "mode.lateral": guidance_state.Lateral,
             "mode.vertical": guidance_state.Vertical,
         }
-        # What a page shows beside the samples, ready for JSON: the names of modes; `_described` once the scenario is read.
+        # What a page shows beside the samples, ready for JSON: the names of modes; `_described`
+        # once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
             "modes": {channel: _mode_names(kind) for channel, kind in modes.items()},
@@ -179,8 +202,17 @@ class Flight:
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0: by `truth`, else the first y_m, the origin of commands; else the earliest stamp."""
-        return next((stamp for stamp in (self._start_ns, self._reference_ns, self._first_ns) if stamp is not None), 0)
+        """Stamp of flight time 0: by `truth`, else the first y_m, the origin of commands; else the
+        earliest stamp.
+        """
+        return next(
+            (
+                stamp
+                for stamp in (self._start_ns, self._reference_ns, self._first_ns)
+                if stamp is not None
+            ),
+            0,
+        )
 
     @property
     def aircraft(self) -> str:
@@ -194,7 +226,9 @@ class Flight:
         return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
 
     def state(self) -> str:
-        """What the recording does: "waiting", "reading" what is there, "recording", "no data", "interrupted" or "ended"."""
+        """What the recording does: "waiting", "reading" what is there, "recording", "no data",
+        "interrupted" or "ended".
+        """
         if self._behind:
             return "reading"
         if self._follower.complete:
@@ -211,18 +245,26 @@ class Flight:
 
     @property
     def models(self) -> dict[str, Any]:
-        """Headings and rows of the rms of the measured error by model, as in the report; empty without a learner."""
+        """Headings and rows of the rms of the measured error by model, as in the report; empty
+        without a learner.
+        """
         if LEARNED not in self.samples or not self._flown:
             return {}
         digests = list(dict.fromkeys(span.digest for span in self._flown))
         ends_ns = [*(span.start_ns for span in self._flown[1:]), self._flown[-1].stop_ns]
         spans = []
         for span, stop_ns in zip(self._flown, ends_ns, strict=True):
-            start, stop = ((stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
+            start, stop = (
+                (stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns)
+            )
             if span.ticks:
-                rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
+                rms = {
+                    name: math.sqrt(square / span.ticks) for name, square in span.squares.items()
+                }
                 spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
-        units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | ({} if self.scenario is None else display_units(self.scenario))
+        units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | (
+            {} if self.scenario is None else display_units(self.scenario)
+        )
         headings, rows = model_rows(spans, units)
         return {"headings": ["", *headings], "rows": rows}
 
@@ -230,19 +272,37 @@ class Flight:
         """Sentences on what the log lacks."""
         follower = self._follower
         among = f" among {_text(listed(self._kinds))}" if self._kinds else ""
-        refused = {name: samples.refused for name, samples in self.samples.items() if samples.refused}
+        refused = {
+            name: samples.refused for name, samples in self.samples.items() if samples.refused
+        }
         return [
             *self.notes,
             *self._lacks,
-            *([f"no sample of a flight{among}"] if self._follower.complete and not self.samples else []),
-            *([f"the log cannot be read further: {_text(follower.fault)}"] if follower.fault else []),
-            *([f"{follower.damaged} damaged parts of the log are left out"] if follower.damaged else []),
+            *(
+                [f"no sample of a flight{among}"]
+                if self._follower.complete and not self.samples
+                else []
+            ),
+            *(
+                [f"the log cannot be read further: {_text(follower.fault)}"]
+                if follower.fault
+                else []
+            ),
+            *(
+                [f"{follower.damaged} damaged parts of the log are left out"]
+                if follower.damaged
+                else []
+            ),
             *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
-            *(f"{name}: {count} samples out of order are left out" for name, count in refused.items()),
+            *(
+                f"{name}: {count} samples out of order are left out"
+                for name, count in refused.items()
+            ),
         ]
 
     def update(self, budget: float = math.inf) -> bool:
-        """Read for at most about `budget` s. Whether there was anything to read; the next call reads on.
+        """Read for at most about `budget` s. Whether there was anything to read; the next call
+        reads on.
 
         Raises ParameterError where the log cannot be read, or for a folder with several bags.
         """
@@ -260,7 +320,9 @@ class Flight:
                     self._behind = self._follower.backlog > LIVE_BACKLOG
                     break
         except OSError as error:
-            raise ParameterError(f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight") from None
+            raise ParameterError(
+                f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight"
+            ) from None
         if news:
             for topic in self._topics.values():
                 self._decode(topic)
@@ -277,7 +339,9 @@ class Flight:
             self._account.join()
 
     def _count(self) -> None:
-        """What an ended log lacks. The page reads a part of the samples; this reads the whole log."""
+        """What an ended log lacks. The page reads a part of the samples; this reads the whole
+        log.
+        """
         with suppress(ParameterError, OSError):
             recorded = read_run(self.run, self._namespace)
             if self._given is not None:
@@ -302,12 +366,17 @@ class Flight:
             self._namespace = namespace
         if namespace != self._namespace:
             if not self._asked:
-                self._note(f"another aircraft in the namespace {namespace or '/'} is not shown: --namespace {namespace or '/'}")
+                self._note(
+                    f"another aircraft in the namespace {namespace or '/'} is not shown: "
+                    f"--namespace {namespace or '/'}"
+                )
             return 0.0
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Whether a namespace belongs to the aircraft on the page, or the aircraft is not known yet."""
+        """Whether a namespace belongs to the aircraft on the page, or the aircraft is not known
+        yet.
+        """
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -321,7 +390,9 @@ class Flight:
                     self._note(f"{topic}: the recorder lost {count} messages")
             elif record.name == CHANNEL_UNITS and "units" not in self.description:
                 units = {name: display_unit(unit) for name, unit in record.metadata.items()}
-                self.description |= {"units": {name: unit._asdict() for name, unit in units.items()}}
+                self.description |= {
+                    "units": {name: unit._asdict() for name, unit in units.items()}
+                }
                 self.described += 1
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
             self._take_scenario(record.data)
@@ -331,7 +402,9 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
+            self.description |= _described(
+                self.scenario
+            )  # reads the airframe, maybe a file of another machine
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
 
@@ -361,21 +434,34 @@ class Flight:
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values, _ = decoded
-        # A pose has the channels that a bridge has received so far: poses with fewer than the widest pose are left out.
+        # A pose has the channels that a bridge has received so far: poses with fewer than the
+        # widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        if names != topic.names and sorted(names) == sorted(topic.names):  # of a second publisher: values are matched by name
+        if names != topic.names and sorted(names) == sorted(
+            topic.names
+        ):  # of a second publisher: values are matched by name
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
             shown = GROUPS.get(topic.name)
-            chosen = [i for i, name in enumerate(names) if shown is None or name in shown or name.partition(".")[0] in shown]
+            chosen = [
+                i
+                for i, name in enumerate(names)
+                if shown is None or name in shown or name.partition(".")[0] in shown
+            ]
             if len(chosen) > MAX_CHANNELS:
-                self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
+                self._note(
+                    f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown"
+                )
             topic.names = names
             topic.columns = np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
             narrower = self.samples.get(topic.name)
-            samples = self.samples[topic.name] = Series(tuple(_text(names[i]) for i in topic.columns))
-            samples.thinned = 0 if narrower is None else narrower.thinned + 1  # pages read the topic again
+            samples = self.samples[topic.name] = Series(
+                tuple(_text(names[i]) for i in topic.columns)
+            )
+            samples.thinned = (
+                0 if narrower is None else narrower.thinned + 1
+            )  # pages read the topic again
         samples = self.samples[topic.name]
         if topic.name == POSE and set(names) < set(topic.names):
             return
@@ -399,15 +485,23 @@ class Flight:
             self._take_errors(stamp_ns, names, values)
         samples.append(stamp_ns, values[:, topic.columns])
         if topic.name == LEARNED:
-            entries = known_entries(Signal(samples.stamp_ns, samples.names, samples.values.astype(float)))
+            entries = known_entries(
+                Signal(samples.stamp_ns, samples.names, samples.values.astype(float))
+            )
             self.description |= {"learned": entries}
             self.described += 1
 
-    def _take_errors(self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray) -> None:
+    def _take_errors(
+        self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray
+    ) -> None:
         """Sum the squares of e in the engaged ticks under each set of parameters."""
         flown = values[:, names.index("parameters")]
         engaged = values[:, names.index("mode")] == Mode.ENGAGED
-        errors = {_text(name[2:]): values[:, k] for k, name in enumerate(names[:MAX_CHANNELS]) if name.startswith("e.")}
+        errors = {
+            _text(name[2:]): values[:, k]
+            for k, name in enumerate(names[:MAX_CHANNELS])
+            if name.startswith("e.")
+        }
         for rows in np.split(np.arange(len(flown)), np.flatnonzero(np.diff(flown)) + 1):
             digest = float(flown[rows[0]])
             start_ns = int(stamp_ns[rows[0]])
@@ -418,7 +512,9 @@ class Flight:
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}
-                span = before._replace(stop_ns=stop_ns, ticks=before.ticks + len(counted), squares=total)
+                span = before._replace(
+                    stop_ns=stop_ns, ticks=before.ticks + len(counted), squares=total
+                )
             if len(self._flown) < MAX_SPANS:
                 self._flown.append(span)
 
@@ -427,11 +523,21 @@ class Flight:
         for k in changes.tolist():
             number = modes[k]
             known = number in set(Mode)
-            self._add_event(PageEvent(int(stamp_ns[k]), "mode", Mode(int(number)).name if known else f"mode {number:g}"))
+            self._add_event(
+                PageEvent(
+                    int(stamp_ns[k]),
+                    "mode",
+                    Mode(int(number)).name if known else f"mode {number:g}",
+                )
+            )
         self._mode = modes[-1]
 
     def _take_events(self, messages: Messages) -> None:
-        namespace = messages.topic.removesuffix(ENGAGEMENT).removesuffix(f"/{ROUTE}").removesuffix(f"/{LEARNING}")
+        namespace = (
+            messages.topic.removesuffix(ENGAGEMENT)
+            .removesuffix(f"/{ROUTE}")
+            .removesuffix(f"/{LEARNING}")
+        )
         if messages.topic not in SHARED and not self._shows(namespace):
             return
         store = typestore()
@@ -446,11 +552,16 @@ class Flight:
                     kind = "warning" if message.level == WARN else "error"
                     self._add_event(PageEvent(sent_ns, kind, f"{message.name}: {message.msg}"))
                 elif message.name.rpartition(".")[2] == CONTROL:
-                    self._add_event(PageEvent(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: ")))
+                    self._add_event(
+                        PageEvent(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: "))
+                    )
             elif messages.type_name == PARAMETER_EVENT:
                 # Before the first sample, starting nodes declare parameters.
                 new = message.new_parameters if self._first_ns is not None else []
-                changed = {entry.name: parameter_value(entry.value) for entry in (*new, *message.changed_parameters)}
+                changed = {
+                    entry.name: parameter_value(entry.value)
+                    for entry in (*new, *message.changed_parameters)
+                }
                 text = ", ".join(f"{name} = {_shown(value)}" for name, value in changed.items())
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
@@ -464,10 +575,14 @@ class Flight:
                 places = [stamped.pose.position for stamped in message.poses]
                 self._take_route(sent_ns, [Waypoint(place.y, place.x, place.z) for place in places])
             else:
-                self._add_event(PageEvent(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
+                self._add_event(
+                    PageEvent(sent_ns, "bridge", f"{message.key} {message.value}".strip())
+                )
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """A route received in flight replaces the route before, unless guidance refuses the new route."""
+        """A route received in flight replaces the route before, unless guidance refuses the new
+        route.
+        """
         guided = None if self.scenario is None else self.scenario.guidance
         if guided is None:
             return
@@ -504,7 +619,11 @@ class Flight:
 
 def _shown(value: Any) -> str:
     """The value of a parameter; of a matrix its size."""
-    return f"{len(value)} values" if isinstance(value, list) and len(value) > MAX_VALUES else str(value)
+    return (
+        f"{len(value)} values"
+        if isinstance(value, list) and len(value) > MAX_VALUES
+        else str(value)
+    )
 
 
 def _text(text: str) -> str:
@@ -545,7 +664,8 @@ def _described(scenario: Scenario) -> dict[str, Any]:
 
 
 def _mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north, east, altitude, m.
+    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north,
+    east, altitude, m.
 
     Raises ParameterError for a route that cannot be flown.
     """

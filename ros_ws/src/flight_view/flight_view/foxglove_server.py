@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves a flight in progress to viewers of the Foxglove protocol: Foxglove, Lichtblick, PlotJuggler.
+"""Serves a flight in progress to viewers of the Foxglove protocol: Foxglove, Lichtblick,
+PlotJuggler.
 
-The messages are copies from the log, byte for byte, from the connection on. A viewer can send nothing.
+The messages are copies from the log, byte for byte, from the connection on. A viewer can send
+nothing.
 """
 
 import math
@@ -22,7 +24,8 @@ BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
 
 
 def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
-    """Serve a run until the end of the recording, SIGINT or SIGTERM. `announce` gets a line for the user.
+    """Serve a run until the end of the recording, SIGINT or SIGTERM. `announce` gets a line for the
+    user.
 
     Raises ParameterError where the port is taken, or the recording has ended before.
     """
@@ -31,7 +34,9 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
         signal.signal(number, lambda *_: ended.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
     before = {
-        record.topic: record._replace(data=[]) for record in follower.read() if isinstance(record, Messages)
+        record.topic: record._replace(data=[])
+        for record in follower.read()
+        if isinstance(record, Messages)
     }  # what defines a channel
     require(
         not follower.complete,
@@ -43,17 +48,26 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     channels: dict[str, foxglove.Channel] = {}
     try:
         server = foxglove.start_server(
-            name=run.name, host=ADDRESS, port=port, capabilities=[], context=context, message_backlog_size=BACKLOG
+            name=run.name,
+            host=ADDRESS,
+            port=port,
+            capabilities=[],
+            context=context,
+            message_backlog_size=BACKLOG,
         )
     except RuntimeError:
-        raise ParameterError(f"--port: {port} cannot be used, expected a free port of this host") from None
+        raise ParameterError(
+            f"--port: {port} cannot be used, expected a free port of this host"
+        ) from None
     announce(f"ws://{ADDRESS}:{server.port} for Foxglove, Lichtblick and PlotJuggler")
     try:
         for first in before.values():
             _channel(first, follower, channels, context)
         while not ended.wait(POLL_PERIOD) and not follower.complete and not follower.fault:
             for record in follower.read():
-                if (channel := _channel(record, follower, channels, context)) is not None and isinstance(record, Messages):
+                if (
+                    channel := _channel(record, follower, channels, context)
+                ) is not None and isinstance(record, Messages):
                     for sent_ns, data in zip(record.sent_ns, record.data, strict=True):
                         channel.log(data, log_time=sent_ns)
     finally:
@@ -62,13 +76,20 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
 
 
 def _channel(
-    record: object, follower: Follower, channels: dict[str, foxglove.Channel], context: foxglove.Context
+    record: object,
+    follower: Follower,
+    channels: dict[str, foxglove.Channel],
+    context: foxglove.Context,
 ) -> foxglove.Channel | None:
-    """The channel of a topic, advertised with the first messages; None for a record without messages."""
+    """The channel of a topic, advertised with the first messages; None for a record without
+    messages.
+    """
     if not isinstance(record, Messages):
         return None
     if record.topic not in channels:
         definition = follower.definitions.get(record.type_name, "").encode()
         schema = foxglove.Schema(name=record.type_name, encoding="ros2msg", data=definition)
-        channels[record.topic] = foxglove.Channel(record.topic, schema=schema, message_encoding="cdr", context=context)
+        channels[record.topic] = foxglove.Channel(
+            record.topic, schema=schema, message_encoding="cdr", context=context
+        )
     return channels[record.topic]

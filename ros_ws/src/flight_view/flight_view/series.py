@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 
 MAX_ROWS = 100_000
-"""Rows of a topic. 30 channels then need 12 MB; 100 Hz last 17 min before the samples become coarser, 50 Hz 33 min."""
+"""Rows of a topic. 30 channels then need 12 MB; 100 Hz last 17 min before the samples become
+coarser, 50 Hz 33 min."""
 
 DISORDER_NS = 1_000_000_000
 """A controller that recovers from an overrun has ticks a few ms older than the tick before."""
@@ -40,8 +41,12 @@ class Series:
         return self._values[: self.count]
 
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
-        """Append rows. A row up to DISORDER_NS older than an earlier row takes the newer stamp; an older row is refused."""
-        earliest = self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
+        """Append rows. A row up to DISORDER_NS older than an earlier row takes the newer stamp; an
+        older row is refused.
+        """
+        earliest = (
+            self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
+        )
         ordered = np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[1:]
         in_order = stamp_ns >= ordered - DISORDER_NS
         self.refused += int(np.count_nonzero(~in_order))
@@ -57,20 +62,30 @@ class Series:
         end = self.count + len(stamp_ns)
         if end > len(self._stamp_ns):
             size = min(max(end, len(self._stamp_ns) * 3 // 2), max(end, self._max_rows))
-            self._stamp_ns = np.concatenate([self.stamp_ns, np.zeros(size - self.count, dtype=np.int64)])
-            self._values = np.concatenate([self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)])
+            self._stamp_ns = np.concatenate(
+                [self.stamp_ns, np.zeros(size - self.count, dtype=np.int64)]
+            )
+            self._values = np.concatenate(
+                [self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)]
+            )
         self._stamp_ns[self.count : end] = stamp_ns
         with np.errstate(over="ignore"):  # beyond float32 a value is drawn as infinite
             self._values[self.count : end] = values
         self.count = end
 
     def _thin(self) -> None:
-        """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps the peaks."""
+        """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps
+        the peaks.
+        """
         grouped = self.count - self.count % 4
         k = len(self.names)
-        for start in range(0, grouped, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
+        for start in range(
+            0, grouped, BLOCK
+        ):  # in place: temporary arrays of all rows would stay in the heap of the process
             groups = self._values[start : min(start + BLOCK, grouped)].reshape(-1, 4, k)
-            thin = np.stack([np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1).reshape(-1, k)
+            thin = np.stack(
+                [np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1
+            ).reshape(-1, k)
             self._values[start // 2 : start // 2 + len(thin)] = thin
         half = grouped // 2
         self._stamp_ns[:half] = self._stamp_ns[:grouped:2].copy()

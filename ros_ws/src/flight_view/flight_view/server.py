@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves the page and the samples of flights to browsers on this host, over HTTP.
 
-A browser asks for news, and draws the answer before the next request: nothing queues for a slow browser. After the first
-answer the browser asks by a WebSocket, with two fifths of the processor time of an HTTP request. Only GET is answered, for a
-fixed list of names. The Host header has to name this host, against DNS rebinding. The files of the page hold no flight and need
-no token. Samples need the token, against foreign users of this host: in a header, or as the first message of a WebSocket, which
-has to come from the page. A cookie would go to the servers on all ports of this host. With `Control` there is a single POST,
-with a second key and the origin of the page.
+A browser asks for news, and draws the answer before the next request: nothing queues for a slow
+browser. After the first answer the browser asks by a WebSocket, with two fifths of the processor
+time of an HTTP request. Only GET is answered, for a fixed list of names. The Host header has to
+name this host, against DNS rebinding. The files of the page hold no flight and need no token.
+Samples need the token, against foreign users of this host: in a header, or as the first message of
+a WebSocket, which has to come from the page. A cookie would go to the servers on all ports of this
+host. With `Control` there is a single POST, with a second key and the origin of the page.
 """
 
 import asyncio
@@ -43,10 +44,13 @@ ADDRESS = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
 SCENE = Path(str(files("flight_analysis.report"))) / "scene"  # shared with the report
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-FILES = {path.name: path for path in sorted([*PAGE.iterdir(), *SCENE.iterdir()]) if path.suffix in TYPES}
+FILES = {
+    path.name: path for path in sorted([*PAGE.iterdir(), *SCENE.iterdir()]) if path.suffix in TYPES
+}
 HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:;"
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src data:;"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -54,8 +58,12 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
-RESERVED = 8  # further connections: for requests of control, and for the first request of a connection
-REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, for the next request to begin, and for the peer to take the answer
+RESERVED = (
+    8  # further connections: for requests of control, and for the first request of a connection
+)
+# s, for a request to arrive in full, for the next request to begin, and for the peer to take the
+# answer
+REQUEST_TIMEOUT = 10.0
 MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
@@ -75,11 +83,18 @@ BUDGET = 0.05  # s of reading between two answers
 class Server:
     """The server of flights, and the task to follow the logs.
 
-    A second flight is a ghost. With `fleet` each flight is an aircraft of a fleet, and the last number has the places of all
-    aircraft.
+    A second flight is a ghost. With `fleet` each flight is an aircraft of a fleet, and the last
+    number has the places of all aircraft.
     """
 
-    def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None, *, fleet: bool = False) -> None:
+    def __init__(
+        self,
+        flights: Sequence[Flight],
+        token: str,
+        control: Control | None = None,
+        *,
+        fleet: bool = False,
+    ) -> None:
         self.followed = flights
         self.fleet = fleet
         self.flights: Sequence[Flight | Fleet] = [*flights, Fleet(flights)] if fleet else flights
@@ -88,7 +103,11 @@ class Server:
         self.port = 0
         self.streams: set[_News] = set()  # open WebSockets
         self._news = asyncio.Event()
-        names = [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([0-9]{1,3})", _Data), (r"/news/([0-9]{1,3})", _News)]
+        names = [
+            (r"/(|[a-z]+\.[a-z]+)", _File),
+            (r"/data/([0-9]{1,3})", _Data),
+            (r"/news/([0-9]{1,3})", _News),
+        ]
         self.http = _LimitedServer(
             Application(
                 [*names, *([(r"/control", _Control)] if control else [])],
@@ -104,7 +123,9 @@ class Server:
         )
 
     def listen(self, port: int) -> None:
-        """Listen on this host alone; port 0 takes any free port. Raises OSError where the port is taken."""
+        """Listen on this host alone; port 0 takes any free port. Raises OSError where the port is
+        taken.
+        """
         listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
         listener.setblocking(False)
         self.port = listener.getsockname()[1]
@@ -119,14 +140,18 @@ class Server:
 
     def knows(self, token: str | bytes) -> bool:
         """Whether a peer has the token."""
-        return hmac.compare_digest(token.encode() if isinstance(token, str) else token, self.token.encode())
+        return hmac.compare_digest(
+            token.encode() if isinstance(token, str) else token, self.token.encode()
+        )
 
     def accepts(self, host: str) -> bool:
         """Whether a Host header names this server, exactly."""
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
     async def follow(self) -> None:
-        """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update` does."""
+        """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update`
+        does.
+        """
         looked = -math.inf
         while True:
             changed = [flight.update(BUDGET) for flight in self.followed]
@@ -134,7 +159,9 @@ class Server:
             if any(changed):
                 self._news.set()
                 self._news.clear()
-                pause = 0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
+                pause = (
+                    0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
+                )
             if any(changed) or time.monotonic() > looked + STATE_PERIOD:
                 looked = time.monotonic()
                 for stream in [*self.streams]:
@@ -142,7 +169,9 @@ class Server:
             await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s for news."""
+        """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s
+        for news.
+        """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (remaining := deadline - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
@@ -150,14 +179,24 @@ class Server:
         return self.answer(flight, known)
 
     def answer(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic. Raises HTTPError for too long a number."""
+        """The answer to a browser with the `known` numbers of rows by topic. Raises HTTPError for
+        too long a number.
+        """
         several = len(self.followed) > 1
         fleet = len(self.followed) if self.fleet else 0
-        return answer(flight, known, ghost=several and not fleet, fleet=fleet, control=self.control is not None)
+        return answer(
+            flight,
+            known,
+            ghost=several and not fleet,
+            fleet=fleet,
+            control=self.control is not None,
+        )
 
 
 def _epoch(flight: Flight | Fleet) -> str:
-    """Changes when rows known to a browser have changed: by thinning, or with the instant of flight time 0."""
+    """Changes when rows known to a browser have changed: by thinning, or with the instant of flight
+    time 0.
+    """
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
@@ -166,8 +205,12 @@ def _first_rows(flight: Flight | Fleet, known: Mapping[str, str]) -> dict[str, i
     same = known.get("epoch") == _epoch(flight)
     rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
     if any(len(text) > MAX_DIGITS for text in rows.values()):
-        raise HTTPError(HTTPStatus.BAD_REQUEST, reason=f"A number of rows has more than {MAX_DIGITS} digits")
-    return {name: int(text) if text.isascii() and text.isdigit() else 0 for name, text in rows.items()}
+        raise HTTPError(
+            HTTPStatus.BAD_REQUEST, reason=f"A number of rows has more than {MAX_DIGITS} digits"
+        )
+    return {
+        name: int(text) if text.isascii() and text.isdigit() else 0 for name, text in rows.items()
+    }
 
 
 def has_news(flight: Flight | Fleet, known: Mapping[str, str]) -> bool:
@@ -182,14 +225,21 @@ def has_news(flight: Flight | Fleet, known: Mapping[str, str]) -> bool:
 
 
 def answer(
-    flight: Flight | Fleet, known: Mapping[str, str], *, ghost: bool = False, fleet: int = 0, control: bool = False
+    flight: Flight | Fleet,
+    known: Mapping[str, str],
+    *,
+    ghost: bool = False,
+    fleet: int = 0,
+    control: bool = False,
 ) -> bytes:
-    """Data unknown to a browser: the length of a head as uint32, the head as JSON, then columns per topic of the head.
+    """Data unknown to a browser: the length of a head as uint32, the head as JSON, then columns per
+    topic of the head.
 
     `fleet`: the number of the places of all aircraft; 0 without a fleet.
 
-    Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows: flight time in s as float64,
-    then the channels as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
+    Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows:
+    flight time in s as float64, then the channels as float32, filled up to a multiple of 8 bytes.
+    At most MAX_ROWS rows of a topic.
     """
     first = _first_rows(flight, known)
     topics = []
@@ -198,11 +248,14 @@ def answer(
         rows = slice(first[name], min(samples.count, first[name] + MAX_ROWS))
         t = (samples.stamp_ns[rows] - flight.start_ns) / NANOSECONDS
         if len(t):
-            topics.append({"name": name, "channels": samples.names, "first": rows.start, "count": len(t)})
+            topics.append(
+                {"name": name, "channels": samples.names, "first": rows.start, "count": len(t)}
+            )
             values = np.ascontiguousarray(samples.values[rows].T, dtype="<f4").tobytes()
             columns += [t.astype("<f8").tobytes(), values, bytes(-len(values) % 8)]
     events = [
-        [(event.stamp_ns - flight.start_ns) / NANOSECONDS, event.kind, event.text] for event in flight.events[first["events"] :]
+        [(event.stamp_ns - flight.start_ns) / NANOSECONDS, event.kind, event.text]
+        for event in flight.events[first["events"] :]
     ]
     head: dict[str, Any] = {
         "epoch": _epoch(flight),
@@ -227,14 +280,17 @@ def answer(
 
 
 class _LimitedServer(HTTPServer):
-    """Holds at most MAX_CONNECTIONS connections with the token, WebSockets included, and RESERVED further connections.
+    """Holds at most MAX_CONNECTIONS connections with the token, WebSockets included, and RESERVED
+    further connections.
 
     A new connection takes the place of the oldest connection that has not shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        self._admitted: dict[IOStream, bool] = {}  # by connection in the order of arrival: whether it has a place for long
+        self._admitted: dict[
+            IOStream, bool
+        ] = {}  # by connection in the order of arrival: whether it has a place for long
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._leave_out_closed()
@@ -244,21 +300,26 @@ class _LimitedServer(HTTPServer):
         super().handle_stream(stream, address)
 
     def admit(self, stream: IOStream) -> bool:
-        """Keep a connection that has shown the token. False where MAX_CONNECTIONS connections are kept already."""
+        """Keep a connection that has shown the token. False where MAX_CONNECTIONS connections are
+        kept already.
+        """
         self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:
             self._admitted[stream] = True
         return self._admitted.get(stream, False)
 
     def _leave_out_closed(self) -> None:
-        self._admitted = {stream: admitted for stream, admitted in self._admitted.items() if not stream.closed()}
+        self._admitted = {
+            stream: admitted for stream, admitted in self._admitted.items() if not stream.closed()
+        }
 
 
 class _Handler(RequestHandler):
-    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass answers.
+    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass
+    answers.
 
-    A connection without the token, or beyond MAX_CONNECTIONS, is closed after the answer. A connection whose peer does not take
-    the answer within REQUEST_TIMEOUT is closed, too.
+    A connection without the token, or beyond MAX_CONNECTIONS, is closed after the answer. A
+    connection whose peer does not take the answer within REQUEST_TIMEOUT is closed, too.
     """
 
     _kept = False
@@ -341,13 +402,18 @@ class _File(_Handler):
 
 
 class _Data(_Handler):
-    """The samples of a flight; the query holds the numbers of rows known to the browser, by topic."""
+    """The samples of a flight; the query holds the numbers of rows known to the browser, by
+    topic.
+    """
 
     async def get(self, *names: str) -> None:
         number = int(names[0])
         if number >= len(self.server.flights):
             raise HTTPError(HTTPStatus.NOT_FOUND)
-        known = {name: values[-1].decode("ascii", "replace") for name, values in self.request.query_arguments.items()}
+        known = {
+            name: values[-1].decode("ascii", "replace")
+            for name, values in self.request.query_arguments.items()
+        }
         content = await self.server.news(self.server.flights[number], known)
         self.set_header("Content-Type", "application/octet-stream")
         with suppress(StreamClosedError):  # the browser has left
@@ -355,7 +421,8 @@ class _Data(_Handler):
 
 
 class _News(_Handler, WebSocketHandler):
-    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the same answer.
+    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the
+    same answer.
 
     The first message is the token: a page sets no header of a WebSocket.
     """
@@ -389,9 +456,13 @@ class _News(_Handler, WebSocketHandler):
             else:
                 self._kept = True
             return None
-        self._known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
+        self._known = dict(
+            parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
+        )
         self._since = time.monotonic()
-        self._answered = asyncio.get_running_loop().create_future()  # done once the answer is in the buffers of the network
+        self._answered = (
+            asyncio.get_running_loop().create_future()
+        )  # done once the answer is in the buffers of the network
         self.look()
         return self._answered  # before it is done, the next message is not read
 
@@ -429,7 +500,9 @@ class _News(_Handler, WebSocketHandler):
 
 
 class _Control(_Handler):
-    """Requests of a page to command the flight: JSON, from the page's own origin, with the key typed by the user."""
+    """Requests of a page to command the flight: JSON, from the page's own origin, with the key
+    typed by the user.
+    """
 
     def get(self, *_: str) -> None:
         raise HTTPError(HTTPStatus.METHOD_NOT_ALLOWED)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the terminal: state, mode, outputs over their references, inputs, attitude, the last events."""
+"""A flight in the terminal: state, mode, outputs over their references, inputs, attitude, the last
+events.
+"""
 
 import math
 import time
@@ -19,11 +21,18 @@ from rise_di_controller.internals import Saturation
 REFRESH = 10.0  # Hz
 EVENTS = 6  # the last events
 SATURATED = {float(kind): kind.name.lower() for kind in (Saturation.MAGNITUDE, Saturation.RATE)}
-STYLES = {"recording": "bold green", "no data": "bold red", "interrupted": "bold yellow", "waiting": "yellow"}
+STYLES = {
+    "recording": "bold green",
+    "no data": "bold red",
+    "interrupted": "bold yellow",
+    "waiting": "yellow",
+}
 
 
 def show(flight: Flight) -> None:
-    """Show a flight until the recording ends or is interrupted, or Ctrl-C. Raises as `Flight.update`."""
+    """Show a flight until the recording ends or is interrupted, or Ctrl-C. Raises as
+    `Flight.update`.
+    """
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:
             flight.update()
@@ -50,10 +59,13 @@ def picture(flight: Flight) -> RenderableType:
         parts.append(Text(_attitude(flight)))
     start_ns = flight.start_ns
     lines = [
-        f"{(event.stamp_ns - start_ns) / NANOSECONDS:8.2f} s  {event.kind}: {event.text}" for event in flight.events[-EVENTS:]
+        f"{(event.stamp_ns - start_ns) / NANOSECONDS:8.2f} s  {event.kind}: {event.text}"
+        for event in flight.events[-EVENTS:]
     ]
     parts += [Text(line, style="dim") for line in lines]
-    return Group(*parts, *(Text(f"note: {sentence}", style="yellow") for sentence in flight.faults()))
+    return Group(
+        *parts, *(Text(f"note: {sentence}", style="yellow") for sentence in flight.faults())
+    )
 
 
 def _outputs(flight: Flight) -> Table:
@@ -73,16 +85,24 @@ def _inputs(flight: Flight) -> Table:
         unit, factor = _unit(flight, name)
         values = [_newest_of(flight, group, name) * factor for group in ("u", "u_free")]
         saturated = SATURATED.get(_newest(flight, "internals", f"limited.{name}"), "")
-        table.add_row(f"{name} {unit}", *map(_number, values), saturated, style="yellow" if saturated else "")
+        table.add_row(
+            f"{name} {unit}", *map(_number, values), saturated, style="yellow" if saturated else ""
+        )
     return table
 
 
 def _attitude(flight: Flight) -> str:
-    roll, pitch, heading = (math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi"))
+    roll, pitch, heading = (
+        math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi")
+    )
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
-    turned = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"  # a pose may have no psi
+    turned = (
+        f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
+    )  # a pose may have no psi
     angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {turned} deg"
-    placed = f", altitude {altitude:.1f} m, climb {climb:+.1f} m/s" if math.isfinite(altitude) else ""
+    placed = (
+        f", altitude {altitude:.1f} m, climb {climb:+.1f} m/s" if math.isfinite(altitude) else ""
+    )
     return angles + placed
 
 
@@ -98,12 +118,19 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
     """Names of the channels "group.name" of the ticks, in a log without ticks of the topic."""
     if "internals" not in flight.samples:
         return flight.samples[group].names if group in flight.samples else ()
-    return [name.partition(".")[2] for name in flight.samples["internals"].names if name.startswith(f"{group}.")]
+    return [
+        name.partition(".")[2]
+        for name in flight.samples["internals"].names
+        if name.startswith(f"{group}.")
+    ]
 
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
     """The newest value of a channel in the ticks, in a log without ticks in the topic."""
-    return _newest(flight, *(("internals", f"{group}.{name}") if "internals" in flight.samples else (group, name)))
+    return _newest(
+        flight,
+        *(("internals", f"{group}.{name}") if "internals" in flight.samples else (group, name)),
+    )
 
 
 def _unit(flight: Flight, name: str) -> tuple[str, float]:

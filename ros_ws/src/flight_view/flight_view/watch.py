@@ -27,40 +27,58 @@ DEFAULT_PORT = 8077
 
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
-    folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True) if is_folder(runs) else []
+    folders = (
+        sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True)
+        if is_folder(runs)
+        else []
+    )
     recording = []
     prefix = f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
         with suppress(ParameterError, OSError):
             held = any(is_locked(file) for file in bag_files(folder))
-            if held and (not namespace or any(topic.startswith(prefix) for topic in log_topics(folder))):
+            if held and (
+                not namespace or any(topic.startswith(prefix) for topic in log_topics(folder))
+            ):
                 recording.append(folder)
     return recording
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
-    """The newest run in recording, with a namespace of that aircraft, else the last run flown. Raises ParameterError."""
+    """The newest run in recording, with a namespace of that aircraft, else the last run flown.
+    Raises ParameterError.
+    """
     if recording := runs_in_recording(runs, namespace):
         return recording[0]
     latest = runs / "latest"
-    require(is_folder(latest), str(runs), "no run", "the runs of `rise-di fly`, or a RUN by its name")
+    require(
+        is_folder(latest), str(runs), "no run", "the runs of `rise-di fly`, or a RUN by its name"
+    )
     return latest.resolve()
 
 
 def namespaces(run: Path) -> list[str | None]:
-    """The namespaces of the aircraft in the log of a run; of a log without aircraft None alone, the first aircraft to come."""
+    """The namespaces of the aircraft in the log of a run; of a log without aircraft None alone, the
+    first aircraft to come.
+    """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]
     return [None]
 
 
 def require_log(run: Path, namespace: str | None = None) -> None:
-    """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an aircraft in the namespace."""
+    """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an
+    aircraft in the namespace.
+    """
     with suppress(OSError):
         if any(is_locked(file) for file in log_files(run)):
             return
     topics = log_topics(run)
-    aircraft = [topic for topic, name in topics.items() if full_name(name) == JOINT_STATE and topic.rpartition("/")[2] in RATES]
+    aircraft = [
+        topic
+        for topic, name in topics.items()
+        if full_name(name) == JOINT_STATE and topic.rpartition("/")[2] in RATES
+    ]
     has = f"no topic of a flight among {listed(topics)}" if topics else "no topic"
     require(bool(aircraft), str(run), has, A_FLIGHT)
     if namespace is not None:
@@ -90,16 +108,26 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
         try:
             server.listen(port)
         except OSError as error:
-            reason = os.strerror(error.errno or 0)  # the sentence of `strerror` may hold the address
+            reason = os.strerror(
+                error.errno or 0
+            )  # the sentence of `strerror` may hold the address
         else:
             break
     else:
-        raise ParameterError(f"--port: {port} cannot be used ({reason}), expected a free port of this host")
+        raise ParameterError(
+            f"--port: {port} cannot be used ({reason}), expected a free port of this host"
+        )
     announce(f"http://{ADDRESS}:{server.port}/#token={server.token}")
-    announce(f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
+    announce(
+        f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} "
+        f"{socket.gethostname()}"
+    )
     follow = asyncio.ensure_future(server.follow())
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):  # also when a shell started this in the background, with SIGINT ignored
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+    ):  # also when a shell started this in the background, with SIGINT ignored
         loop.add_signal_handler(number, follow.cancel)
     try:
         await follow

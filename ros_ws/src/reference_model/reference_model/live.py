@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Live commands u_m of a publisher, the age limit, and the ending after the loss of the publisher.
 
-Zero rates would keep the present bank. So the ending levels the wings first, from the attitude in u_m.
+Zero rates would keep the present bank. So the ending levels the wings first, from the attitude in
+u_m.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,9 @@ class LiveParams(NamedTuple):
     levelling_ns: int  # how long the ending levels the wings before all commands are zero
     bounds: FloatArray  # (m,) largest absolute values of u_m
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
-    channels: tuple[int, int, int, int] | None  # places of q, V, p, r in u_m; None where one is missing
+    channels: (
+        tuple[int, int, int, int] | None
+    )  # places of q, V, p, r in u_m; None where one is missing
     gain: tuple[float, float]  # of bank and of pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
 
@@ -36,26 +39,37 @@ class Live(NamedTuple):
 
 
 def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
-    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command out of bounds."""
+    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command out of
+    bounds.
+    """
     if (np.abs(u_m) > params.bounds).any():
-        raise ChannelError("bounds", f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}")
+        raise ChannelError(
+            "bounds", f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}"
+        )
     return Live(t_ns, u_m, None if attitude is None else (float(attitude[0]), float(attitude[1])))
 
 
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
     """u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
 
-    For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0 + V_m,
+    For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0
+    + V_m,
 
         phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
 
-    p, q, r follow by the inverse of Euler's equations in a coordinated turn (`flight_core.kinematics`); further commands ramp
-    to zero. Afterwards, and without a known attitude, every command is zero.
+    p, q, r follow by the inverse of Euler's equations in a coordinated turn
+    (`flight_core.kinematics`); further commands ramp to zero. Afterwards, and without a known
+    attitude, every command is zero.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
         return live.u_m
-    if silent_ns > params.levelling_ns or live.attitude is None or params.channels is None or params.speed is None:
+    if (
+        silent_ns > params.levelling_ns
+        or live.attitude is None
+        or params.channels is None
+        or params.speed is None
+    ):
         return np.zeros_like(live.u_m)
     at_q, at_v, at_p, at_r = params.channels
     phi, theta = map(tilt, live.attitude)
@@ -69,7 +83,9 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
 
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
-    """The state a period later: the attitude moves by Euler's equations with the reference rates, as the law tracks them."""
+    """The state a period later: the attitude moves by Euler's equations with the reference rates,
+    as the law tracks them.
+    """
     if live.attitude is None or params.channels is None:
         return live
     at_q, _, at_p, at_r = params.channels

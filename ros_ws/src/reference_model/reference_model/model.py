@@ -38,7 +38,8 @@ class Stepper(NamedTuple):
 def stepper(dt: float, params: Model) -> Stepper:
     """Matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    Their columns are Runge-Kutta steps of the unit vectors. The product is the same step to rounding, in a quarter of the time.
+    Their columns are Runge-Kutta steps of the unit vectors. The product is the same step to
+    rounding, in a quarter of the time.
     """
     n, m = params.B_m.shape
     x = np.eye(n, n + 3 * m)
@@ -52,12 +53,15 @@ def stepper(dt: float, params: Model) -> Stepper:
 
 
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
-    """x_m(t + dt), shape (n,), from x_m(t) and u_m at t, t + dt/2 and t + dt as a vector of shape (3m,)."""
+    """x_m(t + dt), shape (n,), from x_m(t) and u_m at t, t + dt/2 and t + dt as a vector of shape
+    (3m,).
+    """
     return matrices.Phi.dot(x_m) + matrices.Gamma.dot(u_m)
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
-    """A filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
+    """A filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n =
+    2m.
 
     The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs, as (2) requires.
     Arguments: shape (m,), rad/s and 1.

@@ -29,10 +29,12 @@ class Command(NamedTuple):
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
-    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's profile until u_m is received.
+    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's
+    profile until u_m is received.
 
-    In lockstep it publishes every y_m up to the instant of clock and computes the next one ahead. Where `u_m_rate` is set it
-    computes it once u_m has arrived: each instant of u_m has exactly one, without channels where there is no command.
+    In lockstep it publishes every y_m up to the instant of clock and computes the next one ahead.
+    Where `u_m_rate` is set it computes it once u_m has arrived: each instant of u_m has exactly
+    one, without channels where there is no command.
     """
 
     def __init__(self) -> None:
@@ -52,7 +54,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self._clock_subscription = self.subscribe(CLOCK)
         if self._u_m_ns or not self.parameters.lockstep:
             lock = PublisherLock(self._timeouts_ns)
-            self._u_m = self.receive(U_M, self._decode_u_m, self._take_u_m, lock=lock, max_age_ns=self._max_age_ns)
+            self._u_m = self.receive(
+                U_M, self._decode_u_m, self._take_u_m, lock=lock, max_age_ns=self._max_age_ns
+            )
             self._u_m_due: deque[Command | None] = deque()
 
     def period_ns(self) -> int:
@@ -76,7 +80,11 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def _decode_u_m(self, raw: bytes) -> Command | None:
         sample = self._decoder.decode(raw)
-        return None if sample is None else Command(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
+        return (
+            None
+            if sample is None
+            else Command(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
+        )
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
         """The attitude where the message has it."""
@@ -93,13 +101,22 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def _log_source(self, source: str) -> None:
         if source == "ending":
-            levels = "wings are levelled, then" if self.parameters.live.speed is not None else "from now on"
+            levels = (
+                "wings are levelled, then"
+                if self.parameters.live.speed is not None
+                else "from now on"
+            )
             self.get_logger().error(f"{self._u_m.name} timed out: {levels} all commands are zero")
         else:
             self.get_logger().info(f"commands from {self._u_m.name} replace the profile")
 
     def advance(self) -> bool:
-        self._clock_ns = max([self._clock_ns, *(stamp_of(received.message) for received in self._clock_subscription.take())])
+        self._clock_ns = max(
+            [
+                self._clock_ns,
+                *(stamp_of(received.message) for received in self._clock_subscription.take()),
+            ]
+        )
         advanced = False
         while True:
             if self._next is None and self._commands_known():
@@ -113,7 +130,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """Lockstep: whether u_m of the instant before the next sample is here, if there is one; it is taken."""
+        """Lockstep: whether u_m of the instant before the next sample is here, if there is one; it
+        is taken.
+        """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:
             return True

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the reference model: validation, and conversion to the arrays of model and profile."""
+"""Parameters of the reference model: validation, and conversion to the arrays of model and
+profile.
+"""
 
 from typing import Annotated
 
@@ -37,7 +39,9 @@ class Pulses(Config):
 
     def _check(self) -> None:
         for key in ("stop", "value"):
-            parameters.require_length(key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))])
+            parameters.require_length(
+                key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))]
+            )
         for k, (start, stop) in enumerate(zip(self.start, self.stop, strict=True)):
             require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
 
@@ -51,7 +55,9 @@ class Sine(Config):
 
 
 class CoordinatedTurn(Config):
-    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the commanded bank rate), to a channel."""
+    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the commanded bank rate), to a
+    channel.
+    """
 
     bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
     turn_rate: str = Field(description="the channel to which the turn rate is added, e.g. r")
@@ -59,14 +65,22 @@ class CoordinatedTurn(Config):
 
 
 class LiveCommands(Config):
-    """Live commands on the topic u_m in place of the profile, and their ending when their publisher is lost."""
+    """Live commands on the topic u_m in place of the profile, and their ending when their publisher
+    is lost.
+    """
 
-    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which u_m times out, s")
-    speed: Positive | None = Field(default=None, description="the trim speed V0, m/s, to level the wings; none: zero at once")
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
+        default=0.2, description="the age at which u_m times out, s"
+    )
+    speed: Positive | None = Field(
+        default=None, description="the trim speed V0, m/s, to level the wings; none: zero at once"
+    )
     levelling: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long the wings are levelled after a timeout, s"
     )
-    roll_rate: Positive = Field(default=0.35, description="the largest roll rate to level the wings, rad/s")
+    roll_rate: Positive = Field(
+        default=0.35, description="the largest roll rate to level the wings, rad/s"
+    )
     bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands")
 
 
@@ -88,36 +102,59 @@ class Linear(Config):
 class ReferenceModelConfig(NodeConfig):
     """Parameters of the reference model node."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(
+        description="the rate at which y_m is published, Hz"
+    )
     start_time: float = Field(
-        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
+        default=0.0,
+        ge=-1,
+        le=1e10,
+        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
     )
     outputs: Names = Field(description="the names of the outputs y_m")
-    second_order: SecondOrder | None = Field(default=None, description="the model, one filter per channel")
+    second_order: SecondOrder | None = Field(
+        default=None, description="the model, one filter per channel"
+    )
     linear: Linear | None = Field(default=None, description="the model, as matrices")
     rise: Positive = Field(description="the duration of a pulse's edge, s: bounds u_m_dot")
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
     live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
-    u_m_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: rate of u_m, Hz; 0: none")
+    u_m_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: rate of u_m, Hz; 0: none"
+    )
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
         if self.u_m_rate:
             divides = period_ns(self.u_m_rate, "u_m_rate") % period == 0
-            require(divides, "u_m_rate", f"{self.u_m_rate:g} Hz", f"a whole fraction of rate ({self.rate:g} Hz)")
+            require(
+                divides,
+                "u_m_rate",
+                f"{self.u_m_rate:g} Hz",
+                f"a whole fraction of rate ({self.rate:g} Hz)",
+            )
         turn = self.coordinated_turn
-        named = {f"pulses.{name}": name for name in self.pulses} | {f"sines.{name}": name for name in self.sines}
+        named = {f"pulses.{name}": name for name in self.pulses} | {
+            f"sines.{name}": name for name in self.sines
+        }
         if turn is not None:
-            named |= {"coordinated_turn.bank_rate": turn.bank_rate, "coordinated_turn.turn_rate": turn.turn_rate}
+            named |= {
+                "coordinated_turn.bank_rate": turn.bank_rate,
+                "coordinated_turn.turn_rate": turn.turn_rate,
+            }
         named |= {f"live.bounds.{name}": name for name in self.live.bounds}
         for key, name in named.items():
-            require(name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}")
+            require(
+                name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}"
+            )
         self._check_model()
         missing = [name for name in RATES_AND_SPEED if name not in self.outputs]
         levels = self.live.speed is None or (not missing and self.second_order is not None)
-        expected = f"none: wings are levelled by {', '.join(RATES_AND_SPEED)} of a second_order model"
+        expected = (
+            f"none: wings are levelled by {', '.join(RATES_AND_SPEED)} of a second_order model"
+        )
         require(levels, "live.speed", self.live.speed, expected)
 
     def _check_model(self) -> None:
@@ -127,32 +164,64 @@ class ReferenceModelConfig(NodeConfig):
         key = "second_order.damping"
         if self.second_order is not None:
             for name in ("natural_frequency", "damping"):
-                parameters.require_length(f"second_order.{name}", getattr(self.second_order, name), self.outputs)
+                parameters.require_length(
+                    f"second_order.{name}", getattr(self.second_order, name), self.outputs
+                )
         elif self.linear is not None:
             key = "linear.A_m"
             n = len(self.linear.states)
             m = len(self.outputs)
             for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):
                 count = len(getattr(self.linear, name))
-                require(count == rows * columns, f"linear.{name}", f"{count} values", f"{rows} rows of {columns}")
+                require(
+                    count == rows * columns,
+                    f"linear.{name}",
+                    f"{count} values",
+                    f"{rows} rows of {columns}",
+                )
             for output in self.outputs:
-                require(output in self.linear.states, "linear.states", ", ".join(self.linear.states), f"{output} among them")
+                require(
+                    output in self.linear.states,
+                    "linear.states",
+                    ", ".join(self.linear.states),
+                    f"{output} among them",
+                )
         with np.errstate(over="ignore"):
             A_m = self.model().A_m
         finite = bool(np.isfinite(A_m).all())
-        require(finite, "second_order", "an A_m that is not finite", "frequencies and dampings whose products are")
+        require(
+            finite,
+            "second_order",
+            "an A_m that is not finite",
+            "frequencies and dampings whose products are",
+        )
         largest = float(np.linalg.eigvals(A_m).real.max())
-        require(largest < 0, key, f"an eigenvalue of A_m with real part {largest:.3g}", "A_m Hurwitz: all of them negative")
+        require(
+            largest < 0,
+            key,
+            f"an eigenvalue of A_m with real part {largest:.3g}",
+            "A_m Hurwitz: all of them negative",
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             Phi = stepper(1.0 / self.rate, self.model()).Phi
         # 1e-6: equal eigenvalues, of a damping of 1, are computed to 1e-8
-        stable = bool(np.isfinite(Phi).all()) and float(np.abs(np.linalg.eigvals(Phi)).max()) < 1.0 + 1e-6
-        require(stable, "rate", f"{self.rate:g} Hz", "a higher one: the Runge-Kutta steps of the model diverge")
+        stable = (
+            bool(np.isfinite(Phi).all())
+            and float(np.abs(np.linalg.eigvals(Phi)).max()) < 1.0 + 1e-6
+        )
+        require(
+            stable,
+            "rate",
+            f"{self.rate:g} Hz",
+            "a higher one: the Runge-Kutta steps of the model diverge",
+        )
 
     def model(self) -> Model:
         """The matrices of equation (2)."""
         if self.second_order is not None:
-            return second_order(np.array(self.second_order.natural_frequency), np.array(self.second_order.damping))
+            return second_order(
+                np.array(self.second_order.natural_frequency), np.array(self.second_order.damping)
+            )
         if self.linear is None:
             raise ParameterError("second_order: found no model, expected second_order or linear")
         n = len(self.linear.states)
@@ -161,9 +230,11 @@ class ReferenceModelConfig(NodeConfig):
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def live_params(self) -> LiveParams:
-        """Limits of u_m and the gains of the ending: a quarter of the reference's bandwidths of p and q.
+        """Limits of u_m and the gains of the ending: a quarter of the reference's bandwidths of p
+        and q.
 
-        With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
+        With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping
+        of about 0.74.
         """
         section = self.live
         channels = None
@@ -184,7 +255,9 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of height 0."""
+        """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of
+        height 0.
+        """
         m = len(self.outputs)
         edges = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
         time = np.zeros((m, edges))

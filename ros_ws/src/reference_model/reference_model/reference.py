@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model without ROS: y_m sample by sample. Used by the node and by the simulation in one process."""
+"""The reference model without ROS: y_m sample by sample. Used by the node and by the simulation in
+one process.
+"""
 
 import numpy as np
 
@@ -15,7 +17,9 @@ BLOCK = 100  # steps for which the profile is evaluated at once
 
 
 class Reference:
-    """Equation (2) with the state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
+    """Equation (2) with the state x_m at the instants k periods. The commands are the profile's
+    until the first live u_m.
+    """
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
         self._model = parameters.model()
@@ -31,15 +35,17 @@ class Reference:
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
 
-        `attitude` has `channels.ATTITUDE`, None for an unknown attitude. Raises ChannelError for an old u_m and for a
-        u_m out of bounds.
+        `attitude` has `channels.ATTITUDE`, None for an unknown attitude. Raises ChannelError for an
+        old u_m and for a u_m out of bounds.
         """
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")
         self._live = live.take(t_ns, u_m, attitude, self._live_params)
 
     def source(self) -> str:
-        """Where the commands come from at the last sample: "profile", "live commands", or "ending" of a timed-out u_m."""
+        """Where the commands come from at the last sample: "profile", "live commands", or "ending"
+        of a timed-out u_m.
+        """
         if self._live is None:
             return "profile"
         aged = self._number * self.period_ns - self._live.t_ns > self._live_params.max_age_ns
@@ -48,7 +54,8 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """y_m at sample `number`, shape (m,), computed in steps of a period.
 
-        The law tracks the last sample until this sample: over skipped samples the dead reckoning takes the last rates.
+        The law tracks the last sample until this sample: over skipped samples the dead reckoning
+        takes the last rates.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
@@ -59,7 +66,9 @@ class Reference:
                 u_m = self._u_m[2 * index : 2 * index + 3].ravel()
             else:
                 u_m = np.tile(self._live_u_m(self._live), 3)
-                self._live = live.dead_reckon(self._live, tracked, self.period_ns, self._live_params)
+                self._live = live.dead_reckon(
+                    self._live, tracked, self.period_ns, self._live_params
+                )
             self._x_m = model.step(self._x_m, u_m, self._stepper)
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
@@ -70,7 +79,9 @@ class Reference:
         index = self._number % BLOCK
         u_m = self._block(self._number)[0] if index == 0 else self._u_m[2 * index]
         u_m = u_m if self._live is None else self._live_u_m(self._live)
-        y_m_dot: FloatArray = model.output(model.x_m_dot(0.0, self._x_m, u_m, self._model), self._model)
+        y_m_dot: FloatArray = model.output(
+            model.x_m_dot(0.0, self._x_m, u_m, self._model), self._model
+        )
         return y_m_dot
 
     def _live_u_m(self, state: Live) -> FloatArray:
@@ -78,6 +89,10 @@ class Reference:
         return live.commands(self._number * self.period_ns, state, y_m, self._live_params)
 
     def _block(self, number: int) -> FloatArray:
-        """Commands of the profile at the starts, middles and ends of BLOCK steps, ten times faster than BLOCK calls."""
-        u_m: FloatArray = command(seconds(self.period_ns) * (number + np.arange(2 * BLOCK + 1) / 2.0), self._profile)
+        """Commands of the profile at the starts, middles and ends of BLOCK steps, ten times faster
+        than BLOCK calls.
+        """
+        u_m: FloatArray = command(
+            seconds(self.period_ns) * (number + np.arange(2 * BLOCK + 1) / 2.0), self._profile
+        )
         return u_m

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface of the RISE-DI flight stack, in one import. A name loads its module at its first use; none needs ROS.
+"""The Python interface of the RISE-DI flight stack, in one import. A name loads its module at its
+first use; none needs ROS.
 
     import rise_di
 
@@ -135,7 +136,11 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
         "flight_design.gains.airframe_properties": ("airframe_facts",),
-        "flight_design.gains.gain_selection": ("GainAssessment", "Selection", "as_yaml as gains_yaml"),
+        "flight_design.gains.gain_selection": (
+            "GainAssessment",
+            "Selection",
+            "as_yaml as gains_yaml",
+        ),
         "flight_analysis.metrics": ("best_error", "error_metrics"),
         "flight_analysis.report.data_frame": ("data_frame",),
         "flight_analysis.report.report": ("Report", "report"),
@@ -155,7 +160,12 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_design.learning.scenario_learner": ("learner",),
         "rise_di.own_airframe": ("NewAirframe", "new_airframe"),
         "rise_di.own_loop": ("Loop", "as_control", "fly_plant"),
-        "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),
+        "rise_di_controller.control_law": (
+            "ControlLaw",
+            "Measurements",
+            "TunedLaw",
+            "without_limits",
+        ),
         "rise_di_controller.controller": ("Controller",),
         "rise_di_controller.decomposition": ("decompose",),
         "rise_di_controller.law": ("LawParams", "LawState", "Sign", "engage", "step"),

@@ -25,7 +25,9 @@ LONGEST = 20.0  # s, of a flight without a duration
 
 
 class Exported(NamedTuple):
-    """An exported controller: its files, the proof, None without one, and the text of the report."""
+    """An exported controller: its files, the proof, None without one, and the text of the
+    report.
+    """
 
     files: list[Path]
     proof: Proof | None
@@ -45,7 +47,8 @@ def export(
     fmu: bool = False,
     proof: bool = True,
 ) -> Exported:
-    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the same bits.
+    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
+    same bits.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
@@ -59,8 +62,8 @@ def export(
         fmu: Write a co-simulation unit of FMI 2.0 too.
         proof: Whether to prove.
 
-    Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C code, without a compiler,
-    and for a folder that cannot be written.
+    Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C
+    code, without a compiler, and for a folder that cannot be written.
     """
     chosen = find_scenario(scenario)
     folder = as_path(folder, "c", "the path of a folder")
@@ -76,9 +79,13 @@ def export(
     if run is None:
         length = min(chosen.flight.duration, LONGEST) if duration is None else duration
         sets = parameter_sets(controller)
-        recordings = _recordings(chosen.vary(flight={"duration": length}), sets, 0 if float32 else drawn, seed)
+        recordings = _recordings(
+            chosen.vary(flight={"duration": length}), sets, 0 if float32 else drawn, seed
+        )
     else:
-        sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
+        sets, recording, equal = run_recording(
+            run if isinstance(run, RecordedRun) else read_run(run)
+        )
         same = sets[0].digest() == controller.digest()
         require(same, "run", "a flight with other parameters", f"those of {title}")
         recordings = iter([recording])
@@ -90,7 +97,9 @@ def export(
     return Exported([*files, folder / REPORT], proved, text)
 
 
-def _recordings(scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int) -> Iterator[Recording]:
+def _recordings(
+    scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int
+) -> Iterator[Recording]:
     """Flights; `drawn` steps and a tenth as many calls, in parts, so that a part fits in memory."""
     yield from flight_recordings(scenario, sets)
     if drawn:

@@ -35,10 +35,11 @@ class CampaignResult(NamedTuple):
     figures: dict[str, Any]
 
     def rows(self) -> "pl.DataFrame":
-        """A row an aircraft, SI: seed, number, factor of the sweep, whether it diverged or lost track, figures, drawn entries.
+        """A row an aircraft, SI: seed, number, factor of the sweep, whether it diverged or lost
+        track, figures, drawn entries.
 
-        The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and "delay". The figures of
-        a diverged aircraft are null.
+        The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and
+        "delay". The figures of a diverged aircraft are null.
         """
         return Campaign.resume(self.folder).rows().collect()
 
@@ -60,28 +61,34 @@ def fly_campaign(
     runs: FilePath = "runs",
     progress: Progress | None = None,
 ) -> CampaignResult:
-    """Fly thousands of uncertain aircraft around the airframe of a scenario, and write the report of the campaign.
+    """Fly thousands of uncertain aircraft around the airframe of a scenario, and write the report
+    of the campaign.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         aircraft: How many uncertain aircraft.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
-        entries: Entries with a deviation of their own: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5, "noise[q]": 0.5}; "lag" and
-            "noise" mean all without their own. {"delay": 0.02} is the largest further delay of u, s. Lags, noise and delay
-            without an entry are those of the scenario.
-        distribution: Of the deviations: "uniform", "normal" with three standard deviations at the limit, or "corners".
+        entries: Entries with a deviation of their own: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5,
+            "noise[q]": 0.5}; "lag" and "noise" mean all without their own. {"delay": 0.02} is the
+            largest further delay of u, s. Lags, noise and delay without an entry are those of the
+            scenario.
+        distribution: Of the deviations: "uniform", "normal" with three standard deviations at the
+            limit, or "corners".
         score: Units of the rms errors in the score by output, SI: {"q": 0.02}.
-        wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the airframe; None: the scenario's.
+        wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the
+            airframe; None: the scenario's.
         seed: Seed of the aircraft.
-        sweep: A parameter of the controller, or its value in a channel, and its factors: {"beta[V]": [0.5, 1.0, 2.0]}.
+        sweep: A parameter of the controller, or its value in a channel, and its factors:
+            {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
         chunk: Aircraft computed at once; None: 1000, with a learner 1. More are faster on a GPU.
-        workers: Threads, with a learner processes; None: one a core. A script with a learner calls the function
-            under `if __name__ == "__main__":`.
+        workers: Threads, with a learner processes; None: one a core. A script with a learner calls
+            the function under `if __name__ == "__main__":`.
         runs: Folder that the folder of the campaign is made in.
         progress: Called with the flights so far and all flights, after each chunk.
 
-    Raises ParameterError with one sentence for what a campaign cannot fly. After Ctrl-C `resume_campaign` continues.
+    Raises ParameterError with one sentence for what a campaign cannot fly. After Ctrl-C
+    `resume_campaign` continues.
     """
     chosen = find_scenario(scenario, duration)
     spread = chosen.aircraft.uncertainty.spread()
@@ -90,7 +97,9 @@ def fly_campaign(
     if distribution is not None:
         spread = spread._replace(distribution=distribution)
     units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
-    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units)
+    definition = define(
+        chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
+    )
     learner(chosen)  # refuses what the aircraft could not learn with
     flies = _engine(definition, workers)
     report = _progress(progress)
@@ -98,8 +107,12 @@ def fly_campaign(
     return _fly(Campaign.begin(folder, definition), flies, report)
 
 
-def resume_campaign(folder: FilePath, *, workers: int | None = None, progress: Progress | None = None) -> CampaignResult:
-    """Fly the aircraft that an interrupted campaign has not flown. Raises ParameterError for a folder without a campaign."""
+def resume_campaign(
+    folder: FilePath, *, workers: int | None = None, progress: Progress | None = None
+) -> CampaignResult:
+    """Fly the aircraft that an interrupted campaign has not flown. Raises ParameterError for a
+    folder without a campaign.
+    """
     campaign = Campaign.resume(as_path(folder, "folder", "the folder of a campaign"))
     return _fly(campaign, _engine(campaign.definition, workers), _progress(progress))
 
@@ -111,7 +124,12 @@ def _engine(definition: Definition, workers: int | None) -> engines.Engine:
 
 
 def _progress(progress: Progress | None) -> Progress:
-    require(progress is None or callable(progress), "progress", progress, "a function of the flights so far and of all flights")
+    require(
+        progress is None or callable(progress),
+        "progress",
+        progress,
+        "a function of the flights so far and of all flights",
+    )
     return progress or (lambda flown, total: None)
 
 
@@ -119,7 +137,9 @@ def _numbers(values: Mapping[str, float], key: str, example: str) -> dict[str, f
     """Numbers by name. Raises ParameterError for another value."""
     if not isinstance(values, Mapping):
         raise ParameterError(f"{key}: found {values!r}, expected numbers by name, as in {example}")
-    return {str(name): as_number(value, f"{key}.{name}", -math.inf) for name, value in values.items()}
+    return {
+        str(name): as_number(value, f"{key}.{name}", -math.inf) for name, value in values.items()
+    }
 
 
 def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:
@@ -127,7 +147,8 @@ def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:
         return None
     if not isinstance(sweep, Mapping) or len(sweep) != 1:
         raise ParameterError(
-            f'sweep: found {sweep!r}, expected one parameter and its factors, as in {{"beta": [0.5, 1.0, 2.0]}}'
+            f'sweep: found {sweep!r}, expected one parameter and its factors, as in {{"beta": '
+            f"[0.5, 1.0, 2.0]}}"
         )
     ((parameter, factors),) = sweep.items()
     return Sweep.validate_mapping({"parameter": parameter, "factors": factors}, "sweep")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of a scenario as environments of gymnasium: the agent takes the place of the controller, a tick a step."""
+"""The aircraft of a scenario as environments of gymnasium: the agent takes the place of the
+controller, a tick a step.
+"""
 
 from typing import Any, NamedTuple
 
@@ -23,7 +25,8 @@ from flight_core.vectors import FloatArray, StampedVector, as_array
 require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
 
-UNLIMITED = 1.0  # SI, bound of an action that the controller does not limit: 57 deg, or the weight as thrust
+# SI, bound of an action that the controller does not limit: 57 deg, or the weight as thrust
+UNLIMITED = 1.0
 
 
 class _Channels(NamedTuple):
@@ -39,7 +42,8 @@ def _channels(scenario: Scenario) -> _Channels:
     controller = scenario.controller
     limits = controller.effector_limits()
     low, high = (
-        np.where(np.isfinite(limit), limit, sign * UNLIMITED) for limit, sign in ((limits.lower, -1), (limits.upper, 1))
+        np.where(np.isfinite(limit), limit, sign * UNLIMITED)
+        for limit, sign in ((limits.lower, -1), (limits.upper, 1))
     )
     shape = (2 * len(controller.outputs),)
     return _Channels(
@@ -50,13 +54,21 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """The scenario with the law alone, in whose place the agent acts: models of a law, or a learner, bind no agent."""
+    """The scenario with the law alone, in whose place the agent acts: models of a law, or a
+    learner, bind no agent.
+    """
     models = ("feedforward", "observer", "schedule", "learn")
-    return scenario.vary(controller={key: None for key in models if getattr(scenario.controller, key, None) is not None})
+    return scenario.vary(
+        controller={
+            key: None for key in models if getattr(scenario.controller, key, None) is not None
+        }
+    )
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
-    """Whether the last sample of a tick is the newest y in every tick, so that earlier samples need no measurement."""
+    """Whether the last sample of a tick is the newest y in every tick, so that earlier samples need
+    no measurement.
+    """
     aircraft = scenario.aircraft
     plain = aircraft.sensors.delay == 0.0 and aircraft.sensors.dropout == 0.0
     return (
@@ -69,7 +81,9 @@ def _is_newest_last(scenario: Scenario) -> bool:
 
 
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Inputs of a step. Raises ParameterError for another shape, and for values that are not finite numbers."""
+    """Inputs of a step. Raises ParameterError for another shape, and for values that are not finite
+    numbers.
+    """
     expected = f"finite numbers of shape {shape}"
     u = as_array(values, "action", expected)
     require(u.shape == shape and bool(np.isfinite(u).all()), "action", f"shape {u.shape}", expected)
@@ -79,29 +93,40 @@ def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     """Simulator and reference model of a scenario; the agent gives u.
 
-    Observation: y then y_m, shape (2 m,), SI, deviations from trim, outputs in the order of the controller; the newest y that
-    has arrived. Action: u, shape (p,), SI, deviation from trim, in the order of the controller's inputs, or of the effectors of
-    its allocation, within their limits.
-    Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, T the period of the controller and unit_i the unit of the score,
-    10 mrad/s (p 20) or 0.1 m/s. An aircraft that diverges terminates the episode: LOSS_OF_TRACK_SCORE for each second left.
-    The end of the flight's duration truncates the episode.
+    Observation: y then y_m, shape (2 m,), SI, deviations from trim, outputs in the order of the
+    controller; the newest y that has arrived. Action: u, shape (p,), SI, deviation from trim, in
+    the order of the controller's inputs, or of the effectors of its allocation, within their
+    limits. Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, T the period of the controller and
+    unit_i the unit of the score, 10 mrad/s (p 20) or 0.1 m/s. An aircraft that diverges terminates
+    the episode: LOSS_OF_TRACK_SCORE for each second left. The end of the flight's duration
+    truncates the episode.
 
     Args:
-        scenario: The aircraft, the reference model, and rate, channels and limits of the controller. Guidance is left out.
-        uncertainty: Every reset draws noise, turbulence, and an aircraft whose A and B are off by up to this fraction, 0 to 1,
-            with the entries and the distribution of `aircraft.uncertainty`.
-            None: every episode has the aircraft, the noise and the turbulence of the scenario.
+        scenario: The aircraft, the reference model, and rate, channels and limits of the
+            controller. Guidance is left out.
+        uncertainty: Every reset draws noise, turbulence, and an aircraft whose A and B are off by
+            up to this fraction, 0 to 1, with the entries and the distribution of
+            `aircraft.uncertainty`. None: every episode has the aircraft, the noise and the
+            turbulence of the scenario.
 
-    Raises ParameterError without gymnasium, for an aircraft of JSBSim with an uncertainty, and for an output without a score.
+    Raises ParameterError without gymnasium, for an aircraft of JSBSim with an uncertainty, and for
+    an output without a score.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
     def __init__(self, scenario: Scenario, uncertainty: float | None = None) -> None:
         self.scenario = as_scenario(scenario)
-        self._uncertainty = None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
+        self._uncertainty = (
+            None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
+        )
         controller = scenario.controller
-        require(not (scenario.aircraft.is_jsbsim and uncertainty), "uncertainty", uncertainty, "0: JSBSim has no A and B")
+        require(
+            not (scenario.aircraft.is_jsbsim and uncertainty),
+            "uncertainty",
+            uncertainty,
+            "0: JSBSim has no A and B",
+        )
         self.outputs = controller.outputs
         self.inputs = controller.effectors
         self.action_space, self.observation_space, self._units = _channels(scenario)
@@ -116,8 +141,12 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         require(self._k >= 0, "t", "no episode", "reset() first")
         return self._k * self._period
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
-        """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an episode."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an
+        episode.
+        """
         super().reset(seed=seed, options=options)
         self._y = np.zeros(len(self.outputs))
         self._topics = Topics(recorded=False)
@@ -139,27 +168,45 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._y_m = sample.value
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """Hold u for a period. Raises ParameterError outside an episode, and for an action that is not m finite numbers."""
+        """Hold u for a period. Raises ParameterError outside an episode, and for an action that is
+        not m finite numbers.
+        """
         require(0 <= self._k < self._ticks, "step", "a step outside an episode", "reset() first")
         u = _actions(action, (len(self.inputs),))
-        self._topics.publish("u", StampedVector(self._k * self._period_ns, u), self._k * self._period_ns)
+        self._topics.publish(
+            "u", StampedVector(self._k * self._period_ns, u), self._k * self._period_ns
+        )
         self._k += 1
         try:
             self._loop.run(self._k * self._period_ns)
         except FlightEnded as error:
             remaining = (self._ticks - self._k + 1) * self._period
             self._k = self._ticks
-            return self._observed(), -LOSS_OF_TRACK_SCORE * remaining, True, False, {"outcome": str(error)}
+            return (
+                self._observed(),
+                -LOSS_OF_TRACK_SCORE * remaining,
+                True,
+                False,
+                {"outcome": str(error)},
+            )
         observed = self._observed()
         e = observed[: len(self._y)] - observed[len(self._y) :]
-        return observed, -self._period * float(np.sum(np.abs(e) / self._units)), False, self._k >= self._ticks, {}
+        return (
+            observed,
+            -self._period * float(np.sum(np.abs(e) / self._units)),
+            False,
+            self._k >= self._ticks,
+            {},
+        )
 
     def _drawn(self) -> Scenario:
         """The scenario of the episode, drawn by the generator of the environment."""
         if self._uncertainty is None:
             return self.scenario
         number, seed = (int(value) for value in self.np_random.integers(0, 2**31, 2))
-        aircraft: dict[str, Any] = {"sensors": self.scenario.aircraft.sensors.model_dump() | {"seed": seed}}
+        aircraft: dict[str, Any] = {
+            "sensors": self.scenario.aircraft.sensors.model_dump() | {"seed": seed}
+        }
         if not self.scenario.aircraft.is_jsbsim:
             drawn = {"A": self._uncertainty, "B": self._uncertainty, "number": number}
             aircraft["uncertainty"] = self.scenario.aircraft.uncertainty.model_dump() | drawn
@@ -174,17 +221,20 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     """N uncertain aircraft of a scenario on one course, compiled.
 
-    Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with the rows of FlightEnv. The aircraft share
-    commands, wind and the noise of the sensors, and end together. Every `reset` draws N aircraft. A diverged aircraft
-    terminates. The next step starts the same aircraft from trim at the present time of the course, and the step after the end
-    of the flight draws N aircraft again: `AutoresetMode.NEXT_STEP`.
+    Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with the rows of
+    FlightEnv. The aircraft share commands, wind and the noise of the sensors, and end together.
+    Every `reset` draws N aircraft. A diverged aircraft terminates. The next step starts the same
+    aircraft from trim at the present time of the course, and the step after the end of the flight
+    draws N aircraft again: `AutoresetMode.NEXT_STEP`.
 
     Args:
         scenario: As that of FlightEnv, of an airframe with matrices.
         num_envs: N.
-        uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to 1.
+        uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to
+            1.
 
-    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of JSBSim.
+    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of
+    JSBSim.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
@@ -201,12 +251,19 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self._assemble = batch_matrices.assemble
         self._stepper = batch.Stepper
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(
+            self.single_action_space, self.num_envs
+        )
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
         self._units = units[:, None]
         self._k = 0
         self._last = 0
-        self._y, self._ended = np.zeros((len(units), self.num_envs)), np.zeros(self.num_envs, dtype=bool)
+        self._y, self._ended = (
+            np.zeros((len(units), self.num_envs)),
+            np.zeros(self.num_envs, dtype=bool),
+        )
 
     @property
     def t(self) -> float:
@@ -214,14 +271,22 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         require(self._last > 0, "t", "no episode", "reset() first")
         return self._k * self._course.period
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
-        """N new aircraft in trim at t = 0. A seed repeats them. Raises ParameterError for a list of seeds."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """N new aircraft in trim at t = 0. A seed repeats them. Raises ParameterError for a list of
+        seeds.
+        """
         seed = None if seed is None else as_count(seed, "seed", 0)
         super().reset(seed=seed, options=options)
         return self._begin(), {}
 
-    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Hold u for a period, (N, p). Raises ParameterError for another shape, and for an action that is not finite."""
+    def step(
+        self, actions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Hold u for a period, (N, p). Raises ParameterError for another shape, and for an action
+        that is not finite.
+        """
         u = _actions(actions, (self.num_envs, len(self._vehicle.inputs)))
         require(self._last > 0, "step", "a step before an episode", "reset() first")
         none = np.zeros(self.num_envs, dtype=bool)
@@ -237,7 +302,9 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self._ended = ~self._flights.bounded
         remaining = (self._last - self._k + 1) * self._course.period
         reward = -self._course.period * np.sum(np.abs(y - y_m) / self._units, axis=0)
-        reward = np.where(self._ended, -LOSS_OF_TRACK_SCORE * remaining, np.where(started, 0.0, reward))
+        reward = np.where(
+            self._ended, -LOSS_OF_TRACK_SCORE * remaining, np.where(started, 0.0, reward)
+        )
         truncated = ~self._ended if self._k == self._last else none
         return self._observed(y, y_m), reward, self._ended, truncated, {}
 
@@ -247,7 +314,9 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         part = self._uncertainty
         airframe = load_airframe(aircraft.airframe)
         seed = int(self.np_random.integers(0, 2**31))
-        A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread())
+        A, B = sampled_matrices(
+            airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread()
+        )
         directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
         drawn = self._assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
         self._flights = self._stepper(drawn, self._vehicle, self._course)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe of the user's own, with a scenario that flies, as `rise-di airframes --write` writes both."""
+"""An airframe of the user's own, with a scenario that flies, as `rise-di airframes --write` writes
+both.
+"""
 
 import tempfile
 from collections.abc import Sequence
@@ -51,38 +53,62 @@ def new_airframe(
     replace: bool = False,
     **body: str | float,
 ) -> NewAirframe:
-    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario with selected gains that has been flown once.
+    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario with selected gains that has
+    been flown once.
 
     Args:
-        source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an airframe file (.yaml), or
-            of a text of AVL (system matrix, or stability derivatives) or XFLR5 (state matrices).
+        source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
+            airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
+            XFLR5 (state matrices).
         folder: Folder of both files.
         name: Name of the airframe; empty: that of the file.
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
-        states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".
-        inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1 more thrust".
-        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V: ft/s"), or sums:
-            "q, V = 0.987 u + 0.163 w".
+        states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
+            theta: rad".
+        inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
+            down, thrust: 1 more thrust".
+        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V:
+            ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
             Empty: q, V, p, r by elevator, thrust, aileron, rudder.
-        thrust: Whether to add an input thrust in units of the weight along the flight path, for a model without a thrust.
+        thrust: Whether to add an input thrust in units of the weight along the flight path, for a
+            model without a thrust.
         text: Where the figures come from.
-        lag: Lags of the actuators in s, one or one an input; None: 0.05 s of a control surface, 0.3 s of an engine.
+        lag: Lags of the actuators in s, one or one an input; None: 0.05 s of a control surface, 0.3
+            s of an engine.
         replace: Whether files of these names may be replaced.
-        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit of length, `length`.
+        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit
+            of length, `length`.
 
-    Raises ParameterError with one sentence: for a model that contradicts physics, and for an aircraft that no gains fly.
+    Raises ParameterError with one sentence: for a model that contradicts physics, and for an
+    aircraft that no gains fly.
     """
     airframe, note = import_airframe(
-        source, name=name, speed=speed, states=states, inputs=inputs, outputs=outputs, thrust=thrust, text=text, **body
+        source,
+        name=name,
+        speed=speed,
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
+        thrust=thrust,
+        text=text,
+        **body,
     )
     is_file_name = Path(airframe.name).name == airframe.name
-    require(is_file_name, "name", repr(airframe.name), "the name of a file in the folder, without a /")
+    require(
+        is_file_name, "name", repr(airframe.name), "the name of a file in the folder, without a /"
+    )
     place = as_path(folder, "folder", "the path of a folder")
     files = place / f"{airframe.name}.yaml", place / f"{airframe.name}_flight.yaml"
-    source_is_target = isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
+    source_is_target = (
+        isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
+    )
     for path in files[source_is_target:]:
         require(replace or not path.exists(), "folder", f"{path}", "a new file, or replace")
-    lags = first_flight.default_lags(airframe) if lag is None else tuple(lags_by_input(lag, airframe).values())
+    lags = (
+        first_flight.default_lags(airframe)
+        if lag is None
+        else tuple(lags_by_input(lag, airframe).values())
+    )
     text_of_airframe = LICENCE + as_yaml(airframe)
     with tempfile.TemporaryDirectory() as trial:
         (Path(trial) / files[0].name).write_text(text_of_airframe, encoding="utf-8")
@@ -96,9 +122,11 @@ def new_airframe(
 
 
 def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]) -> str:
-    """The text of a scenario with selected gains whose flight ends as planned, clear of the end stops.
+    """The text of a scenario with selected gains whose flight ends as planned, clear of the end
+    stops.
 
-    `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text names them.
+    `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text
+    names them.
     """
     square = len(airframe.inputs) == len(airframe.outputs)
     inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)] if square else []
@@ -107,9 +135,13 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
     for size in SIZES:
 
         def text(path: Path, section: str, size: float = size) -> str:
-            return first_flight.scenario_text(airframe, str(path), str(files[1]), section, lag, size)
+            return first_flight.scenario_text(
+                airframe, str(path), str(files[1]), section, lag, size
+            )
 
-        selection = select_gains(trial, _parsed(text(trial, controller), files[1]), inputs=inputs, samples=SAMPLES)
+        selection = select_gains(
+            trial, _parsed(text(trial, controller), files[1]), inputs=inputs, samples=SAMPLES
+        )
         section = gain_yaml.as_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)
@@ -118,9 +150,12 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
         if tape.outcome == COMPLETED and max(used.values()) <= CLEAR:
             return text(files[0], section)
         hardest = max(used, key=lambda key: used[key])
-        reached = f"outcome {tape.outcome}, {hardest} at {100.0 * used[hardest]:.0f} % of its end stop"
+        reached = (
+            f"outcome {tape.outcome}, {hardest} at {100.0 * used[hardest]:.0f} % of its end stop"
+        )
     raise ParameterError(
-        f"airframe {airframe.name}: found {reached}, expected a flight: give the lags of its actuators with lag"
+        f"airframe {airframe.name}: found {reached}, expected a flight: give the lags of its "
+        "actuators with lag"
     )
 
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own: tick by tick, around a plant that is a function, and in python-control."""
+"""The controller in a loop of the user's own: tick by tick, around a plant that is a function, and
+in python-control.
+"""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -30,17 +32,20 @@ if TYPE_CHECKING:
     import control
 
 Plant = Callable[[float, FloatArray, float], ArrayLike]
-"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and measures y (m,) then; SI, deviations from trim."""
+"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and measures y (m,) then; SI,
+deviations from trim."""
 
 
 class Loop:
-    """The controller behind its guard, a call a tick. The node runs the same `Controller`, so u has the same bits.
+    """The controller behind its guard, a call a tick. The node runs the same `Controller`, so u has
+    the same bits.
 
         loop = rise_di.Loop(scenario.controller)
         u = loop.step(t, y, y_m)
 
     Args:
-        controller: Parameters of the controller, or a mapping of these as in the section `controller` of a scenario.
+        controller: Parameters of the controller, or a mapping of these as in the section
+            `controller` of a scenario.
 
     Raises ParameterError for parameters that the controller does not accept.
     """
@@ -55,12 +60,16 @@ class Loop:
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
-        self.output: ControlOutput | None = None  # of the last tick; None where nothing is to be sent
+        self.output: ControlOutput | None = (
+            None  # of the last tick; None where nothing is to be sent
+        )
         self.lost = ""  # why a sample of the last tick is lost; empty where none is
 
     @property
     def mode(self) -> Mode:
-        """Mode of the guard: WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they are old."""
+        """Mode of the guard: WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they
+        are old.
+        """
         return self._controller.mode
 
     @property
@@ -69,41 +78,62 @@ class Loop:
         return self._controller.names
 
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
-        """A tick at t in s: u, shape (m,), SI, deviation from trim, in the order of `inputs`; 0 before the engagement.
+        """A tick at t in s: u, shape (m,), SI, deviation from trim, in the order of `inputs`; 0
+        before the engagement.
 
-        With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations from trim, belong to t and
-        have the order of `outputs`; y of an observer with vanes has the order of `measured`. None is a lost
-        sample, and so is one that no aircraft can give: `lost` has the reason, and the first of a row is a RuntimeWarning.
-        t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
-        Raises ParameterError for a t that goes back, for a wrong length and for a value that is not finite.
+        With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations
+        from trim, belong to t and have the order of `outputs`; y of an observer with vanes has the
+        order of `measured`. None is a lost sample, and so is one that no aircraft can give: `lost`
+        has the reason, and the first of a row is a RuntimeWarning. t may jitter; it never goes
+        back. The failsafe of the guard starts where samples are older than `max_age`. Raises
+        ParameterError for a t that goes back, for a wrong length and for a value that is not
+        finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
         last_ns = self._now_ns
-        require(now_ns > last_ns, "t", f"{t:g} s", f"more than {seconds(last_ns):g} s, the t of the last tick")
+        require(
+            now_ns > last_ns,
+            "t",
+            f"{t:g} s",
+            f"more than {seconds(last_ns):g} s, the t of the last tick",
+        )
         self._now_ns = now_ns
         before = self.lost
         self.lost = ""
-        for key, value, take in (("y", y, self._controller.take_y), ("y_m", y_m, self._controller.take_y_m)):
+        for key, value, take in (
+            ("y", y, self._controller.take_y),
+            ("y_m", y_m, self._controller.take_y_m),
+        ):
             if value is not None:
                 names = self.measured if key == "y" else self.outputs
-                self.lost = take(StampedVector(now_ns, self.vector(value, key, names)), now_ns) or self.lost
+                self.lost = (
+                    take(StampedVector(now_ns, self.vector(value, key, names)), now_ns) or self.lost
+                )
         if self.lost and not before:
             warnings.warn(f"sample lost at t = {t:g} s: {self.lost}", RuntimeWarning, stacklevel=2)
         self.output = self._controller.tick(now_ns)
         if restarted := self._controller.restarted():
-            warnings.warn(f"the law engages again at t = {t:g} s: {restarted}", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"the law engages again at t = {t:g} s: {restarted}", RuntimeWarning, stacklevel=2
+            )
         return self._controller.state.command.copy()
 
     def retune(self, controller: ControllerConfig) -> None:
-        """Replace the parameters before the next tick, without a jump of u. Raises ParameterError as `Controller.retune`."""
+        """Replace the parameters before the next tick, without a jump of u. Raises ParameterError
+        as `Controller.retune`.
+        """
         self._controller.retune(controller)
         self.config = controller
 
     def vector(self, value: ArrayLike, key: str, names: Sequence[str]) -> FloatArray:
-        """A sample of y or y_m as an array of its own, a value a name. Raises ParameterError with the key."""
+        """A sample of y or y_m as an array of its own, a value a name. Raises ParameterError with
+        the key.
+        """
         expected = f"{len(names)} finite numbers: {', '.join(names)}"
         vector = as_array(value, key, expected)
-        require(vector.shape == (len(names),) and bool(np.isfinite(vector).all()), key, value, expected)
+        require(
+            vector.shape == (len(names),) and bool(np.isfinite(vector).all()), key, value, expected
+        )
         return vector.copy()
 
 
@@ -113,23 +143,34 @@ def fly_plant(
     reference_model: ReferenceModelConfig | Mapping[str, Any],
     duration: float,
 ) -> Tape:
-    """Fly a plant of the user's own under the controller and return the tape: y, y_m, u and internals.
+    """Fly a plant of the user's own under the controller and return the tape: y, y_m, u and
+    internals.
 
-    `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0. Outputs and inputs have the order
-    of the controller. A plant that raises FlightEnded ends the flight early, with the reason in `outcome` of the tape.
-    Raises ParameterError for parameters, for a wrong y, and for outputs or rates that do not fit each other.
+    `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
+    Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
+    flight early, with the reason in `outcome` of the tape. Raises ParameterError for parameters,
+    for a wrong y, and for outputs or rates that do not fit each other.
     """
     loop = Loop(controller)
     config = reference_model
     if not isinstance(config, ReferenceModelConfig):
         config = ReferenceModelConfig.validate_mapping(config, "reference_model")
-    require_channels("reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller")
+    require_channels(
+        "reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller"
+    )
     reference = Reference(config)
     period_ns = nanoseconds(loop.period)
     multiple = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
-    require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
+    require(
+        period_ns % reference.period_ns == 0,
+        "reference_model.rate",
+        f"{config.rate:g} Hz",
+        multiple,
+    )
     each = period_ns // reference.period_ns
-    ticks = int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
+    ticks = (
+        int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
+    )
     channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
     rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
     u = np.zeros(len(loop.inputs))
@@ -138,36 +179,51 @@ def fly_plant(
         t_ns = k * period_ns
         dt = loop.period if k else 0.0
         try:
-            y = loop.vector(plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured)
+            y = loop.vector(
+                plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured
+            )
         except FlightEnded as error:
             outcome = str(error)
             break
         y_m = select(loop.outputs, config.outputs, reference.sample(k * each))
         u = loop.step(seconds(t_ns), y, y_m)
-        sample = {"y": y, "y_m": y_m} | ({} if loop.output is None else {"u": u, "internals": loop.output.internals})
+        sample = {"y": y, "y_m": y_m} | (
+            {} if loop.output is None else {"u": u, "internals": loop.output.internals}
+        )
         for topic, value in sample.items():
             rows[topic].append((t_ns, value))
     signals = {}
     for topic, names in channels.items():
         stamp_ns = np.array([stamp for stamp, _ in rows[topic]], dtype=np.int64)
-        signals[topic] = Signal(stamp_ns, names, np.array([row for _, row in rows[topic]]).reshape(-1, len(names)))
+        signals[topic] = Signal(
+            stamp_ns, names, np.array([row for _, row in rows[topic]]).reshape(-1, len(names))
+        )
     return Tape(signals, outcome=outcome)
 
 
-def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False) -> "control.NonlinearIOSystem":
-    """The engaged law as a discrete system of python-control, with limits and anti-windup: `y_NAME`, `y_m_NAME` -> `u_NAME`.
+def as_control(
+    controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False
+) -> "control.NonlinearIOSystem":
+    """The engaged law as a discrete system of python-control, with limits and anti-windup:
+    `y_NAME`, `y_m_NAME` -> `u_NAME`.
 
-    The period is that of the controller. The state is that of the law, then u and y_m of the last tick; from 0 the flight
-    starts in trim. With an allocation the outputs are the effectors, at the end of the state. With `linear` the law near
-    e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins: inside the limits the effectors are T u.
-    Raises ParameterError without python-control, for a controller with a feedforward, whose model is beside the law, and with
+    The period is that of the controller. The state is that of the law, then u and y_m of the last
+    tick; from 0 the flight starts in trim. With an allocation the outputs are the effectors, at the
+    end of the state. With `linear` the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots
+    and margins: inside the limits the effectors are T u. Raises ParameterError without
+    python-control, for a controller with a feedforward, whose model is beside the law, and with
     `linear` for the literal sign.
     """
     require_package("control")
     import control  # noqa: PLC0415 - an extra
 
     config = Loop(controller).config
-    require(config.feedforward is None, "controller.feedforward", "a section", "none: as_control has the law alone")
+    require(
+        config.feedforward is None,
+        "controller.feedforward",
+        "a section",
+        "none: as_control has the law alone",
+    )
     dt = 1.0 / config.rate
     tuned = config.tuned_law()
     guard = config.guard()
@@ -177,21 +233,40 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     if linear:
         near = linear_law(tuned, m, dt)
         T = np.eye(m) if guard.allocation is None else guard.allocation.T
-        return control.ss(near.A, near.B, T @ near.C, T @ near.D, dt, inputs=measured, outputs=names, name=config.law)
+        return control.ss(
+            near.A,
+            near.B,
+            T @ near.C,
+            T @ near.D,
+            dt,
+            inputs=measured,
+            outputs=names,
+            name=config.law,
+        )
     law, params = tuned
     zero = np.zeros(m)
     p = 0 if guard.allocation is None else len(names)
     start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
     sizes = [value.size for value in start.values()]
-    offset = np.concatenate([value.ravel() for value in start.values()])  # so that x = 0 is the engagement in trim
+    offset = np.concatenate(
+        [value.ravel() for value in start.values()]
+    )  # so that x = 0 is the engagement in trim
     ends = np.cumsum(sizes)
 
     def tick(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         parts = np.split(offset + x[: ends[-1]], ends[:-1])
-        state = restored(law, {name: part.reshape(start[name].shape) for name, part in zip(start, parts, strict=True)})
+        state = restored(
+            law,
+            {
+                name: part.reshape(start[name].shape)
+                for name, part in zip(start, parts, strict=True)
+            },
+        )
         u_before, y_m_before, effectors = np.split(x[ends[-1] :], [m, 2 * m])
         sample = Measurements(v[:m], v[m:], (v[m:] - y_m_before) / dt, zero, u_before)
-        after, _, u, allocated = law_within_limits(state, sample, np.float64(dt), tuned, guard, effectors if p else None)
+        after, _, u, allocated = law_within_limits(
+            state, sample, np.float64(dt), tuned, guard, effectors if p else None
+        )
         flat = np.concatenate([value.ravel() for value in fields(after).values()])
         commanded = np.asarray(u if allocated is None else allocated)
         return np.concatenate([flat - offset, u, v[m:], commanded[:p]]), commanded

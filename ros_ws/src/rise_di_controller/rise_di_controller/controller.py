@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and a log. For node and simulation."""
+"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and a log. For
+node and simulation.
+"""
 
 from collections import deque
 from collections.abc import Callable, Generator
@@ -29,12 +31,16 @@ class ControlOutput(NamedTuple):
 
     @property
     def internals(self) -> FloatArray:
-        """Values for the log in the order of `Controller.names`. Computed on access, so u is published first."""
+        """Values for the log in the order of `Controller.names`. Computed on access, so u is
+        published first.
+        """
         return self.log()
 
 
 class Prepared(NamedTuple):
-    """What a controller makes of parameters before they are in force: a third of the time of a change in flight."""
+    """What a controller makes of parameters before they are in force: a third of the time of a
+    change in flight.
+    """
 
     parameters: ControllerConfig
     law: TunedLaw
@@ -49,7 +55,13 @@ def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
     yield
     limits = parameters.guard()
     yield
-    return Prepared(parameters, law, limits, parameters.digest(), internals.names(parameters.logged_groups(law.control_law)))
+    return Prepared(
+        parameters,
+        law,
+        limits,
+        parameters.digest(),
+        internals.names(parameters.logged_groups(law.control_law)),
+    )
 
 
 def prepared(parameters: ControllerConfig) -> Prepared:
@@ -115,18 +127,24 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether feedforward and observer are others than at the start, as a learner proposes them."""
+        """Whether feedforward and observer are others than at the start, as a learner proposes
+        them.
+        """
         return not self._first_law
 
     def restart(self) -> None:
-        """Engage the law again with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
+        """Engage the law again with the next fresh y and y_m, from the u of then (bumpless
+        transfer); a failsafe goes on.
+        """
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
 
     def retune(self, parameters: "ControllerConfig | Prepared") -> None:
-        """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
+        """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal
+        parameters change nothing.
 
-        Raises ParameterError for parameters with a different state: of a different law, or with an observer added.
+        Raises ParameterError for parameters with a different state: of a different law, or with an
+        observer added.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -149,10 +167,14 @@ class Controller:
     def still_vanes(self) -> tuple[str, ...]:
         """The vanes left out by the observer: still vanes.
 
-        An engagement measures the motion from 0. Until a vane has moved, or the time of the average has passed, the last report
-        holds.
+        An engagement measures the motion from 0. Until a vane has moved, or the time of the average
+        has passed, the last report holds.
         """
-        return tuple(name for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True) if still)
+        return tuple(
+            name
+            for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True)
+            if still
+        )
 
     def _measure_vanes(self, inputs: guard.TickInputs) -> None:
         measures = getattr(self._state.law, "vane_measures", None)
@@ -162,7 +184,9 @@ class Controller:
         if self.mode is Mode.ENGAGED and inputs.dt == 0.0:
             self._engaged_ns, self._vanes_moved = inputs.stamp_ns, np.zeros_like(self._vanes_moved)
         self._vanes_moved = self._vanes_moved | (measures > 0.0)
-        known = self._vanes_moved | (seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time)
+        known = self._vanes_moved | (
+            seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time
+        )
         self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
 
     def diverging(self) -> tuple[str, ...]:
@@ -170,24 +194,36 @@ class Controller:
         if self._first_law:
             return ()
         diverging = divergence.diverging(self._errors, self._least, self._learned)
-        return tuple(name for name, diverges in zip(self._parameters.outputs, diverging, strict=True) if diverges)
+        return tuple(
+            name
+            for name, diverges in zip(self._parameters.outputs, diverging, strict=True)
+            if diverges
+        )
 
     def oscillations(self) -> dict[str, float]:
-        """Periods, s, of the outputs that oscillate under a model learned in flight, more than before."""
+        """Periods, s, of the outputs that oscillate under a model learned in flight, more than
+        before.
+        """
         if self._first_law or not self._oscillations.periods.any():
             return {}
-        periods = zip(self._parameters.outputs, (self._learned * self._oscillations.periods).tolist(), strict=True)
+        periods = zip(
+            self._parameters.outputs,
+            (self._learned * self._oscillations.periods).tolist(),
+            strict=True,
+        )
         return {name: period for name, period in periods if period}
 
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return parameters.models() == self._first.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> str:
-        """Buffer a sample of y, in the law's order. Returns why the sample is lost, as a sentence; empty for a sample taken.
+        """Buffer a sample of y, in the law's order. Returns why the sample is lost, as a sentence;
+        empty for a sample taken.
 
-        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. A sample whose jump is confirmed
-        engages the law again. Raises ChannelError: reason "future" for a stamp more than the age limit ahead of the clock,
-        reason "order" for a stamp not later than the stamp of the sample taken before.
+        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. A sample
+        whose jump is confirmed engages the law again. Raises ChannelError: reason "future" for a
+        stamp more than the age limit ahead of the clock, reason "order" for a stamp not later than
+        the stamp of the sample taken before.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
@@ -215,26 +251,36 @@ class Controller:
         return ""
 
     def _lost(self, earlier: deque[StampedVector], sample: StampedVector, now_ns: int) -> str:
-        """Why a sample of m values is beyond the bounds; empty for one inside. Raises ChannelError."""
+        """Why a sample of m values is beyond the bounds; empty for one inside. Raises
+        ChannelError.
+        """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
         if earlier:
             require_newer(sample.stamp_ns, earlier[-1].stamp_ns)
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def restarted(self) -> str:
-        """Why the law has engaged again by itself since the last call, as a sentence; empty if it has not."""
+        """Why the law has engaged again by itself since the last call, as a sentence; empty if it
+        has not.
+        """
         sentence = self._restarted
         self._restarted = ""
         return sentence
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """A tick at `now_ns`, `late_ns` after the deadline. Returns None where nothing is to be published."""
+        """A tick at `now_ns`, `late_ns` after the deadline. Returns None where nothing is to be
+        published.
+        """
         y = self._newest_paired_y()
         was_engaged = self._state.mode is Mode.ENGAGED
-        self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
+        self._state, inputs = guard.tick(
+            self._state, now_ns, y, list(self._y_m), self._guard, self._law, active
+        )
         if inputs is None:
             return None
-        if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:  # a step has another dt
+        if (
+            was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0
+        ):  # a step has another dt
             self._restarted = "u or the state of the law was not finite"
         self._measure_vanes(inputs)
         self._number += self.has_internals
@@ -246,20 +292,33 @@ class Controller:
         limits = self._guard
         digest = self._digest
         given_up = self._given_up
-        log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest, given_up)
+        log = partial(
+            internals.values,
+            self._state,
+            inputs,
+            limits,
+            seconds(late_ns),
+            age,
+            self._number,
+            digest,
+            given_up,
+        )
         return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago than the age limit.
+        """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago
+        than the age limit.
 
-        The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u of the controller to the
-        failsafe u of the aircraft: the re-engagement is bumpless.
+        The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u
+        of the controller to the failsafe u of the aircraft: the re-engagement is bumpless.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
-        """The newest y up to a period after the newest y_m: with a late y_m an earlier y is used, and no failsafe starts."""
+        """The newest y up to a period after the newest y_m: with a late y_m an earlier y is used,
+        and no failsafe starts.
+        """
         newest = self._y[-1] if self._y else None
         if not self._y_m:
             return newest
@@ -269,7 +328,11 @@ class Controller:
     def ages(self, now_ns: int) -> dict[str, float]:
         """Ages of the newest received y and y_m, s; an input never received is absent."""
         newest = {"y": self._y, "y_m": self._y_m}
-        return {name: seconds(now_ns - samples[-1].stamp_ns) for name, samples in newest.items() if samples}
+        return {
+            name: seconds(now_ns - samples[-1].stamp_ns)
+            for name, samples in newest.items()
+            if samples
+        }
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
         """Names of the stale inputs: y or y_m never received or older than the age limit."""
@@ -279,6 +342,8 @@ class Controller:
 
 
 def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
-    """Mask of the channels with a feedforward, (m,): a learner leaves out those that fly the law of the start."""
+    """Mask of the channels with a feedforward, (m,): a learner leaves out those that fly the law of
+    the start.
+    """
     some = None if parameters.feedforward is None else parameters.feedforward.inputs
     return np.array([some is None or name in some for name in parameters.inputs])

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SDU decomposition Omega = C B = S D U, equations (10)-(11). The law has to know D alone of the aircraft.
+"""SDU decomposition Omega = C B = S D U, equations (10)-(11). The law has to know D alone of the
+aircraft.
 
-D depends on the order of the channels, on the pairing of inputs with outputs and on the signs of the inputs, so D is
-validated together with the channels. U measures the quality of the pairing: beta and K of channel i grow with abs(U_ij), j > i.
+D depends on the order of the channels, on the pairing of inputs with outputs and on the signs of
+the inputs, so D is validated together with the channels. U measures the quality of the pairing:
+beta and K of channel i grow with abs(U_ij), j > i.
 """
 
 import math
@@ -19,15 +21,17 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, as_array
 
 NEARLY_ZERO = 1e-9
-"""Minor k is nearly zero if a change of every entry of Omega by this fraction of the entry's size could turn the sign of
-Delta_k / Delta_(k-1), to first order. Rounding is 2e-16 times the growth of the elimination, so a growth of 1e6 is allowed.
-Published and identified values are six orders of magnitude coarser."""
+"""Minor k is nearly zero if a change of every entry of Omega by this fraction of the entry's size
+could turn the sign of Delta_k / Delta_(k-1), to first order. Rounding is 2e-16 times the growth of
+the elimination, so a growth of 1e6 is allowed. Published and identified values are six orders of
+magnitude coarser."""
 
 MANY = 5
-"""Channels whose orders are all tried: (5!)^2 = 14,400 take a second, those of six a minute, and those of eight do not fit into
-memory."""
+"""Channels whose orders are all tried: (5!)^2 = 14,400 take a second, those of six a minute, and
+those of eight do not fit into memory."""
 
-_EQUILIBRATIONS = 10  # a round halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
+# a round halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
+_EQUILIBRATIONS = 10
 
 
 Order = tuple[tuple[int, ...], tuple[int, ...]]
@@ -35,7 +39,9 @@ Order = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 class DecompositionError(ParameterError):
-    """A matrix without S D U. `minor` is the number of the first minor zero or nearly so, None if not square."""
+    """A matrix without S D U. `minor` is the number of the first minor zero or nearly so, None if
+    not square.
+    """
 
     def __init__(self, sentence: str, minor: int | None = None) -> None:
         super().__init__(sentence)
@@ -51,7 +57,9 @@ class SDU(NamedTuple):
 
 
 class Pairing(NamedTuple):
-    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs, channel k of the law is row and column k."""
+    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs, channel k of the law is
+    row and column k.
+    """
 
     outputs: tuple[int, ...]  # row of Omega by channel
     inputs: tuple[int, ...]  # column of Omega by channel
@@ -65,9 +73,10 @@ def decompose(Omega: ArrayLike) -> SDU:
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
         S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
 
-    Raises DecompositionError if Omega is not square or not finite, or if a leading minor is zero or nearly so.
-    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S. Morse, "A Gain Matrix
-    Decomposition and Some of Its Applications", Systems & Control Letters 21, 1993.
+    Raises DecompositionError if Omega is not square or not finite, or if a leading minor is zero or
+    nearly so. Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S.
+    Morse, "A Gain Matrix Decomposition and Some of Its Applications", Systems & Control Letters 21,
+    1993.
     """
     L, p, W, L_inverse = _eliminate(Omega)
     D = np.sign(p)
@@ -76,12 +85,15 @@ def decompose(Omega: ArrayLike) -> SDU:
 
 
 def signs(Omega: FloatArray) -> FloatArray:
-    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)). Raises DecompositionError as `decompose` does."""
+    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)). Raises DecompositionError as
+    `decompose` does.
+    """
     return np.sign(_eliminate(Omega)[1])
 
 
 def leading_minors(Omega: FloatArray) -> FloatArray:
-    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,). Minors of zero are allowed.
+    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,). Minors of zero
+    are allowed.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -90,37 +102,46 @@ def leading_minors(Omega: FloatArray) -> FloatArray:
 
 
 def unit_diagonal(Omega: FloatArray) -> FloatArray:
-    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i: Omega_ij / abs(Omega_jj), shape (m, m).
+    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i: Omega_ij / abs(Omega_jj),
+    shape (m, m).
 
-    Raises DecompositionError if Omega is not square or not finite, or if an output does not respond to the paired input.
+    Raises DecompositionError if Omega is not square or not finite, or if an output does not respond
+    to the paired input.
     """
     matrix = _square(Omega)
     diagonal = np.abs(np.diag(matrix))
     if not diagonal.all():
         i = int(np.flatnonzero(diagonal == 0.0)[0])
-        raise DecompositionError(f"Omega: found Omega_{i + 1}{i + 1} = 0, expected outputs that respond to their own inputs")
+        raise DecompositionError(
+            f"Omega: found Omega_{i + 1}{i + 1} = 0, expected outputs that respond to their own "
+            "inputs"
+        )
     return matrix / diagonal
 
 
 def coupling(Omega: FloatArray) -> float:
-    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response; a large value is a bad pairing.
+    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response; a large value
+    is a bad pairing.
 
-    Infinite where an output does not respond to the paired input. The coupling depends on the units of y, not on the units or
-    signs of u. Raises DecompositionError as `decompose` does.
+    Infinite where an output does not respond to the paired input. The coupling depends on the units
+    of y, not on the units or signs of u. Raises DecompositionError as `decompose` does.
     """
     signs(Omega)
     return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """The smallest change of the channels to D = I, or None where no order that was tried gives D = I.
+    """The smallest change of the channels to D = I, or None where no order that was tried gives D =
+    I.
 
-    Up to MANY channels, every order of the outputs is combined with every order of the inputs: (m!)^2. Of more channels three
-    orders are tried: the given one, the inputs by the largest responses, and that of complete pivoting, so that a smaller
-    change may exist, or one where None is returned. A combination has a single choice of input signs, namely D, because a
-    change of the sign of input k changes D_k only. The preference is, in this order: most outputs with the same input, most
-    outputs in the same place, most inputs with the same sign, the smallest max abs(U - I) in inputs of unit response. Orders
-    with a zero on the diagonal, or with max abs(U - I) above `largest_U`, are excluded.
+    Up to MANY channels, every order of the outputs is combined with every order of the inputs:
+    (m!)^2. Of more channels three orders are tried: the given one, the inputs by the largest
+    responses, and that of complete pivoting, so that a smaller change may exist, or one where None
+    is returned. A combination has a single choice of input signs, namely D, because a change of the
+    sign of input k changes D_k only. The preference is, in this order: most outputs with the same
+    input, most outputs in the same place, most inputs with the same sign, the smallest max abs(U -
+    I) in inputs of unit response. Orders with a zero on the diagonal, or with max abs(U - I) above
+    `largest_U`, are excluded.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -131,29 +152,43 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
         outputs, inputs = order
         return sum(map(ne, outputs, inputs)), sum(map(ne, outputs, places))
 
-    every = product(permutations(places), permutations(places)) if len(matrix) <= MANY else _likely_orders(matrix)
+    every = (
+        product(permutations(places), permutations(places))
+        if len(matrix) <= MANY
+        else _likely_orders(matrix)
+    )
     for _, group in groupby(sorted(every, key=change), key=change):
         pairings = (_pairing(matrix, *order) for order in group)
-        accepted = [pairing for pairing in pairings if pairing is not None and _excess(pairing.U) <= largest_U]
+        accepted = [
+            pairing
+            for pairing in pairings
+            if pairing is not None and _excess(pairing.U) <= largest_U
+        ]
         if accepted:
             return min(accepted, key=lambda pairing: (pairing.signs.count(-1), _excess(pairing.U)))
     return None
 
 
 def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
-    """The given order, the inputs with the largest product of responses, and the order of complete pivoting."""
+    """The given order, the inputs with the largest product of responses, and the order of complete
+    pivoting.
+    """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
 
     rows, columns = _sizes(matrix)
     remainder = matrix / rows[:, None] / columns
     m = len(matrix)
     places = tuple(range(m))
-    assigned = linear_sum_assignment(np.log(np.maximum(np.abs(remainder), np.finfo(float).tiny)), maximize=True)[1]
+    assigned = linear_sum_assignment(
+        np.log(np.maximum(np.abs(remainder), np.finfo(float).tiny)), maximize=True
+    )[1]
     orders = {(places, places), (places, tuple(assigned.tolist()))}
     outputs = list[int]()
     inputs = list[int]()
     while remainder.any():
-        i, j = (int(place) for place in np.unravel_index(np.argmax(np.abs(remainder)), remainder.shape))
+        i, j = (
+            int(place) for place in np.unravel_index(np.argmax(np.abs(remainder)), remainder.shape)
+        )
         remainder = remainder - np.outer(remainder[:, j], remainder[i] / remainder[i, j])
         remainder[i] = 0.0
         remainder[:, j] = 0.0
@@ -162,7 +197,9 @@ def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
     return orders | {(tuple(outputs), tuple(inputs))} if len(outputs) == m else orders
 
 
-def _pairing(matrix: FloatArray, outputs: tuple[int, ...], inputs: tuple[int, ...]) -> Pairing | None:
+def _pairing(
+    matrix: FloatArray, outputs: tuple[int, ...], inputs: tuple[int, ...]
+) -> Pairing | None:
     try:
         factors = decompose(unit_diagonal(matrix[np.ix_(outputs, inputs)]))
     except DecompositionError:
@@ -178,18 +215,21 @@ def _excess(U: FloatArray) -> float:
 def _square(Omega: ArrayLike) -> FloatArray:
     matrix = np.array(as_array(Omega, "Omega", "a matrix of numbers, (m, m)"))
     if matrix.ndim != 2 or len(set(matrix.shape)) != 1 or matrix.size == 0:
-        raise DecompositionError(f"Omega: found shape {matrix.shape}, expected as many outputs as inputs, (m, m)")
+        raise DecompositionError(
+            f"Omega: found shape {matrix.shape}, expected as many outputs as inputs, (m, m)"
+        )
     if not np.isfinite(matrix).all():
         raise DecompositionError(f"Omega: found {matrix.tolist()}, expected finite values")
     return matrix
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
+    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1
+    in every row and column.
 
-    The scales follow the units of the channels, so a comparison with the scales does not depend on units. A row or column of
-    zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
-    Matrices", RAL-TR-2001-034.
+    The scales follow the units of the channels, so a comparison with the scales does not depend on
+    units. A row or column of zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to
+    Equilibrate Both Rows and Columns Norms in Matrices", RAL-TR-2001-034.
     """
     rows = np.ones(len(matrix))
     columns = np.ones(len(matrix))
@@ -203,7 +243,8 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper triangular.
+    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper
+    triangular.
 
     p_k = (L^-1)_k Omega (W^-1)_k gives the certainty of the sign of p_k.
     """
@@ -220,8 +261,10 @@ def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, Fl
         largest = (np.abs(L_inverse[k]) @ rows) * (columns @ np.abs(W_inverse[:, k]))
         if abs(p[k]) <= NEARLY_ZERO * largest:
             raise DecompositionError(
-                f"Omega: found leading minor {k + 1} zero or nearly so (pivot {p[k]:.3g} beside {largest:.3g}), expected "
-                "leading minors away from zero: another order or pairing of the channels may have them",
+                f"Omega: found leading minor {k + 1} zero or nearly so (pivot {p[k]:.3g} beside "
+                f"{largest:.3g}), expected "
+                "leading minors away from zero: another order or pairing of the channels may "
+                "have them",
                 minor=k + 1,
             )
         L[k + 1 :, k] = remainder[k + 1 :, k] / p[k]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a learned model diverges or oscillates: the error beside the error of the law of the start."""
+"""Whether a law with a learned model diverges or oscillates: the error beside the error of the law
+of the start.
+"""
 
 from collections import deque
 from typing import NamedTuple
@@ -10,22 +12,30 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 
-MEMORY = 1.0  # s, time constant of the mean square of e: a few periods of the slowest oscillation that servos allow
+# s, time constant of the mean square of e: a few periods of the slowest oscillation that servos
+# allow
+MEMORY = 1.0
 FACTOR = 3.0  # of the largest rms error before: gusts that come later are up to twice as strong
 LEAST = {"V": 1.0}  # m/s, rms error that does not count as a divergence
-LEAST_RATE = 0.1  # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
+LEAST_RATE = (
+    0.1  # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
+)
 
 # s, length of the record of e, and of the means in it: a loop with servos oscillates slower
 WINDOW = 10.0
 STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s
-LIKENESS = 0.7  # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
-GROWN = 1.5  # of the largest rms error over WINDOW before: below this the law of the start is not clearly better
+# correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
+LIKENESS = 0.7
+# of the largest rms error over WINDOW before: below this the law of the start is not clearly better
+GROWN = 1.5
 HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 
 
 class Errors(NamedTuple):
-    """Mean squares of e = y - y_m, (m,): the running mean, and the largest mean under the first law."""
+    """Mean squares of e = y - y_m, (m,): the running mean, and the largest mean under the first
+    law.
+    """
 
     now: FloatArray
     largest: FloatArray
@@ -37,13 +47,16 @@ def least(outputs: tuple[str, ...]) -> FloatArray:
 
 
 def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors:
-    """A tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now); `largest` is held unless the first law flies."""
+    """A tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now); `largest` is held unless the first law
+    flies.
+    """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
 
 
 def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Outputs, (m,), whose rms error is above FACTOR times its largest under the first law, and above `least`.
+    """Outputs, (m,), whose rms error is above FACTOR times its largest under the first law, and
+    above `least`.
 
     Only outputs with a learned model count, mask (m,): further outputs fly the first law.
     """
@@ -51,14 +64,18 @@ def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> 
 
 
 class Oscillations:
-    """The error e over the last WINDOW, and in which outputs it oscillates, by more than under the first law.
+    """The error e over the last WINDOW, and in which outputs it oscillates, by more than under the
+    first law.
 
-    A limit cycle repeats itself: e is like e a period earlier, over the whole window. Wind and single commands do not.
+    A limit cycle repeats itself: e is like e a period earlier, over the whole window. Wind and
+    single commands do not.
     """
 
     def __init__(self, least: FloatArray) -> None:
         """`least`: mean squares below a divergence, (m,)."""
-        self.periods = np.zeros_like(least)  # s, of the oscillations at the last test, (m,); 0 for none
+        self.periods = np.zeros_like(
+            least
+        )  # s, of the oscillations at the last test, (m,); 0 for none
         self._least = HARMLESS**2 * least
         self._largest = np.zeros_like(least)
         self._record = deque[FloatArray](maxlen=round(WINDOW / STEP))
@@ -69,7 +86,9 @@ class Oscillations:
         self._first_law = True
 
     def take(self, e: FloatArray, dt: float, learned: NDArray[np.bool_] | None) -> None:
-        """Record a tick, and test once a second. `learned`: outputs with a learned model, (m,); None under the first law."""
+        """Record a tick, and test once a second. `learned`: outputs with a learned model, (m,);
+        None under the first law.
+        """
         if (learned is None) is not self._first_law:
             self._first_law = learned is None
             self._record.clear()
@@ -93,17 +112,25 @@ class Oscillations:
             self._largest = np.maximum(self._largest, square)
         elif len(record) == self._record.maxlen:
             grown = square > np.maximum(GROWN**2 * self._largest, self._least)
-            self.periods = np.array([spacing * period(x) * tested for x, tested in zip(record.T, learned & grown, strict=True)])
+            self.periods = np.array(
+                [
+                    spacing * period(x) * tested
+                    for x, tested in zip(record.T, learned & grown, strict=True)
+                ]
+            )
 
 
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
-    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`, also by repeated commands."""
+    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`, also
+    by repeated commands.
+    """
     moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array([bool(moves) and period(x) > 0 for x, moves in zip(y.T, moving, strict=True)])
 
 
 def period(x: FloatArray) -> int:
-    """The period of an oscillation that fills a record, (N,), in samples, at most N / 4; 0 without one.
+    """The period of an oscillation that fills a record, (N,), in samples, at most N / 4; 0 without
+    one.
 
         r_k = N / (N - k) sum x_i x_(i+k) / sum x_i^2,  x less its mean
 

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward by model inversion, an extension of the paper, off by default: the input of a nominal model along y_m.
+"""Feedforward by model inversion, an extension of the paper, off by default: the input of a nominal
+model along y_m.
 
-The feedforward uses y_m only, no state of the aircraft, and does not change the law. See docs/theory.md.
+The feedforward uses y_m only, no state of the aircraft, and does not change the law. See
+docs/theory.md.
 """
 
 from typing import NamedTuple
@@ -15,11 +17,15 @@ from flight_core.arithmetic import product, sine
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, FloatArray, array_namespace
 
-ZERO_REAL_PART = 1e-6  # 1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11 days.
+# 1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11
+# days.
+ZERO_REAL_PART = 1e-6
 
 
 class Nominal(NamedTuple):
-    """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI and radians."""
+    """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI
+    and radians.
+    """
 
     A: Array  # (n, n)
     B: Array  # (n, m)
@@ -29,17 +35,34 @@ class Nominal(NamedTuple):
     path: Array  # (n, n), I - B Omega^-1 C: what the ideal input leaves of a drift
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
-    lead: Array  # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
+    # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
+    lead: Array
     sine_states: tuple[int, ...]  # indices of the states with a sine term
-    acts: Array | None = None  # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
+    acts: Array | None = (
+        None  # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
+    )
 
 
-def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None) -> Nominal:
+def nominal_model(
+    A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None
+) -> Nominal:
     """The nominal model with the products for a tick. Omega = C B is regular."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
-    return Nominal(A, B, C, gravity, inverse, path, product(path, A), product(path, gravity), lead, angles, acts)
+    return Nominal(
+        A,
+        B,
+        C,
+        gravity,
+        inverse,
+        path,
+        product(path, A),
+        product(path, gravity),
+        lead,
+        angles,
+        acts,
+    )
 
 
 class FeedforwardState(NamedTuple):
@@ -60,8 +83,11 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     return FeedforwardState(product(nominal.C.T, y_m), zeros, zero, zero, zeros)
 
 
-def continued(state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal) -> FeedforwardState:
-    """State for a new model in the same motion: x and u_0 stay, where there are any, and u is that of the new model.
+def continued(
+    state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
+) -> FeedforwardState:
+    """State for a new model in the same motion: x and u_0 stay, where there are any, and u is that
+    of the new model.
 
     u_ff goes on at u - u_0. Arguments: y_m_dot and dt of the last tick.
     """
@@ -72,13 +98,16 @@ def continued(state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Ar
 
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Input for the motion y_m_dot of the outputs of the nominal model: Omega^-1 (y_m_dot - C (A x + f(x))), shape (m,)."""
+    """Input for the motion y_m_dot of the outputs of the nominal model: Omega^-1 (y_m_dot - C (A x
+    + f(x))), shape (m,).
+    """
     drift = product(nominal.A, x) + product(nominal.gravity, sines(x, nominal))
     return product(nominal.inverse, y_m_dot - product(nominal.C, drift))
 
 
 def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
-    """Nominal model under the ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so C x_dot = y_m_dot.
+    """Nominal model under the ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so C x_dot
+    = y_m_dot.
 
     As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
     """
@@ -86,30 +115,37 @@ def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
 
 
 def sines(x: FloatArray, nominal: Nominal) -> FloatArray:
-    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N). NumPy arrays only."""
+    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N). NumPy
+    arrays only.
+    """
     values = np.zeros_like(x)
     for j in nominal.sine_states:
-        values[j] = sine(x[j].item() if x.ndim == 1 else x[j])  # a Python float: a fifth of the time of an array
+        values[j] = sine(
+            x[j].item() if x.ndim == 1 else x[j]
+        )  # a Python float: a fifth of the time of an array
     return values
 
 
-def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tuple[FeedforwardState, Array]:
+def step(
+    state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal
+) -> tuple[FeedforwardState, Array]:
     """A tick: (state, y_m, dt) -> (state, u_ff - u_0), a term added to u of the law.
 
-    y_m is linear over the last tick. The outputs of the nominal model follow y_m. The remaining states (the zero dynamics) are
-    integrated with the required input:
+    y_m is linear over the last tick. The outputs of the nominal model follow y_m. The remaining
+    states (the zero dynamics) are integrated with the required input:
 
         y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m a tick ago
         x       = Runge-Kutta step of x_dot from x_p       C x = y_m
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
-    u_ff extrapolates the last two u linearly to the instant of action of this tick's input: an actuator of first order
-    moves by u at the command u + lag u_dot. The first two ticks after engagement only determine the slope and add
-    nothing. u_0 is u_ff of the second tick, so u does not jump (bumpless transfer). dt > 0.
+    u_ff extrapolates the last two u linearly to the instant of action of this tick's input: an
+    actuator of first order moves by u at the command u + lag u_dot. The first two ticks after
+    engagement only determine the slope and add nothing. u_0 is u_ff of the second tick, so u does
+    not jump (bumpless transfer). dt > 0.
 
-    Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project, after the feedforward
-    of model inversion; see docs/theory.md.
+    Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project,
+    after the feedforward of model inversion; see docs/theory.md.
     """
     xp = array_namespace(y_m)
     y_m_dot = (y_m - product(nominal.C, state.x)) / dt
@@ -128,8 +164,8 @@ def acting(u: Array, nominal: Nominal) -> Array:
 def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:
     """Eigenvalues of the zero dynamics, shape (n - m,), 1/s: the zeros of the nominal model.
 
-    Eigenvalues of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I for states not outputs, and sin(x)
-    linearised to x. NumPy arrays only.
+    Eigenvalues of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I for states not
+    outputs, and sin(x) linearised to x. NumPy arrays only.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)
     matrix = nominal.path @ (nominal.A + nominal.gravity)

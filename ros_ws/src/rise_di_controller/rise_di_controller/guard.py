@@ -1,13 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for every control law.
+"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for
+every control law.
 
-- Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law (`ControlLaw.limited`).
-- Allocation: u to more effectors than the law has inputs, inside the limits of the effectors (`allocation.allocate`).
+- Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law
+  (`ControlLaw.limited`).
+- Allocation: u to more effectors than the law has inputs, inside the limits of the effectors
+  (`allocation.allocate`).
 - Watchdog: an input older than `max_age` is stale (`tick`).
 - Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
-- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first engagement.
-- Finite: a sample with NaN or infinity is as none, and a law whose u or state would not be finite engages again.
+- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as
+  at the first engagement.
+- Finite: a sample with NaN or infinity is as none, and a law whose u or state would not be finite
+  engages again.
 """
 
 from collections.abc import Sequence
@@ -29,13 +34,14 @@ from rise_di_controller.samples import SampleLimits
 from rise_di_controller.saturation import Limits, saturate
 from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at, observers_of
 
-# Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
-# the extrapolation would amplify the noise of the difference more than 20 times.
+# Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are
+# noisier: the extrapolation would amplify the noise of the difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
 
 LARGEST_VANE = np.pi  # rad, where the motion of a vane ends
 
-# Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower rates.
+# Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower
+# rates.
 SAMPLE_BUFFER_SIZE = 100
 
 
@@ -50,15 +56,21 @@ class GuardParams(NamedTuple):
     limits: Limits
     samples: SampleLimits  # of y and y_m, for the controller
     nominal: Nominal | None = None  # None: no feedforward
-    history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
+    # ticks over which a new observer runs before it flies; 0: it starts from the present error
+    history: int = 0
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
-    vanes: tuple[int, ...] = ()  # states of the nominal model read by vanes; the readings follow the outputs in y
-    over_speed: OverSpeed | None = None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
+    vanes: tuple[
+        int, ...
+    ] = ()  # states of the nominal model read by vanes; the readings follow the outputs in y
+    over_speed: OverSpeed | None = (
+        None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
+    )
 
 
-# The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full: with half of the ticks
-# lost, an upper end of 3 increases the error by 15 % in q and 22 % in r. The lower end keeps a burst of samples from
-# exciting the sign term. A gap beyond the age limit leads to re-engagement.
+# The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full:
+# with half of the ticks lost, an upper end of 3 increases the error by 15 % in q and 22 % in r. The
+# lower end keeps a burst of samples from exciting the sign term. A gap beyond the age limit leads
+# to re-engagement.
 DT_RANGE = (0.2, 10.0)
 
 
@@ -83,10 +95,14 @@ class ControllerState(NamedTuple):
     u_failsafe: FloatArray  # u at the start of the failsafe
     u_ff: FloatArray  # the feedforward, 0 where there is none
     feedforward: FeedforwardState | None = None
-    hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
+    # times of the present failsafe: new parameters count from the next failsafe on, so that u does
+    # not jump
+    hold_ns: int = 0
     ramp_ns: int = 0
     history: tuple[PastTick, ...] = ()
-    effectors: FloatArray | None = None  # (p,) commanded, with an allocation; u is the input of the law that they give
+    effectors: FloatArray | None = (
+        None  # (p,) commanded, with an allocation; u is the input of the law that they give
+    )
     effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
     vanes: Vanes | None = None  # None without vanes
 
@@ -97,7 +113,9 @@ class ControllerState(NamedTuple):
 
 
 class TickInputs(NamedTuple):
-    """Inputs of a tick, for the log. The tick recomputed from these inputs gives u to the last bit."""
+    """Inputs of a tick, for the log. The tick recomputed from these inputs gives u to the last
+    bit.
+    """
 
     stamp_ns: int  # of y, and so of u; the instant of the tick where no y is used
     y: FloatArray
@@ -110,15 +128,19 @@ def initial_state(m: int, allocation: Allocation | None = None) -> ControllerSta
     """The state before the first sample: u = 0."""
     zero = np.zeros(m)
     effectors = None if allocation is None else np.zeros(len(allocation.T))
-    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero, effectors=effectors)
+    return ControllerState(
+        Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero, effectors=effectors
+    )
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """The signal at an instant, shape (m,); None where neither interpolation nor extrapolation is possible.
+    """The signal at an instant, shape (m,); None where neither interpolation nor extrapolation is
+    possible.
 
-    A sample with the stamp of the instant is returned unchanged. Between two samples the signal is linear. Beyond the newest
-    sample the signal is extrapolated by at most `reach_ns`, with the slope to the newest sample at least MIN_SLOPE_SPAN
-    `reach_ns` older. Without an older sample, the newest sample is held.
+    A sample with the stamp of the instant is returned unchanged. Between two samples the signal is
+    linear. Beyond the newest sample the signal is extrapolated by at most `reach_ns`, with the
+    slope to the newest sample at least MIN_SLOPE_SPAN `reach_ns` older. Without an older sample,
+    the newest sample is held.
 
     Arguments: samples with increasing stamps.
     """
@@ -134,7 +156,11 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
         return None
     else:
         after = older[-1]
-        spaced = [sample for sample in older if after.stamp_ns - sample.stamp_ns >= MIN_SLOPE_SPAN * reach_ns]
+        spaced = [
+            sample
+            for sample in older
+            if after.stamp_ns - sample.stamp_ns >= MIN_SLOPE_SPAN * reach_ns
+        ]
         if not spaced:
             return after.value
         before = spaced[-1]
@@ -143,14 +169,23 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
 
 
 def _with_history(
-    state: ControllerState, stepped: ControllerState, y_m: FloatArray, dt: float, missed: int, guard: GuardParams
+    state: ControllerState,
+    stepped: ControllerState,
+    y_m: FloatArray,
+    dt: float,
+    missed: int,
+    guard: GuardParams,
 ) -> ControllerState:
     """The state after a step of the law with the past ticks, missed ticks included."""
     assert stepped.y is not None  # noqa: S101 - the step took a y
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
-    lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),) * missed
-    last = PastTick(stepped.y.value - y_m, stepped.u - state.u_trim - stepped.u_ff, y_m, np.float64(dt), scale)
+    lost = (
+        PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),
+    ) * missed
+    last = PastTick(
+        stepped.y.value - y_m, stepped.u - state.u_trim - stepped.u_ff, y_m, np.float64(dt), scale
+    )
     return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
 
 
@@ -167,15 +202,17 @@ def tick(
 ) -> tuple[ControllerState, TickInputs | None]:
     """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
-    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step of the law with the
-    measured dt, clipped to DT_RANGE periods. `ControlLaw.missed` predicts over every whole period without a y before the step.
-    The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
-    Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM. Where `active` is false the
-    mode is INACTIVE, and u is held or ramps to trim; with fresh inputs u is published at trim before the first engagement too.
-    Returns None for the inputs where nothing is to be published.
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step
+    of the law with the measured dt, clipped to DT_RANGE periods. `ControlLaw.missed` predicts over
+    every whole period without a y before the step. The law adds to u_trim, or to u_trim + u_ff with
+    a feedforward. Without a new y nothing changes. Stale inputs start the failsafe: HOLD (nothing
+    is integrated), then RAMP to trim, then TRIM. Where `active` is false the mode is INACTIVE, and
+    u is held or ramps to trim; with fresh inputs u is published at trim before the first engagement
+    too. Returns None for the inputs where nothing is to be published.
 
-    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's order; readings of vanes
-    follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace a feedforward of unknown state, in replay.
+    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's
+    order; readings of vanes follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace
+    a feedforward of unknown state, in replay.
     """
     vane = None
     if guard.vanes and y is not None:
@@ -183,7 +220,13 @@ def tick(
         vane = _readings(y.value[m:], state.vanes)
         y = y._replace(value=y.value[:m])
     reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
-    if not active and state.law is None and y is not None and reference is not None and not state.u.any():
+    if (
+        not active
+        and state.law is None
+        and y is not None
+        and reference is not None
+        and not state.u.any()
+    ):
         return state._replace(mode=Mode.INACTIVE), TickInputs(now_ns, y.value, reference, 0.0, 0.0)
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
@@ -193,7 +236,9 @@ def tick(
     if y.stamp_ns <= state.y.stamp_ns:
         return state, None
     nominal = seconds(guard.period_ns)
-    dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
+    dt = min(
+        max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal
+    )
     control_law, params = law
     law_state = state.law
     u_trim = state.u_trim
@@ -201,7 +246,9 @@ def tick(
     ff_state = state.feedforward
     missed = max(round(dt / nominal) - 1, 0)
     if missed:
-        held = Measurements(state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u)
+        held = Measurements(
+            state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u
+        )
         for _ in range(missed):
             law_state = control_law.missed(law_state, held, params)
     model = _nominal(guard, law_state)
@@ -215,9 +262,19 @@ def tick(
     slope = (reference - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference
     measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
-    after, u_free, u, effectors = law_within_limits(law_state, measured, dt, law, guard, state.effectors)
+    after, u_free, u, effectors = law_within_limits(
+        law_state, measured, dt, law, guard, state.effectors
+    )
     stepped = state._replace(
-        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
+        law=after,
+        y=y,
+        y_m=reference,
+        u=u,
+        u_free=u_free,
+        u_ff=u_ff,
+        feedforward=ff_state,
+        effectors=effectors,
+        vanes=vanes,
     )
     if not _is_finite(stepped):
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
@@ -226,8 +283,12 @@ def tick(
     return stepped, inputs._replace(dt=dt)
 
 
-def _fresh_reference(now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams) -> FloatArray | None:
-    """The reference at the stamp of y, (m,); None where y or y_m is stale or not finite, or has no sample near that stamp."""
+def _fresh_reference(
+    now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams
+) -> FloatArray | None:
+    """The reference at the stamp of y, (m,); None where y or y_m is stale or not finite, or has no
+    sample near that stamp.
+    """
     if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
         return None
     reference = align(y_m, y.stamp_ns, guard.period_ns)
@@ -246,7 +307,9 @@ def _engaged(
     """The state at an engagement: the law begins from the present u."""
     reference = inputs.y_m
     zero = np.zeros_like(state.u)
-    ff_state = None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
+    ff_state = (
+        None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
+    )
     measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
     return state._replace(
         mode=Mode.ENGAGED,
@@ -273,13 +336,17 @@ def _is_finite(state: ControllerState) -> bool:
 
 
 def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
-    """The readings of the vanes, (k,): one that no vane gives is that of the tick before, so the vane counts as still."""
+    """The readings of the vanes, (k,): one that no vane gives is that of the tick before, so the
+    vane counts as still.
+    """
     last = np.zeros_like(reading) if before is None else before.reading
     return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
 
 
 def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
-    """The nominal model of the feedforward, at the speed of a schedule if any; None without a feedforward."""
+    """The nominal model of the feedforward, at the speed of a schedule if any; None without a
+    feedforward.
+    """
     if guard.nominal is None or guard.over_speed is None:
         return guard.nominal
     nominal: Nominal = guard.over_speed.at_scale(law.scale)
@@ -287,24 +354,39 @@ def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
 
 
 def _vanes(
-    reading: FloatArray | None, state: FeedforwardState | None, guard: GuardParams, recorded: FloatArray | None
+    reading: FloatArray | None,
+    state: FeedforwardState | None,
+    guard: GuardParams,
+    recorded: FloatArray | None,
 ) -> Vanes | None:
-    """The readings, and the states of the nominal model along y_m as readings of the reference motion; None without vanes."""
+    """The readings, and the states of the nominal model along y_m as readings of the reference
+    motion; None without vanes.
+    """
     if reading is None:
         return None
     return Vanes(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
 
 
 def law_within_limits(
-    state: Any, measured: Measurements, dt: Array, law: TunedLaw, guard: GuardParams, effectors: FloatArray | None
+    state: Any,
+    measured: Measurements,
+    dt: Array,
+    law: TunedLaw,
+    guard: GuardParams,
+    effectors: FloatArray | None,
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
-    """A step of the law inside its limits and those of the effectors: state, u before saturation, u, effectors.
+    """A step of the law inside its limits and those of the effectors: state, u before saturation,
+    u, effectors.
 
     Arguments: `effectors` (p,) of the last tick, None without an allocation.
     """
     after, u_free = law.control_law.step(state, measured, dt, law.params)
-    u, effector_values = _within_effectors(saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard)
-    if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
+    u, effector_values = _within_effectors(
+        saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard
+    )
+    if not np.array_equal(
+        u, u_free
+    ):  # otherwise `limited` gives the same and takes three times as long
         limits = guard.limits if guard.allocation is None else reached(u_free, u)
         after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
         u, effector_values = _within_effectors(u, effectors, dt, guard)
@@ -314,7 +396,9 @@ def law_within_limits(
 def _within_effectors(
     u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u that the effectors give for a u, and the effectors; u and None without an allocation."""
+    """The u that the effectors give for a u, and the effectors; u and None without an
+    allocation.
+    """
     if guard.allocation is None or before is None:
         return u, None
     effectors, u = allocate(u, before, dt, guard.allocation)
@@ -329,11 +413,12 @@ def retune(
 ) -> ControllerState:
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
-    An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
-    the same motion: z comes from the new filter over these ticks, and u_o goes on where an observer acts. Without a history the
-    observer starts again from the present error, and u_o and u_ff become part of u_trim. A schedule has the models of the
-    present speed, and over the record those of every tick. Arguments: `guards`, old and new, with the models of the
-    feedforward.
+    An observer with the same matrices continues. With a history of the last ticks a new observer
+    and a new feedforward go on in the same motion: z comes from the new filter over these ticks,
+    and u_o goes on where an observer acts. Without a history the observer starts again from the
+    present error, and u_o and u_ff become part of u_trim. A schedule has the models of the present
+    speed, and over the record those of every tick. Arguments: `guards`, old and new, with the
+    models of the feedforward.
     """
     y = state.y
     y_m = state.y_m
@@ -346,20 +431,33 @@ def retune(
     observers = (old.params, new.params)
     if isinstance(law, ScheduleState):
         observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
-    other_model = isinstance(observing, (ObserverState, VaneObserverState)) and _is_replaced(*observers)
-    if len(state.history) > 1 and isinstance(observing, ObserverState) and isinstance(observing.law, LawState):
+    other_model = isinstance(observing, (ObserverState, VaneObserverState)) and _is_replaced(
+        *observers
+    )
+    if (
+        len(state.history) > 1
+        and isinstance(observing, ObserverState)
+        and isinstance(observing.law, LawState)
+    ):
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
         if other_model or other_nominal:
-            # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part of the law: what
-            # the law has integrated beside an observer stays there, which would take it long to integrate again.
+            # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes
+            # the part of the law: what the law has integrated beside an observer stays there, which
+            # would take it long to integrate again.
             law_part = state.u - state.u_trim - state.u_ff
             limits = observers[1].limits
-            acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
+            acted, acts = (
+                (params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers
+            )
             goes_on = np.where(acted, observing.u_o - change, law_part)
             u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-            inner = shifted(observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law)
+            inner = shifted(
+                observing.law,
+                law_part - u_o - (law_part + change - observing.u_o),
+                observers[1].law,
+            )
             filters = observers_of(new.params, [tick.scale for tick in state.history])
             z = observer.estimates_after(state.history, change, filters)
             started = ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
@@ -368,22 +466,32 @@ def retune(
     if other_model and not _same_model(*observers):
         z = observer.initial_estimates(y.value - y_m, observers[1])
         state = state._replace(u_trim=state.u_trim + observing.u_o)
-        started = observing._replace(z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma))
+        started = observing._replace(
+            z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
+        )
         law = law._replace(law=started) if isinstance(law, ScheduleState) else started
     if other_nominal:
         start = None if after is None else feedforward.initial_state(y_m, after)
-        state = state._replace(u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start)
+        state = state._replace(
+            u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
+        )
     return state._replace(law=law)
 
 
-def _with_nominal(state: ControllerState, y_m: FloatArray, nominal: Nominal | None) -> tuple[ControllerState, Array]:
-    """The state with the feedforward of another model in the same motion, and the change of u_ff, (m,)."""
+def _with_nominal(
+    state: ControllerState, y_m: FloatArray, nominal: Nominal | None
+) -> tuple[ControllerState, Array]:
+    """The state with the feedforward of another model in the same motion, and the change of u_ff,
+    (m,).
+    """
     u_ff = np.zeros_like(state.u)
     goes_on = None
     if nominal is not None:
         earlier = state.history[-2]
         last = state.history[-1]
-        goes_on = feedforward.continued(state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal)
+        goes_on = feedforward.continued(
+            state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
+        )
         u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
     return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
 
@@ -394,7 +502,10 @@ def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
 
 
 def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
-    same = all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("Phi", "Gamma", "H", "L", "F"))
+    same = all(
+        np.array_equal(getattr(old, name), getattr(new, name))
+        for name in ("Phi", "Gamma", "H", "L", "F")
+    )
     return same and _same_arrays(old.vanes, new.vanes)
 
 
@@ -435,4 +546,6 @@ def _failsafe(
     effectors = state.effectors_failsafe
     if effectors is not None and scale != 1.0:
         effectors = scale * effectors
-    return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(now_ns, y.value, y_m, 0.0, 0.0)
+    return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(
+        now_ns, y.value, y_m, 0.0, 0.0
+    )

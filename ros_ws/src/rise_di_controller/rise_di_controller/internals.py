@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: a named vector per tick. With the parameters the log is enough to recompute u."""
+"""The controller's log: a named vector per tick. With the parameters the log is enough to recompute
+u.
+"""
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
@@ -21,7 +23,16 @@ VANE_STATE = ("vane_mean", "vane_square", "vane_measures")
 VANE_READING = ("vane", "vane_m")
 GIVEN_UP = "given_up"  # group of a controller that learns
 RESERVED = frozenset(
-    {*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, *VANE_STATE, *VANE_READING, EFFECTOR, GIVEN_UP}
+    {
+        *SCALARS,
+        *OUTPUT_GROUPS,
+        *INPUT_GROUPS,
+        *OBSERVER_GROUPS,
+        *VANE_STATE,
+        *VANE_READING,
+        EFFECTOR,
+        GIVEN_UP,
+    }
 ) - {"e"}
 """Names reserved by the log, not for the state of a law. e is y - y_m."""
 
@@ -44,12 +55,16 @@ def groups(
 ) -> dict[str, tuple[str, ...]]:
     """Groups of channels of `internals` and the names per group, in the order of the log.
 
-    By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement), integral_e (units of y times
-    s) and Pi (scaled input). By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff
-    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in. Of vanes: mean, mean square around it,
-    1 for a vane in use, the reading, and the reading in the reference motion. Of an allocation: effector, as commanded.
+    By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement),
+    integral_e (units of y times s) and Pi (scaled input). By input: u before (u_free) and after
+    saturation (u), u_trim, limited (Saturation), u_ff (feedforward). Of an observer: estimates z,
+    by input u_o, and sigma, the fade-in. Of vanes: mean, mean square around it, 1 for a vane in
+    use, the reading, and the reading in the reference motion. Of an allocation: effector, as
+    commanded.
     """
-    state_groups = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)]
+    state_groups = [
+        name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)
+    ]
     grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *state_groups)}
     grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
     if "z" in field_names(law):
@@ -62,9 +77,9 @@ def groups(
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Channel names of `internals`: the scalars, then "group.name".
 
-    Scalars: mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y
-    at the tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters
-    (ControllerConfig.digest).
+    Scalars: mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after
+    its deadline), age (s, of y at the tick), number (counts the samples from 1 since the start: a
+    gap is a lost sample), parameters (ControllerConfig.digest).
     """
     channels = list(SCALARS)
     for group, members in grouped.items():
@@ -84,24 +99,47 @@ def values(
 ) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged.
 
-    `given_up` is 1 for an output without a model to the end of the engagement, (m,), and empty without a learner.
-    With an allocation an input is limited by MAGNITUDE where it, or any effector, is at an end.
+    `given_up` is 1 for an output without a model to the end of the engagement, (m,), and empty
+    without a learner. With an allocation an input is limited by MAGNITUDE where it, or any
+    effector, is at an end.
     """
     if state.law is None:
-        raise ValueError("internals: found a controller that was never engaged, expected an engaged one")
-    scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])
+        raise ValueError(
+            "internals: found a controller that was never engaged, expected an engaged one"
+        )
+    scalars = np.array(
+        [
+            float(state.mode),
+            inputs.dt,
+            inputs.y_m_offset,
+            late,
+            age,
+            float(number),
+            float(parameters),
+        ]
+    )
     limits = guard.limits
     at_stop = False
     if guard.allocation is not None and state.effectors is not None:
         stops = guard.allocation.limits
         at_stop = bool(((state.effectors <= stops.lower) | (state.effectors >= stops.upper)).any())
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper) & (not at_stop)
-    limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
+    limited = np.where(
+        state.u == state.u_free,
+        Saturation.NO,
+        np.where(inside, Saturation.RATE, Saturation.MAGNITUDE),
+    )
     state_values = fields(state.law)
     state_values.pop("e", None)
-    observer_values = [state_values.pop(group) for group in (*OBSERVER_GROUPS, *VANE_STATE) if group in state_values]
+    observer_values = [
+        state_values.pop(group)
+        for group in (*OBSERVER_GROUPS, *VANE_STATE)
+        if group in state_values
+    ]
     readings = () if state.vanes is None else state.vanes
     by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *state_values.values())
     by_input = (state.u_free, state.u, state.u_trim, limited, state.u_ff)
     effectors = () if state.effectors is None else (state.effectors,)
-    return np.concatenate([scalars, *by_output, *by_input, *observer_values, *readings, *effectors, given_up])
+    return np.concatenate(
+        [scalars, *by_output, *by_input, *observer_values, *readings, *effectors, given_up]
+    )

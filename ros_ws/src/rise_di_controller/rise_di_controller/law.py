@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as a pure step: from y and y_m only, without A, B, f or any acceleration.
+"""The control law, equations (20)-(22), as a pure step: from y and y_m only, without A, B, f or any
+acceleration.
 
 `CONTROL_LAWS` has the law in the protocol of `control_law`, with anti-windup and retuning.
 """
@@ -12,7 +13,9 @@ from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.saturation import Limits, saturate
 
-MIN_GAIN = 0.01  # lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive
+# lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be
+# positive
+MIN_GAIN = 0.01
 
 
 class Sign(IntEnum):
@@ -26,8 +29,9 @@ class Sign(IntEnum):
 class LawParams(NamedTuple):
     """Parameters of the law over m channels.
 
-    The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1. So K is a bandwidth
-    in rad/s, and beta has units of y / s^2. The theorem holds for v as for u.
+    The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii)
+    about 1. So K is a bandwidth in rad/s, and beta has units of y / s^2. The theorem holds for v as
+    for u.
     """
 
     K: Array  # (m,) diagonal of equation (22), 1/s
@@ -50,24 +54,32 @@ class LawState(NamedTuple):
 
 
 def gain(k_g: Array, k_d: Array) -> Array:
-    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,), from k_g () and k_d (m - 1,)."""
+    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,), from k_g () and k_d
+    (m - 1,).
+    """
     xp = array_namespace(k_d)
     return 1.0 + k_g + xp.concat([k_d, xp.zeros(1, dtype=k_d.dtype)])
 
 
 def total_lag(lag: Array, delay: float, period: float) -> Array:
-    """Lag from y to the actuator positions: actuator + 1.5 period (sampling and hold) + delay, shape of `lag`, s."""
+    """Lag from y to the actuator positions: actuator + 1.5 period (sampling and hold) + delay,
+    shape of `lag`, s.
+    """
     return lag + 1.5 * period + delay
 
 
 def engage(y: Array, y_m: Array) -> LawState:
-    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at engagement (bumpless transfer)."""
+    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at engagement (bumpless
+    transfer).
+    """
     xp = array_namespace(y)
     e = y - y_m
     return LawState(e, e, xp.zeros_like(e), xp.zeros_like(e))
 
 
-def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) -> tuple[LawState, Array]:
+def step(
+    state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams
+) -> tuple[LawState, Array]:
     """A tick of the law: (state, y, y_m, dt) -> (state, u).
 
     With e = y - y_m (3), e_p = e at the previous tick, dt the time between the two ticks:
@@ -79,12 +91,14 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         SOFT:      Pi += dt beta s first, s = clip(e / eps, -1, 1)
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
-    e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead) consistent with the
-    prediction: backward Euler of (21), with an error of order dt^2 and without chatter. SOFT is for loops with lag. u is the
-    deviation from the input at engagement. sgn(0) = 0. dt > 0.
+    e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead)
+    consistent with the prediction: backward Euler of (21), with an error of order dt^2 and without
+    chatter. SOFT is for loops with lag. u is the deviation from the input at engagement. sgn(0) =
+    0. dt > 0.
 
     Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units of input_scale.
-    Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see docs/theory.md.
+    Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
+    docs/theory.md.
     """
     xp = array_namespace(y)
     e = y - y_m
@@ -109,24 +123,36 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
 def control(before: LawState, after: LawState, params: LawParams) -> Array:
     """Equation (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
-    e and integral_e are the values after the tick. Pi is the value before the tick with the literal sign (first used,
-    then updated), and the value after the tick with the soft and implicit signs. Units of u.
+    e and integral_e are the values after the tick. Pi is the value before the tick with the literal
+    sign (first used, then updated), and the value after the tick with the soft and implicit signs.
+    Units of u.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
-    return params.input_scale * (-params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi))
+    return params.input_scale * (
+        -params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi)
+    )
 
 
 def step_with_anti_windup(
-    state: LawState, y: Array, y_m: Array, dt: Array, u_trim: Array, u_before: Array, params: LawParams, limits: Limits
+    state: LawState,
+    y: Array,
+    y_m: Array,
+    dt: Array,
+    u_trim: Array,
+    u_before: Array,
+    params: LawParams,
+    limits: Limits,
 ) -> tuple[LawState, Array, Array]:
-    """A step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape (m,).
+    """A step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape
+    (m,).
 
-    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an outward increment of integral_e or of Pi is
-    reduced; an inward increment stays. The increment of integral_e is dropped. The increment of Pi, the faster integral, is
-    scaled to bring u to the limit:
+    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an outward
+    increment of integral_e or of Pi is reduced; an inward increment stays. The increment of
+    integral_e is dropped. The increment of Pi, the faster integral, is scaled to bring u to the
+    limit:
 
-        excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e), 0)
-        change = abs(change of u by the increment of Pi)
+        excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e),
+        0) change = abs(change of u by the increment of Pi)
         Pi+    = Pi + max(change - excess, 0) / change (increment of Pi)
 
     Without saturation every bit equals the law alone. Theorem 1 does not cover saturation.
@@ -154,13 +180,17 @@ def step_with_anti_windup(
 
 
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
-    """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of the linear term.
+    """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of
+    the linear term.
 
-    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K, Lambda and u of the old
-    parameters. The remaining states stay. Equation (23) continues from the same u with the new gains.
+    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K,
+    Lambda and u of the old parameters. The remaining states stay. Equation (23) continues from the
+    same u with the new gains.
     """
     u = control(state, state, old)
-    Pi = -new.D * u / new.input_scale - new.K * (state.e - state.e_0 + new.Lambda * state.integral_e)
+    Pi = -new.D * u / new.input_scale - new.K * (
+        state.e - state.e_0 + new.Lambda * state.integral_e
+    )
     return state._replace(Pi=Pi)
 
 
@@ -176,7 +206,9 @@ def _control_law(sign: Sign) -> ControlLaw:
     def start(measured: Measurements, params: LawParams) -> LawState:
         return engage(measured.y, measured.y_m)
 
-    def tick(state: LawState, measured: Measurements, dt: Array, params: LawParams) -> tuple[LawState, Array]:
+    def tick(
+        state: LawState, measured: Measurements, dt: Array, params: LawParams
+    ) -> tuple[LawState, Array]:
         after, u = step(state, measured.y, measured.y_m, dt, with_sign(params))
         return after, measured.u_trim + u
 

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller, by name: RISE-DI, and the laws registered by installed packages.
+"""The control laws of the controller, by name: RISE-DI, and the laws registered by installed
+packages.
 
 A package registers a law by an entry point in setup.py; see docs/laws.md:
 
@@ -31,29 +32,44 @@ def names() -> tuple[str, ...]:
 
 
 def schema(name: object) -> type[ControllerConfig]:
-    """The parameters of a law. Raises ParameterError for a law not registered, registered twice, or not loadable."""
+    """The parameters of a law. Raises ParameterError for a law not registered, registered twice, or
+    not loadable.
+    """
     if name == DEFAULT:
         return RiseDiConfig
     if name not in names():
-        raise ParameterError(f"law: found {name!r}, expected a registered law: {', '.join(names())}")
+        raise ParameterError(
+            f"law: found {name!r}, expected a registered law: {', '.join(names())}"
+        )
     entries = {entry.value: entry for entry in _registered().select(name=str(name))}
     if len(entries) > 1:
-        raise ParameterError(f"law: found {name!r}, registered as {' and as '.join(sorted(entries))}, expected one of them")
+        raise ParameterError(
+            f"law: found {name!r}, registered as {' and as '.join(sorted(entries))}, expected "
+            "one of them"
+        )
     try:
         schema = next(iter(entries.values())).load()
     except (ImportError, AttributeError) as error:
-        raise ParameterError(f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package") from None
+        raise ParameterError(
+            f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package"
+        ) from None
     if not (isinstance(schema, type) and issubclass(schema, ControllerConfig)):
-        raise ParameterError(f"law: found {name!r}, registered as {schema!r}, expected a subclass of ControllerConfig")
+        raise ParameterError(
+            f"law: found {name!r}, registered as {schema!r}, expected a subclass of "
+            "ControllerConfig"
+        )
     if schema.needs:
         raise ParameterError(
-            f"law: found {name!r}, which needs {schema.needs}, expected a law of y and y_m: the topics have no more"
+            f"law: found {name!r}, which needs {schema.needs}, expected a law of y and y_m: the "
+            "topics have no more"
         )
     return schema
 
 
 class AnyLaw(ControllerConfig):
-    """The section `controller` of a scenario: the parameters of the law named by the key `law`, RISE-DI by default."""
+    """The section `controller` of a scenario: the parameters of the law named by the key `law`,
+    RISE-DI by default.
+    """
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled linear loop of a control law around a model, with actuators and delay: stability and delay margin."""
+"""The sampled linear loop of a control law around a model, with actuators and delay: stability and
+delay margin.
+"""
 
 import math
 from functools import lru_cache
@@ -14,17 +16,24 @@ from rise_di_controller.control_law import Measurements, TunedLaw, fields, resto
 from rise_di_controller.law import LawParams, Sign, total_lag
 
 SPECTRAL_RADIUS_TOLERANCE = 1e-6
-"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a double eigenvalue 1, which
-rounding splits by the root of the rounding error, 1e-8."""
+"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a
+double eigenvalue 1, which rounding splits by the root of the rounding error, 1e-8."""
 
 MAX_DELAY_MARGIN = 0.5
-"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop of this stack."""
+"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
+of this stack."""
 
-SMALL = 2.0**-40  # size of the steps from 0: below every limit and every width of a sign; a power of two loses no digit
+SMALL = (
+    2.0**-40
+    # size of the steps from 0: below every limit and every width of a sign; a power of two loses no
+    # digit
+)
 
 
 class LinearPlant(NamedTuple):
-    """x_dot = A x + B u_a, y = C x with an actuator per input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
+    """x_dot = A x + B u_a, y = C x with an actuator per input, lag_i u_a,i_dot = u_i - u_a,i; the
+    law's order, SI.
+    """
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
@@ -45,7 +54,9 @@ class Loop(NamedTuple):
 
 
 class LinearLaw(NamedTuple):
-    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0; leading axes are batches."""
+    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0;
+    leading axes are batches.
+    """
 
     A: FloatArray  # (..., k, k)
     B: FloatArray  # (..., k, m), with vanes these in further columns, as in D
@@ -54,11 +65,12 @@ class LinearLaw(NamedTuple):
 
 
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
-    """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the state or of y.
+    """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the
+    state or of y.
 
-    An observer has faded in, and its vanes measure: a column each, after those of y. With `candidates` N the parameters have N
-    sets of gains as the last axis, and the matrices have them as the first. Raises ParameterError for the literal sign: not
-    linear anywhere.
+    An observer has faded in, and its vanes measure: a column each, after those of y. With
+    `candidates` N the parameters have N sets of gains as the last axis, and the matrices have them
+    as the first. Raises ParameterError for the literal sign: not linear anywhere.
     """
     control_law, params = law
     core = params
@@ -72,10 +84,14 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
     wide = m if none is None else m + len(none)
     if vanes is not None:
-        params = params._replace(vanes=vanes._replace(least=np.where(np.isinf(vanes.least), np.inf, -1.0)))
+        params = params._replace(
+            vanes=vanes._replace(least=np.where(np.isinf(vanes.least), np.inf, -1.0))
+        )
     still = Measurements(zero, zero, zero, zero, zero, vane=none, vane_m=none)
     at_engagement = fields(control_law.engage(still, params))
-    at_rest = {name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()}
+    at_rest = {
+        name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()
+    }
     if "sigma" in at_rest:
         at_rest["sigma"] = np.ones((1, *sets))
     ends = np.cumsum([len(value) for value in at_rest.values()])
@@ -90,7 +106,9 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
     equilibrium = step(begin[:size], begin[size:])
     units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
-    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL for unit in units]
+    columns = [
+        (step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL for unit in units
+    ]
     matrix = np.array(columns).T
     above = matrix[..., :size, :]
     below = matrix[..., size:, :]
@@ -98,7 +116,8 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period; leading axes are batches.
+    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period; leading axes
+    are batches.
 
     Source: C. Van Loan, IEEE TAC 23(3), 1978.
     """
@@ -121,7 +140,9 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
 
 
 class SampledPlant(NamedTuple):
-    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x; leading axes are batches."""
+    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x; leading axes are
+    batches.
+    """
 
     A: FloatArray  # (..., k, k)
     B: FloatArray  # (..., k, m)
@@ -129,15 +150,19 @@ class SampledPlant(NamedTuple):
 
 
 def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledPlant:
-    """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of earlier ticks.
+    """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of
+    earlier ticks.
 
-    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). Source: K. J. Astrom,
-    B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
+    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
+    Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
+    sampling of a plant with delay.
     """
     n, m = plant.B.shape[-2:]
     batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
-    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any rate, unused
+    rate = np.where(
+        has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0
+    )  # without an actuator: any rate, unused
     motion = np.zeros((*batch, n + m, n + m))
     drive = np.zeros((*batch, n + m, m))
     motion[..., :n, :n] = plant.A
@@ -155,7 +180,9 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
-    inputs = np.zeros((*batch, n + m, m + held * m))  # effect of u of this tick, then of earlier ticks
+    inputs = np.zeros(
+        (*batch, n + m, m + held * m)
+    )  # effect of u of this tick, then of earlier ticks
     for i in range(m):
         transition, new = zero_order_hold(motion, drive, loop.period - part[i])
         _, old = zero_order_hold(motion, drive, part[i])
@@ -169,9 +196,11 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
 
 
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
-    """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
+    """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the
+    unit circle.
 
-    The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and law are batches.
+    The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and
+    law are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
     k = A.shape[-1]
@@ -195,12 +224,17 @@ def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray)
 
 
 def delay_margin(
-    plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | None = None, longest: float = MAX_DELAY_MARGIN
+    plant: LinearPlant,
+    law: LinearLaw,
+    loop: Loop,
+    channel: int | None = None,
+    longest: float = MAX_DELAY_MARGIN,
 ) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all channels or in `channel`.
+    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all
+    channels or in `channel`.
 
-    0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The search takes steps of half
-    a period, then bisects down to 0.1 ms.
+    0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The
+    search takes steps of half a period, then bisects down to 0.1 ms.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     if not is_stable(plant, law, loop, 0.0 * delayed):

@@ -1,13 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the sampled linear loop of a law at the inputs of an aircraft: phase, gain, sensitivity, disk margin, damping.
+"""Margins of the sampled linear loop of a law at the inputs of an aircraft: phase, gain,
+sensitivity, disk margin, damping.
 
 With P(z) from u to y, the sampled aircraft with actuators and delay, and K(z) from y to u, the law:
 
-    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1        loop transfer function with input i alone open
+    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1  loop transfer function with input i alone open
 
-on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedback Systems", chapter 10, for phase, gain and
-sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk Margins", IEEE Control Systems 40(5), 2020.
+on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedback Systems", chapter
+10, for phase, gain and sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk
+Margins", IEEE Control Systems 40(5), 2020.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,16 +33,23 @@ IntArray = NDArray[np.intp]
 
 DECADES = 5
 PER_DECADE = 40
-"""Grid of frequencies below pi / T. The frequencies of the modes are added, and eight points around every peak."""
+"""Grid of frequencies below pi / T. The frequencies of the modes are added, and eight points around
+every peak."""
 
 SLOW = np.pi / 2.0
-"""rad, largest natural frequency times T of a slow mode: four ticks a cycle. A faster mode shows in gain margin and S."""
+"""rad, largest natural frequency times T of a slow mode: four ticks a cycle. A faster mode shows in
+gain margin and S."""
 
-NO_MODE = 1e-6  # rad, natural frequency times T below which an eigenvalue belongs to an integral or a kept constant
-VANISHED = 1e-9  # magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
+# rad, natural frequency times T below which an eigenvalue belongs to an integral or a kept constant
+NO_MODE = 1e-6
+# magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
+VANISHED = 1e-9
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
-SERIAL_SIZE = 4000  # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
-PHASE_AT_ZERO = 0.01  # rad, phase of -L at the lowest frequency below which L is taken as real there
+# entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
+SERIAL_SIZE = 4000
+PHASE_AT_ZERO = (
+    0.01  # rad, phase of -L at the lowest frequency below which L is taken as real there
+)
 # of `scaled_norm`, and of the search for the peak
 BALANCED_ROUNDS = 6
 DESCENT_STEPS = 40
@@ -48,16 +57,22 @@ MAX_REFINED = 40
 
 
 class Margins(NamedTuple):
-    """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...). An unstable loop has none: 0, 1, infinite S."""
+    """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...). An unstable loop has
+    none: 0, 1, infinite S.
+    """
 
     stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
     phase: FloatArray  # (..., m) rad, infinite where abs(L_i) is never 1
     crossover: FloatArray  # (..., m) rad/s of this phase margin, 0 without a crossover
-    gain_decrease: FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without a limit
+    gain_decrease: (
+        FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without a limit
+    )
     gain_increase: FloatArray  # (..., m) factor above 1, infinite without a limit
     sensitivity: FloatArray  # (..., m) largest abs(S_ii)
     disk: FloatArray  # (..., m) balanced disk margin of an input, 0 to 2
-    sensitivity_all: FloatArray  # (...) largest singular value of S, scaled diagonally: all inputs at once
+    sensitivity_all: (
+        FloatArray  # (...) largest singular value of S, scaled diagonally: all inputs at once
+    )
     disk_all: FloatArray  # (...) balanced disk margin, independent disks in the inputs at once
     damping: FloatArray  # (...) least damping ratio of a slow mode, 1 without a slow mode
 
@@ -71,10 +86,15 @@ class Margins(NamedTuple):
         """The worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
-            name: np.asarray(getattr(self, name).max(axis=0)) for name in ("gain_decrease", "sensitivity", "sensitivity_all")
+            name: np.asarray(getattr(self, name).max(axis=0))
+            for name in ("gain_decrease", "sensitivity", "sensitivity_all")
         }
         least_phase = np.argmin(self.phase, axis=0)[None]
-        return Margins(**least | most | {"crossover": np.take_along_axis(self.crossover, least_phase, axis=0)[0]})
+        return Margins(
+            **least
+            | most
+            | {"crossover": np.take_along_axis(self.crossover, least_phase, axis=0)[0]}
+        )
 
 
 def disk_gain(disk: FloatArray) -> FloatArray:
@@ -96,7 +116,9 @@ class SlowModes(NamedTuple):
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SlowModes:
-    """The slow modes of an aircraft: p = log(eigenvalue) / T, frequency abs(p), damping -Re p / abs(p)."""
+    """The slow modes of an aircraft: p = log(eigenvalue) / T, frequency abs(p), damping -Re p /
+    abs(p).
+    """
     eigenvalues = np.linalg.eigvals(closed_loop(plant, law, loop, np.zeros(len(loop.lag))))
     return _slow_modes(eigenvalues.astype(np.complex128), loop.period)
 
@@ -115,25 +137,38 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
 
 
-def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True) -> Margins:
-    """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a law for each of them.
+def loop_margins(
+    plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True
+) -> Margins:
+    """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a
+    law for each of them.
 
-    Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The phase margin is the
-    smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are 1 / abs(L_i) at real L_i < 0, next to 1 on either side.
-    The disk margin is 1 / max_w abs(S_ii - 1/2) of an input, and with independent disks in the inputs at once
+    Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The
+    phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are 1 / abs(L_i)
+    at real L_i < 0, next to 1 on either side. The disk margin is 1 / max_w abs(S_ii - 1/2) of an
+    input, and with independent disks in the inputs at once
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
-    exact for m <= 3 and at most the disk margin for more inputs. Without `together` the figures of all inputs at once are NaN,
-    which saves a third of the time.
+    exact for m <= 3 and at most the disk margin for more inputs. Without `together` the figures of
+    all inputs at once are NaN, which saves a third of the time.
     """
     shape = _batch_shape(plant, law)
-    parts = [_margins(form, loop.period, together=together) for form in _schur_forms(plant, law, loop)]
-    return Margins(*(np.concatenate(values).reshape((*shape, *values[0].shape[1:])) for values in zip(*parts, strict=True)))
+    parts = [
+        _margins(form, loop.period, together=together) for form in _schur_forms(plant, law, loop)
+    ]
+    return Margins(
+        *(
+            np.concatenate(values).reshape((*shape, *values[0].shape[1:]))
+            for values in zip(*parts, strict=True)
+        )
+    )
 
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
-    """The `phase` of `loop_margins` alone, (..., m), without the search for gain margins and peaks."""
+    """The `phase` of `loop_margins` alone, (..., m), without the search for gain margins and
+    peaks.
+    """
     parts = []
     for form in _schur_forms(plant, law, loop):
         w, S = _on_grid(form, loop.period)
@@ -147,7 +182,9 @@ def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
 
 
 class _SchurForm(NamedTuple):
-    """The closed loop in Schur form: v = d + L (z - T)^-1 R d, from a disturbance d of the inputs to v = d + u."""
+    """The closed loop in Schur form: v = d + L (z - T)^-1 R d, from a disturbance d of the inputs
+    to v = d + u.
+    """
 
     T: ComplexArray  # (N, k, k) upper triangular
     R: ComplexArray  # (N, k, m)
@@ -164,7 +201,9 @@ def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_Sc
     count = int(np.prod(shape))
 
     def each(matrix: FloatArray) -> FloatArray:
-        return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(count, *matrix.shape[-2:])
+        return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(
+            count, *matrix.shape[-2:]
+        )
 
     A = each(plant.A)
     B = each(plant.B)
@@ -190,7 +229,9 @@ def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
 
 
 def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
-    """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part at once."""
+    """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part
+    at once.
+    """
     (N, k, m), F = form.R.shape, z.shape[1]
     size = min(max(SERIAL_SIZE // (k * m), 1), F)
     z = np.pad(z, ((0, 0), (0, -F % size)), mode="edge").reshape(N, -1, size)
@@ -198,7 +239,9 @@ def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
     flat = X.reshape(N, -1, k, size * m)
     for i in reversed(range(k)):
         coupled = (form.T[:, None, i, None, i + 1 :] @ flat[:, :, i + 1 :]).reshape(N, -1, size, m)
-        X[:, :, i] = (form.R[:, None, i, None] + coupled) / (z - form.T[:, i, i, None, None])[..., None]
+        X[:, :, i] = (form.R[:, None, i, None] + coupled) / (z - form.T[:, i, i, None, None])[
+            ..., None
+        ]
     product = (form.L[:, None] @ flat).reshape(N, -1, m, size, m)
     return np.asarray(np.eye(m) + product.swapaxes(2, 3).reshape(N, -1, m, m)[:, :F])
 
@@ -253,7 +296,9 @@ def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
-    """Grids of the aircraft, (N, F), rad/s, ascending: a common grid, and the frequencies of the modes."""
+    """Grids of the aircraft, (N, F), rad/s, ascending: a common grid, and the frequencies of the
+    modes.
+    """
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
     modes = np.where(turns.imag != 0.0, np.abs(turns.imag), np.abs(turns))
@@ -263,16 +308,23 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Four points on either side of the peaks of S_ii, of S_ii - 1/2 and of norms over the inputs, (N, G), S balanced."""
+    """Four points on either side of the peaks of S_ii, of S_ii - 1/2 and of norms over the inputs,
+    (N, G), S balanced.
+    """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
     norms = [_norm_bound(matrix)[..., None] for matrix in (S, half)]
-    peaks = np.argmax(np.concatenate([np.abs(diagonal), np.abs(diagonal - 0.5), *norms], axis=2), axis=1)  # (N, Q)
+    peaks = np.argmax(
+        np.concatenate([np.abs(diagonal), np.abs(diagonal - 0.5), *norms], axis=2), axis=1
+    )  # (N, Q)
     first = np.maximum(peaks - 1, 0)
     last = np.minimum(peaks + 1, w.shape[1] - 1)
     rows = np.arange(len(w))[:, None]
     parts = (np.arange(1, 5) / 5.0)[:, None, None]
-    sides = [low + parts * (high - low) for low, high in ((w[rows, first], w[rows, peaks]), (w[rows, peaks], w[rows, last]))]
+    sides = [
+        low + parts * (high - low)
+        for low, high in ((w[rows, first], w[rows, peaks]), (w[rows, peaks], w[rows, last]))
+    ]
     return np.moveaxis(np.concatenate(sides), 0, 1).reshape(len(w), -1)
 
 
@@ -292,7 +344,9 @@ def _refined(
     period: float,
     residual: Callable[[ComplexArray], FloatArray],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
+    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there: regula
+    falsi, Illinois.
+    """
     aircraft, place, channel = places
     forms = _SchurForm(*(part[aircraft] for part in form))
     low = w[aircraft, place]
@@ -304,7 +358,9 @@ def _refined(
     before = np.zeros(len(low))
     for _ in range(8 if len(low) else 0):
         gap = at_high - at_low
-        middle = np.where(gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap))
+        middle = np.where(
+            gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap)
+        )
         S = _sensitivity(forms, np.exp(1j * middle * period)[:, None])[:, 0]
         L = 1.0 / S[np.arange(len(low)), channel, channel] - 1.0
         value = residual(L)
@@ -323,7 +379,9 @@ def _log_gain(L: ComplexArray) -> FloatArray:
         return np.maximum(np.log(np.abs(L)), -700.0)  # L = 0 where no feedback acts
 
 
-def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: float) -> tuple[FloatArray, FloatArray]:
+def _phase_margins(
+    form: _SchurForm, w: FloatArray, L: ComplexArray, period: float
+) -> tuple[FloatArray, FloatArray]:
     """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and the frequency, (N, m)."""
     gains = _log_gain(L)
     places = _crossings(gains)
@@ -337,15 +395,24 @@ def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: flo
     return phase, crossover
 
 
-def _gain_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """Factors next to 1 below and above for L_i = -1, (N, m); L_i is real at w = 0 and at pi / T too."""
+def _gain_margins(
+    form: _SchurForm, w: FloatArray, L: ComplexArray, period: float
+) -> tuple[FloatArray, FloatArray]:
+    """Factors next to 1 below and above for L_i = -1, (N, m); L_i is real at w = 0 and at pi / T
+    too.
+    """
     imaginary = np.imag(L) / (1.0 + np.abs(L))
     imaginary[:, -1] = 0.0  # rounding apart
     places = _crossings(imaginary)
     inside = places[1] < L.shape[1] - 2  # the last point is looked at by itself
     places = (places[0][inside], places[1][inside], places[2][inside])
-    _, crossing = _refined(form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L)))
-    ends = np.concatenate([np.where(np.abs(np.angle(-L[:, :1])) < PHASE_AT_ZERO, L[:, :1].real, 0.0), L[:, -1:].real], axis=1)
+    _, crossing = _refined(
+        form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L))
+    )
+    ends = np.concatenate(
+        [np.where(np.abs(np.angle(-L[:, :1])) < PHASE_AT_ZERO, L[:, :1].real, 0.0), L[:, -1:].real],
+        axis=1,
+    )
     decrease = np.zeros(L[:, 0].shape)
     increase = np.full(L[:, 0].shape, np.inf)
     for row, channel, value in zip(places[0], places[2], crossing.real, strict=True):
@@ -369,14 +436,17 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
-    """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal: Osborne's iteration."""
+    """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal:
+    Osborne's iteration.
+    """
     M = matrices.copy()
     off = ~np.eye(matrices.shape[-1], dtype=bool)
     least = 1e-9 * np.linalg.norm(M, axis=(-2, -1)) + 1e-300
     for _ in range(BALANCED_ROUNDS if len(off) > 1 else 0):
         for i, places in enumerate(off):
             row, column = (
-                np.sqrt(np.sum(part.real**2 + part.imag**2, axis=-1)) for part in (M[..., i, places], M[..., places, i])
+                np.sqrt(np.sum(part.real**2 + part.imag**2, axis=-1))
+                for part in (M[..., i, places], M[..., places, i])
             )
             factor = np.sqrt((row + least) / (column + least))[..., None]
             M[..., i, :] /= factor
@@ -391,10 +461,12 @@ def _norm_bound(matrices: ComplexArray) -> FloatArray:
 
 
 def scaled_norm(matrices: ComplexArray) -> FloatArray:
-    """min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m): the bound of the structured singular value, (P,).
+    """min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m): the bound of the structured
+    singular value, (P,).
 
-    Osborne's iteration, then descent along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2, u and v the singular vectors.
-    Any D gives an upper bound: an early end is conservative. Source: A. Packard, J. Doyle, Automatica 29(1), 1993.
+    Osborne's iteration, then descent along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2, u and
+    v the singular vectors. Any D gives an upper bound: an early end is conservative. Source: A.
+    Packard, J. Doyle, Automatica 29(1), 1993.
     """
     M = _balanced(matrices)
     best = np.full(len(M), np.inf)
@@ -407,10 +479,14 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
-    """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is refined to convergence."""
+    """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is
+    refined to convergence.
+    """
     bounds = _norm_bound(balanced)
     rows = np.arange(len(balanced))
-    least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))  # a diagonal entry, unchanged by D
+    least = np.abs(np.einsum("NFii->NFi", balanced)).max(
+        axis=(1, 2)
+    )  # a diagonal entry, unchanged by D
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))
     refined = np.zeros(bounds.shape, dtype=bool)
@@ -419,6 +495,8 @@ def _largest_norm(balanced: ComplexArray) -> FloatArray:
         todo = rows[~refined[rows, peak] & (bounds[rows, peak] > least)]
         if not len(todo):
             break
-        bounds[todo, peak[todo]] = np.minimum(bounds[todo, peak[todo]], scaled_norm(balanced[todo, peak[todo]]))
+        bounds[todo, peak[todo]] = np.minimum(
+            bounds[todo, peak[todo]], scaled_norm(balanced[todo, peak[todo]])
+        )
         refined[todo, peak[todo]] = True
     return np.asarray(np.maximum(bounds.max(axis=1), least))

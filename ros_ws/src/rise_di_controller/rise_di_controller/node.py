@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller node: a lifecycle node that runs the guarded law at a fixed rate or in lockstep.
 
-It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
+It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting
+publishers and stale inputs.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,26 +25,45 @@ from flight_ros.reports import MAX_REPORT_SIZE, Report
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
 from flight_ros.ticker import Tick
-from flight_ros.topics import AUTHORITY, INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
+from flight_ros.topics import (
+    AUTHORITY,
+    INTERNALS,
+    LEARNING,
+    LOCKSTEP,
+    PROPOSAL,
+    PROPOSALS,
+    Y_M,
+    U,
+    Y,
+)
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import AUTHORITY_TICKS, Event, EventKind, Learning, Proposal, authority_names
+from rise_di_controller.proposals import (
+    AUTHORITY_TICKS,
+    Event,
+    EventKind,
+    Learning,
+    Proposal,
+    authority_names,
+)
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 LONG_MAX_AGE = 1.0  # s, from which a failsafe is named as late
 SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two lines on a rate too low for max_age
 BEHIND_NS = 1_000_000
-"""From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have
-finished their ticks of up to 1 ms. Ticks at a random part of the period delay u by up to 2 ms more, and those at the instants
-of y and y_m wait for a processor of two."""
+"""From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have
+arrived, and their nodes have finished their ticks of up to 1 ms. Ticks at a random part of the
+period delay u by up to 2 ms more, and those at the instants of y and y_m wait for a processor of
+two."""
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
-    """At each tick it takes the received y and y_m, steps the law and publishes u with the stamp of y.
+    """At each tick it takes the received y and y_m, steps the law and publishes u with the stamp of
+    y.
 
-    In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its instant. It publishes
-    exactly one u, without channels where the controller has no output.
+    In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its
+    instant. It publishes exactly one u, without channels where the controller has no output.
     """
 
     def __init__(self) -> None:
@@ -51,12 +71,20 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         LifecycleNodeMixin.__init__(self)
         answer_invalid_transitions(self)
         self._active = False
-        self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
+        self._publishes = (
+            self.parameters.autostart
+        )  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
         y_input = self.parameters.measured, self._taking(self._controller.take_y)
         y_m_input = self.parameters.outputs, self._taking(self._controller.take_y_m)
         self._y, self._y_m = (
-            self.receive(topic, Decoder(names).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
+            self.receive(
+                topic,
+                Decoder(names).decode,
+                take,
+                max_age_ns=self._max_age_ns,
+                lock=self._new_lock(),
+            )
             for topic, (names, take) in ((Y, y_input), (Y_M, y_m_input))
         )
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
@@ -81,11 +109,14 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             if self.parameters.start_active:
                 self.trigger_activate()
         else:
-            self.get_logger().info("unconfigured: waiting to be configured and activated (autostart is false)")
+            self.get_logger().info(
+                "unconfigured: waiting to be configured and activated (autostart is false)"
+            )
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reset the law. The parameters were validated when they were set."""
-        self._controller.restart()  # keeps u, so that a node that is configured again transfers without a bump
+        # keeps u, so that a node that is configured again transfers without a bump
+        self._controller.restart()
         self.get_logger().info(self.parameters.summary())
         self._warn_long_max_age(self.parameters)
         return TransitionCallbackReturn.SUCCESS
@@ -120,13 +151,17 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """BEHIND_NS, or half a period where that is less, after a whole period of the system clock."""
+        """BEHIND_NS, or half a period where that is less, after a whole period of the system
+        clock.
+        """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
         if self._last_ns and (instants := self._controller.overrun(self._last_ns, now_ns)):
-            self.get_logger().warning(f"overrun of {seconds(now_ns - self._last_ns):.3f} s: re-engaging")
+            self.get_logger().warning(
+                f"overrun of {seconds(now_ns - self._last_ns):.3f} s: re-engaging"
+            )
             for instant_ns in instants:
                 self._step(instant_ns, 0)
         self._last_ns = now_ns
@@ -139,8 +174,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
-    def _taking(self, take: Callable[[StampedVector, int], str]) -> Callable[[StampedVector, int], None]:
-        """`take`, with a ChannelError for a sample that is lost, so that the receiver counts and logs it."""
+    def _taking(
+        self, take: Callable[[StampedVector, int], str]
+    ) -> Callable[[StampedVector, int], None]:
+        """`take`, with a ChannelError for a sample that is lost, so that the receiver counts and
+        logs it.
+        """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
             if lost := take(sample, now_ns):
@@ -152,7 +191,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """Log and count that the law has engaged again by itself, a line in 2 s at most."""
         if restarted := self._controller.restarted():
             self._restarts += 1
-            self.get_logger().warning(f"the law engages again: {restarted}", throttle_duration_sec=2.0)
+            self.get_logger().warning(
+                f"the law engages again: {restarted}", throttle_duration_sec=2.0
+            )
 
     def _tell_vanes(self) -> None:
         """Log a vane at the begin and the end of a standstill."""
@@ -173,11 +214,14 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return None if self.parameters.lockstep else PublisherLock(self._timeouts_ns)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Ages above which a publisher has timed out: for the same node in another process, and for another node.
+        """Ages above which a publisher has timed out: for the same node in another process, and for
+        another node.
 
         Another one may take over once the failsafe has brought u to trim.
         """
-        return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold + self.parameters.ramp)
+        return self._max_age_ns(), self._max_age_ns() + nanoseconds(
+            self.parameters.hold + self.parameters.ramp
+        )
 
     def _step(self, now_ns: int, late_ns: int) -> bool:
         """One tick of the controller; whether it had an output to publish."""
@@ -191,11 +235,14 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._tell_restart()
         if output is None or not self._publishes:
             return False
-        # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
+        # A tick that was stopped half-way does not publish its old u: the aircraft has started its
+        # failsafe, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns():
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
         if self._controller.has_internals:
-            self._publish_internals(self._internals_encoder.encode(output.stamp_ns, output.internals))
+            self._publish_internals(
+                self._internals_encoder.encode(output.stamp_ns, output.internals)
+            )
         return True
 
     def advance(self) -> bool:
@@ -227,8 +274,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         parameters = self.parameters
         if not isinstance(parameters, RiseDiConfig) or parameters.learn is None:
             return None
-        # The first identification of a learner that was started again comes after the first of `updates`.
-        timeouts_ns = nanoseconds(parameters.learn.updates[0]), nanoseconds(2.0 * parameters.learn.window)
+        # The first identification of a learner that was started again comes after the first of
+        # `updates`.
+        timeouts_ns = (
+            nanoseconds(parameters.learn.updates[0]),
+            nanoseconds(2.0 * parameters.learn.window),
+        )
         self._proposals = self.receive(
             PROPOSAL,
             self._decode_proposal,
@@ -238,7 +289,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
             max_size=MAX_REPORT_SIZE,
         )
-        self._publish_learning, self._send_authority = self.advertise(LEARNING), self.advertise(AUTHORITY)
+        self._publish_learning, self._send_authority = (
+            self.advertise(LEARNING),
+            self.advertise(AUTHORITY),
+        )
         self._authority_encoder = self.encoder(authority_names(parameters.outputs))
         return Learning(parameters, self._say, simulated=parameters.lockstep)
 
@@ -252,12 +306,18 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Tell guidance what the inputs can do, by the model that flies. Without a learner nothing is told."""
+        """Tell guidance what the inputs can do, by the model that flies. Without a learner nothing
+        is told.
+        """
         if self._learning is not None:
-            self._send_authority(self._authority_encoder.encode(now_ns, self._learning.authority(self._controller)))
+            self._send_authority(
+                self._authority_encoder.encode(now_ns, self._learning.authority(self._controller))
+            )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """Lockstep: whether the proposal has arrived for which the step of an instant waits, if any."""
+        """Lockstep: whether the proposal has arrived for which the step of an instant waits, if
+        any.
+        """
         if self._learning is None:
             return True
         self._proposals.poll(now_ns)
@@ -277,7 +337,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if not isinstance(start, int) or not isinstance(flown, int):
             raise ChannelError("malformed", "a proposal without the digests start and flown")
         assert self._learning is not None  # noqa: S101 - the receiver was made beside it
-        self._learning.receive(Proposal(report.stamp_ns, start, flown, change, report.sentence), self._controller, now_ns)
+        self._learning.receive(
+            Proposal(report.stamp_ns, start, flown, change, report.sentence),
+            self._controller,
+            now_ns,
+        )
 
     def _say(self, event: Event) -> None:
         """Log and publish what became of a proposal."""
@@ -286,7 +350,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.get_logger().warning(sentence)
         else:
             self.get_logger().info(sentence)
-        report = Report(event.stamp_ns, self.instance, sentence, {"event": event.kind}, warns=not event.change)
+        report = Report(
+            event.stamp_ns, self.instance, sentence, {"event": event.kind}, warns=not event.change
+        )
         self._publish_learning(reports.encode(report, "learning"))
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
@@ -294,19 +360,35 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         for receiver in (self._y, self._y_m):
             if receiver.subscription.topic.name in stale:
                 self.warn_no_publisher(receiver.subscription)
-                if (sentence := receiver.slowness(self._max_age_ns())) and self._slow.due(receiver.name):
+                if (sentence := receiver.slowness(self._max_age_ns())) and self._slow.due(
+                    receiver.name
+                ):
                     self.get_logger().warning(f"{receiver.name}: {sentence}")
         if not stale:
             publisher = None if self._y.lock is None else self._y.lock.publisher
             why = self.clock_of(publisher or "") or ": check for a delay and for different clocks"
-            self.get_logger().warning(f"no {self._y_m.name} at the stamp of {self._y.name}{why}", throttle_duration_sec=2.0)
+            self.get_logger().warning(
+                f"no {self._y_m.name} at the stamp of {self._y.name}{why}",
+                throttle_duration_sec=2.0,
+            )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         mode = self._controller.mode
         level = DiagnosticStatus.OK if mode is Mode.ENGAGED else DiagnosticStatus.WARN
         ages = {}
         if not self.parameters.lockstep:
-            ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in self._controller.ages(self.now_ns()).items()}
-        still = {"vanes left out": ", ".join(self._still_vanes) or "none"} if self.parameters.vanes else {}
+            ages = {
+                f"age of {name} (s)": f"{age:.4f}"
+                for name, age in self._controller.ages(self.now_ns()).items()
+            }
+        still = (
+            {"vanes left out": ", ".join(self._still_vanes) or "none"}
+            if self.parameters.vanes
+            else {}
+        )
         restarts = {"restarts of the law": self._restarts}
-        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **restarts, **still, **ages}
+        return (
+            level,
+            mode.name,
+            {"mode": mode.name, "law": self.parameters.summary(), **restarts, **still, **ages},
+        )

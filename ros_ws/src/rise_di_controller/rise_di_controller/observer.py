@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer, an extension of the paper, off by default: estimates of states, wind and disturbances correct the trim of a law.
+"""Observer, an extension of the paper, off by default: estimates of states, wind and disturbances
+correct the trim of a law.
 
-The observer extends any control law: the law's own equations do not change. The matrices are parameters, so nothing is solved
-here. See docs/theory.md.
+The observer extends any control law: the law's own equations do not change. The matrices are
+parameters, so nothing is solved here. See docs/theory.md.
 """
 
 from collections.abc import Sequence
@@ -19,18 +20,25 @@ from rise_di_controller.saturation import Limits, saturate
 
 
 class VaneParams(NamedTuple):
-    """Parameters of k vanes, sensors beside y for the observer alone: a reading is H z beyond the reference motion."""
+    """Parameters of k vanes, sensors beside y for the observer alone: a reading is H z beyond the
+    reference motion.
+    """
 
     H: Array  # (k, s)
-    L: Array  # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
-    least: Array  # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
+    L: Array
+    least: (
+        Array  # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    )
     time: Array  # () s, over which the motion is averaged
 
 
 class ObserverParams(NamedTuple):
-    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N aircraft as the last axis.
+    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N
+    aircraft as the last axis.
 
-    The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_trim), e = H z.
+    The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
+    u_trim), e = H z.
     """
 
     law: Any  # parameters of the extended law
@@ -85,16 +93,20 @@ def initial_estimates(e: Array, params: ObserverParams) -> Array:
     return product(params.H.swapaxes(0, 1), e)
 
 
-def estimates_after(history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]) -> Array:
+def estimates_after(
+    history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]
+) -> Array:
     """Estimates of the filter over the last ticks, predicted for the next tick.
 
-        z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))      the steady state at the means
+        z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))
+            the steady state at the means
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    So the filter knows what the law held: to estimate it takes longer than the record. A tick without a y has no
-    correction. The products with e and u are taken of all ticks of a filter at once, in a third of the time. Arguments:
-    `history` with a y at least; `change` of the feedforward since then, (m,); the `filters` of the ticks.
+    So the filter knows what the law held: to estimate it takes longer than the record. A tick
+    without a y has no correction. The products with e and u are taken of all ticks of a filter at
+    once, in a third of the time. Arguments: `history` with a y at least; `change` of the
+    feedforward since then, (m,); the `filters` of the ticks.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -109,14 +121,19 @@ def estimates_after(history: tuple[PastTick, ...], change: Array, filters: Seque
         by_u[:, ticks] = product(params.Gamma, u[:, ticks])
         steps[id(params)] = params.Phi, params.Phi - product(gain, params.H)
     _, corrected = steps[id(filters[0])]
-    z = product(inverse(np.eye(len(corrected)) - corrected), np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1))
+    z = product(
+        inverse(np.eye(len(corrected)) - corrected),
+        np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1),
+    )
     for place, has_y, addend in zip(tick_filters.tolist(), known, (by_e + by_u).T, strict=True):
         predicted, corrected = steps[place]
         z = product(corrected if has_y else predicted, z) + addend
     return z
 
 
-def moving(state: VaneObserverState, reading: Array, dt: Array, params: VaneParams) -> VaneObserverState:
+def moving(
+    state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
+) -> VaneObserverState:
     """The state with the motion of the readings, and the vanes in use.
 
         part    = min(dt / time, 1)
@@ -124,7 +141,8 @@ def moving(state: VaneObserverState, reading: Array, dt: Array, params: VanePara
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane has electrical noise alone, of less than `least`. So has a vane in calm air, without wind to tell.
+    A frozen vane has electrical noise alone, of less than `least`. So has a vane in calm air,
+    without wind to tell.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -134,16 +152,21 @@ def moving(state: VaneObserverState, reading: Array, dt: Array, params: VanePara
     return state._replace(vane_mean=mean, vane_square=square, vane_measures=measures)
 
 
-def by_vanes(z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams) -> Array:
+def by_vanes(
+    z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams
+) -> Array:
     """Correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
 
-    Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion, (k,).
+    Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion,
+    (k,).
     """
     xp = array_namespace(z)
     residual = deviation - product(params.H, z)
     total = 0.0 * z
     for v in range(len(params.H)):
-        total = total + measures[v] * product(params.L[v], xp.concat([innovation, residual[v : v + 1]]))
+        total = total + measures[v] * product(
+            params.L[v], xp.concat([innovation, residual[v : v + 1]])
+        )
     return total
 
 
@@ -155,10 +178,14 @@ def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverPa
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick, with the vanes of a finite `least`."""
+    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick, with the vanes
+    of a finite `least`.
+    """
     corrected = params.L @ params.H
     if params.vanes is not None:
-        for row, gain, least in zip(params.vanes.H, params.vanes.L, params.vanes.least, strict=True):
+        for row, gain, least in zip(
+            params.vanes.H, params.vanes.L, params.vanes.least, strict=True
+        ):
             corrected = corrected + np.isfinite(least) * (gain @ np.vstack([params.H, row]))
     return np.asarray(params.Phi @ (np.eye(len(params.Phi)) - corrected))
 
@@ -177,7 +204,9 @@ def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParam
     z = state.z + product(params.L, innovation)
     if params.vanes is not None and measured.vane is not None:
         state = moving(state, measured.vane, dt, params.vanes)
-        z = z + by_vanes(state.z, innovation, measured.vane - measured.vane_m, state.vane_measures, params.vanes)
+        z = z + by_vanes(
+            state.z, innovation, measured.vane - measured.vane_m, state.vane_measures, params.vanes
+        )
     sigma = array_namespace(e).minimum(state.sigma + dt * params.fade_rate, 1.0 + 0.0 * state.sigma)
     u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
     return state._replace(z=z, u_o=u_o, sigma=sigma)
@@ -185,7 +214,8 @@ def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParam
 
 @lru_cache(maxsize=64)
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
-    """A control law from the trim u_trim + u_o; the observer takes u after saturation (anti-windup), and its vanes.
+    """A control law from the trim u_trim + u_o; the observer takes u after saturation
+    (anti-windup), and its vanes.
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
@@ -194,24 +224,32 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     The law takes the measured e, not the estimate.
     """
 
-    def corrected(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[Any, Measurements]:
+    def corrected(
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+    ) -> tuple[Any, Measurements]:
         state = correct(state, measured, dt, params)
         return state, measured._replace(u_trim=measured.u_trim + state.u_o)
 
-    def predicted(state: Any, law_state: Any, u: Array, measured: Measurements, params: ObserverParams) -> Any:
+    def predicted(
+        state: Any, law_state: Any, u: Array, measured: Measurements, params: ObserverParams
+    ) -> Any:
         return state._replace(law=law_state, z=predict(state.z, u - measured.u_trim, params))
 
     def engage(measured: Measurements, params: ObserverParams) -> Any:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         zero = xp.zeros_like(e)
-        state = ObserverState(law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1])
+        state = ObserverState(
+            law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1]
+        )
         if not vanes or measured.vane is None:
             return state
         none = 0.0 * measured.vane
         return VaneObserverState(*state, measured.vane, none, none)
 
-    def step(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[Any, Array]:
+    def step(
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+    ) -> tuple[Any, Array]:
         state, inner = corrected(state, measured, dt, params)
         law_state, u = law.step(state.law, inner, dt, params.law)
         return predicted(state, law_state, u, measured, params), u
@@ -230,4 +268,12 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
         law_state = law.missed(state.law, measured, params.law)
         return predicted(state, law_state, measured.u_before, measured, params)
 
-    return ControlLaw(VaneObserverState if vanes else ObserverState, engage, step, limited, retune, missed, inner=law)
+    return ControlLaw(
+        VaneObserverState if vanes else ObserverState,
+        engage,
+        step,
+        limited,
+        retune,
+        missed,
+        inner=law,
+    )

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller under any control law: validation, and conversion to the arrays of guard, feedforward, observer.
+"""Parameters of the controller under any control law: validation, and conversion to the arrays of
+guard, feedforward, observer.
 
 The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by the name of the law.
 """
@@ -40,13 +41,24 @@ from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, nominal_model, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
-from rise_di_controller.observer import ObserverParams, VaneParams, filter_matrix, with_observer, without_frozen
+from rise_di_controller.observer import (
+    ObserverParams,
+    VaneParams,
+    filter_matrix,
+    with_observer,
+    without_frozen,
+)
 from rise_di_controller.saturation import Limits
 
-MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop with an observer has to be stable
+MARGIN_PARTS = (
+    0.0,
+    0.5,
+    1.0,
+)  # of the delay margin, where the nominal loop with an observer has to be stable
 
 MAX_DELAY_PERIODS = 100
-"""The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor time, 1000 half a minute."""
+"""The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor
+time, 1000 half a minute."""
 
 MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T: that of numbers with ten digits is 1e-9
 
@@ -54,32 +66,53 @@ OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
 """Parameters that concern only the node: neither the law nor its guard depends on them."""
 
 MAX_STABLE_STEP = 2.5
-"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
+"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the
+longest that the law takes."""
 
 
 class FeedforwardConfig(Config):
-    """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by row."""
+    """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by
+    row.
+    """
 
     states: Names = Field(description="the states of the model, the outputs among them")
     A: Numbers = Field(description="A, a row a state")
     B: Numbers = Field(description="B, a row a state, the columns as controller.inputs")
-    gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
-    lead: NonNegatives = Field(description="from a tick until its input acts, s: half a period, delay, lag")
-    inputs: Names | None = Field(default=None, description="the inputs with a feedforward; all where absent")
+    gravity: Numbers | None = Field(
+        default=None, description="sine terms, x_dot += gravity sin(x), a row a state"
+    )
+    lead: NonNegatives = Field(
+        description="from a tick until its input acts, s: half a period, delay, lag"
+    )
+    inputs: Names | None = Field(
+        default=None, description="the inputs with a feedforward; all where absent"
+    )
     deviation: NonNegatives | None = Field(
         default=None, description="standard deviations of B, for the limits of guidance; none: 0"
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
-        """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for a C B whose D differs."""
+        """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for
+        a C B whose D differs.
+        """
         n = len(self.states)
         m = len(outputs)
         for name in outputs:
-            require(self.states.count(name) == 1, "feedforward.states", ", ".join(self.states), f"the output {name} once")
+            require(
+                self.states.count(name) == 1,
+                "feedforward.states",
+                ", ".join(self.states),
+                f"the output {name} once",
+            )
         for key, columns in (("A", n), ("B", m), ("gravity", n), ("deviation", m)):
             values = getattr(self, key)
             fits = values is None or len(values) == n * columns
-            require(fits, f"feedforward.{key}", f"{len(values or ())} values", f"{n * columns}: {n} rows of {columns}")
+            require(
+                fits,
+                f"feedforward.{key}",
+                f"{len(values or ())} values",
+                f"{n * columns}: {n} rows of {columns}",
+            )
         require_length("feedforward.lead", self.lead, inputs)
         A = np.reshape(self.A, (n, n))
         B = np.reshape(self.B, (n, m))
@@ -88,21 +121,42 @@ class FeedforwardConfig(Config):
         try:
             nominal_D = [int(sign) for sign in signs(C @ B)]
         except DecompositionError as error:
-            raise ParameterError(f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}") from None
-        require(nominal_D == list(D), "feedforward.B", f"a C B with D = {nominal_D}", f"D = {list(D)}, that of the controller")
+            raise ParameterError(
+                f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}"
+            ) from None
+        require(
+            nominal_D == list(D),
+            "feedforward.B",
+            f"a C B with D = {nominal_D}",
+            f"D = {list(D)}, that of the controller",
+        )
         unknown = [name for name in self.inputs or () if name not in inputs]
-        require(not unknown, "feedforward.inputs", ", ".join(unknown), f"some of {', '.join(inputs)}")
-        acts = None if self.inputs is None else np.array([float(name in self.inputs) for name in inputs])
+        require(
+            not unknown, "feedforward.inputs", ", ".join(unknown), f"some of {', '.join(inputs)}"
+        )
+        acts = (
+            None
+            if self.inputs is None
+            else np.array([float(name in self.inputs) for name in inputs])
+        )
         return nominal_model(A, B, C, gravity, np.array(self.lead), acts)
 
 
 class VanesConfig(Config):
-    """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by row."""
+    """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by
+    row.
+    """
 
-    channels: Names = Field(description="the channels of y, also states of the feedforward, as alpha")
+    channels: Names = Field(
+        description="the channels of y, also states of the feedforward, as alpha"
+    )
     H: Numbers = Field(description="reading less that of the reference = H z, a row a vane")
-    L: Numbers = Field(description="added to L: by vane a row an estimate, a column an output and the vane")
-    least: NonNegatives = Field(description="rms motion of a reading below which the vane counts as frozen")
+    L: Numbers = Field(
+        description="added to L: by vane a row an estimate, a column an output and the vane"
+    )
+    least: NonNegatives = Field(
+        description="rms motion of a reading below which the vane counts as frozen"
+    )
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
@@ -116,17 +170,26 @@ class VanesConfig(Config):
         require(known, "observer.vanes.channels", ", ".join(self.channels), expected)
         for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
             entries = len(getattr(self, key))
-            require(entries == size, f"observer.vanes.{key}", f"{entries} values", f"{size} for {k} vanes, {s} estimates")
+            require(
+                entries == size,
+                f"observer.vanes.{key}",
+                f"{entries} values",
+                f"{size} for {k} vanes, {s} estimates",
+            )
         least = np.array(self.least) ** 2
         L = np.reshape(self.L, (k, s, m + 1))
         return VaneParams(np.reshape(self.H, (k, s)), L, least, np.float64(self.time))
 
 
 class ObserverConfig(Config):
-    """An observer of the nominal model, an extension of the paper, with its matrices as designed; SI, row by row."""
+    """An observer of the nominal model, an extension of the paper, with its matrices as designed;
+    SI, row by row.
+    """
 
     rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
-    states: Names = Field(description="names of the estimates: those of the feedforward's states first, as x.alpha")
+    states: Names = Field(
+        description="names of the estimates: those of the feedforward's states first, as x.alpha"
+    )
     Phi: Numbers = Field(description="estimates one period later without input")
     Gamma: Numbers = Field(description="effect of u, held over the period")
     L: Numbers = Field(description="correction by the errors of the outputs")
@@ -134,7 +197,9 @@ class ObserverConfig(Config):
     part: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.6, description="bound of u_o, part of the limits of u; 0: without u_o and u_ff"
     )
-    within: Positive = Field(default=0.1, description="least time in which u_o goes from 0 to its bound, s")
+    within: Positive = Field(
+        default=0.1, description="least time in which u_o goes from 0 to its bound, s"
+    )
     fade: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=1.0, description="time in which u_o fades in after engagement, s"
     )
@@ -149,7 +214,10 @@ class ObserverConfig(Config):
         for key, rows, columns in (("Phi", s, s), ("Gamma", s, m), ("L", s, m), ("F", m, s)):
             entries = len(getattr(self, key))
             require(
-                entries == rows * columns, f"observer.{key}", f"{entries} values", f"{rows * columns}: {rows} rows of {columns}"
+                entries == rows * columns,
+                f"observer.{key}",
+                f"{entries} values",
+                f"{rows * columns}: {rows} rows of {columns}",
             )
         H = np.hstack([nominal.C, np.zeros((m, s - n))])
         Phi, Gamma, L = (np.reshape(values, (s, -1)) for values in (self.Phi, self.Gamma, self.L))
@@ -157,16 +225,21 @@ class ObserverConfig(Config):
 
 
 class AllocationConfig(Config):
-    """An allocation of the inputs of the law to as many effectors or more, an extension of the paper. SI, row by row."""
+    """An allocation of the inputs of the law to as many effectors or more, an extension of the
+    paper. SI, row by row.
+    """
 
     effectors: Names = Field(description="the channels of u that are published")
     T: Numbers = Field(description="u = T v: a row an effector, a column an input")
-    effect: Numbers = Field(description="v = effect u: a row an input, a column an effector; effect T = I")
+    effect: Numbers = Field(
+        description="v = effect u: a row an input, a column an effector; effect T = I"
+    )
     lower: Numbers = Field(description="lower end stops of the effectors from trim")
     upper: Numbers = Field(description="upper end stops of the effectors from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
-        default=None, description="the inputs, the one that keeps its effect the longest first; none: in order"
+        default=None,
+        description="the inputs, the one that keeps its effect the longest first; none: in order",
     )
 
     def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
@@ -175,59 +248,109 @@ class AllocationConfig(Config):
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]
         effect = np.reshape(self.effect, (-1, p))[places]
-        return self.model_copy(update={"T": tuple(T.ravel().tolist()), "effect": tuple(effect.ravel().tolist())})
+        return self.model_copy(
+            update={"T": tuple(T.ravel().tolist()), "effect": tuple(effect.ravel().tolist())}
+        )
 
     def arrays(self, inputs: Sequence[str]) -> Allocation:
-        """The arrays of the allocation. Raises ParameterError for sizes that do not match and for an effect T that is not I."""
+        """The arrays of the allocation. Raises ParameterError for sizes that do not match and for
+        an effect T that is not I.
+        """
         p = len(self.effectors)
         m = len(inputs)
-        require(p >= m, "allocation.effectors", ", ".join(self.effectors), f"{m} or more, for {', '.join(inputs)}")
-        require(len(set(self.effectors)) == p, "allocation.effectors", ", ".join(self.effectors), "different names")
+        require(
+            p >= m,
+            "allocation.effectors",
+            ", ".join(self.effectors),
+            f"{m} or more, for {', '.join(inputs)}",
+        )
+        require(
+            len(set(self.effectors)) == p,
+            "allocation.effectors",
+            ", ".join(self.effectors),
+            "different names",
+        )
         for key, rows, columns in (("T", p, m), ("effect", m, p)):
             entries = f"{len(getattr(self, key))} values"
-            require(entries == f"{p * m} values", f"allocation.{key}", entries, f"{p * m}: {rows} rows of {columns}")
+            require(
+                entries == f"{p * m} values",
+                f"allocation.{key}",
+                entries,
+                f"{p * m}: {rows} rows of {columns}",
+            )
         for key in ("lower", "upper", "slew"):
-            require_length(f"allocation.{key}", getattr(self, key) or self.effectors, self.effectors)
+            require_length(
+                f"allocation.{key}", getattr(self, key) or self.effectors, self.effectors
+            )
         for name, low, high in zip(self.effectors, self.lower, self.upper, strict=True):
             spans_trim = low <= 0.0 <= high and low < high
-            require(spans_trim, "allocation.lower", f"{low:g} and upper {high:g} of {name}", "a range with trim, 0, inside")
+            require(
+                spans_trim,
+                "allocation.lower",
+                f"{low:g} and upper {high:g} of {name}",
+                "a range with trim, 0, inside",
+            )
         priority = self.priority or tuple(inputs)
         require_channels("allocation.priority", priority, inputs, "the inputs of the law")
         T = np.reshape(self.T, (p, m))
         effect = np.reshape(self.effect, (m, p))
         error = float(np.abs(effect @ T - np.eye(m)).max())
-        require(error < MAX_INVERSE_ERROR, "allocation.T", f"effect T that is off I by {error:.3g}", "T with effect T = I")
+        require(
+            error < MAX_INVERSE_ERROR,
+            "allocation.T",
+            f"effect T that is off I by {error:.3g}",
+            "T with effect T = I",
+        )
         slew = (np.inf,) * p if self.slew is None else self.slew
         limits = Limits(np.array(self.lower), np.array(self.upper), np.array(slew))
         return allocation(T, effect, [inputs.index(name) for name in priority], limits)
 
 
 class ControllerConfig(NodeConfig):
-    """Parameters of the controller node that every control law has. A subclass has those of one law, as fields."""
+    """Parameters of the controller node that every control law has. A subclass has those of one
+    law, as fields.
+    """
 
     needs: ClassVar[str] = ""
-    """What the law needs beside y and y_m, as words; the controller refuses a law that needs anything."""
+    """What the law needs beside y and y_m, as words; the controller refuses a law that needs
+    anything."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
-    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(default=0.0, description="in lockstep: rate of y, Hz")
+    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
+        default=0.0, description="in lockstep: rate of y, Hz"
+    )
     law: str = Field(default="rise_di", description="the law, by its registered name")
-    outputs: Names = Field(description="the channels of y; in RISE-DI the last has the smallest gain (22)")
-    inputs: Names = Field(description="the channels of u, paired with the outputs; with an allocation those of v")
+    outputs: Names = Field(
+        description="the channels of y; in RISE-DI the last has the smallest gain (22)"
+    )
+    inputs: Names = Field(
+        description="the channels of u, paired with the outputs; with an allocation those of v"
+    )
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
-    input_scale: Positives = Field(description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)")
+    input_scale: Positives = Field(
+        description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)"
+    )
     lag: NonNegatives = Field(description="time constants of the actuators, s; 0: none")
     delay: NonNegative = Field(description="delay from y to the actuators beside sampling, s")
     y_max: Positives | None = Field(
         default=None,
         description="the largest abs(y), abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
-    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
-    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held, s")
-    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long the ramp to trim takes, s")
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
+        description="the age above which y or y_m is stale, s"
+    )
+    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        description="failsafe: how long u is held, s"
+    )
+    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        description="failsafe: how long the ramp to trim takes, s"
+    )
     lower: Numbers | None = Field(default=None, description="lower limits of u from trim")
     upper: Numbers | None = Field(default=None, description="upper limits of u from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
-    on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="u after deactivation: ramped to trim or held")
+    on_deactivate: Literal["trim", "hold"] = Field(
+        default="trim", description="u after deactivation: ramped to trim or held"
+    )
     autostart: bool = Field(default=True, description="configure the node at start")
     start_active: bool = Field(
         default=True,
@@ -246,7 +369,9 @@ class ControllerConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Parameters that may change in flight: those of the law and the guard. Those that name channels or signs may not."""
+        """Parameters that may change in flight: those of the law and the guard. Those that name
+        channels or signs may not.
+        """
         common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew", "y_max"}
         return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
 
@@ -255,7 +380,8 @@ class ControllerConfig(NodeConfig):
             pass
 
     def checks(self) -> Iterator[None]:
-        """The relations between the values, checked in parts of at most about 1 ms, for a controller that flies meanwhile.
+        """The relations between the values, checked in parts of at most about 1 ms, for a
+        controller that flies meanwhile.
 
         Raises ParameterError.
         """
@@ -265,7 +391,10 @@ class ControllerConfig(NodeConfig):
             divide(period, period_ns(self.y_rate, "y_rate"), "y_rate", "1 / rate")
         longest = MAX_DELAY_PERIODS / self.rate
         require(
-            self.delay <= longest, "delay", f"{self.delay:g} s", f"at most {longest:g} s, {MAX_DELAY_PERIODS} periods of rate"
+            self.delay <= longest,
+            "delay",
+            f"{self.delay:g} s",
+            f"at most {longest:g} s, {MAX_DELAY_PERIODS} periods of rate",
         )
         require_length("inputs", self.inputs, self.outputs)
         for key in ("D", "input_scale", "lag"):
@@ -290,17 +419,32 @@ class ControllerConfig(NodeConfig):
             yield
         if self.observer is not None:
             if nominal is None:
-                raise ParameterError("observer: found no feedforward beside it, expected that section too: it has the model")
+                raise ParameterError(
+                    "observer: found no feedforward beside it, expected that section too: it "
+                    "has the model"
+                )
             yield from self._check_observer(self.observer, nominal)
 
     def _check_state(self) -> None:
         """The log holds each array of the law's state by output, beside groups of its own."""
         zero = np.zeros(len(self.outputs))
-        state = self.control_law().engage(Measurements(zero, zero, zero, zero, zero), self.law_params())
+        state = self.control_law().engage(
+            Measurements(zero, zero, zero, zero, zero), self.law_params()
+        )
         for name, value in fields(state).items():
-            require(name not in internals.RESERVED, "law", f"a state with {name}", "another name, which the log does not have")
+            require(
+                name not in internals.RESERVED,
+                "law",
+                f"a state with {name}",
+                "another name, which the log does not have",
+            )
             shape = np.shape(value)
-            require(shape == zero.shape, "law", f"a state with {name} of shape {shape}", f"{zero.shape}, one value an output")
+            require(
+                shape == zero.shape,
+                "law",
+                f"a state with {name} of shape {shape}",
+                f"{zero.shape}, one value an output",
+            )
 
     def _check_nominal(self, nominal: Nominal) -> None:
         zeros = zero_dynamics(nominal)
@@ -311,11 +455,17 @@ class ControllerConfig(NodeConfig):
         require(rightmost <= ZERO_REAL_PART, "feedforward.A", eigenvalue, stable)
         limit = MAX_STABLE_STEP / DT_RANGE[1] * self.rate
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
-        require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
+        require(
+            fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow
+        )
 
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
-        """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which certifies what flies."""
-        expected = tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
+        """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which
+        certifies what flies.
+        """
+        expected = (
+            tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
+        )
         require(
             observer.states[: len(expected)] == expected,
             "observer.states",
@@ -324,14 +474,24 @@ class ControllerConfig(NodeConfig):
         )
         if observer.vanes is not None:
             observer.vanes.params(self.outputs, self._model_states(), len(observer.states))
-        require(observer.rate == self.rate, "observer.rate", f"{observer.rate:g} Hz", f"controller.rate, {self.rate:g} Hz")
+        require(
+            observer.rate == self.rate,
+            "observer.rate",
+            f"{observer.rate:g} Hz",
+            f"controller.rate, {self.rate:g} Hz",
+        )
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
         if F.any(axis=1).all():  # channels without it fly the law alone, which the loop below has
             matrices["F"] = Phi - Gamma @ F
         for key, matrix in matrices.items():
             radius = spectral_radius(matrix)
-            require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
+            require(
+                radius < 1.0,
+                f"observer.{key}",
+                f"a spectral radius of {radius:.6g}",
+                "less than 1: it is unstable",
+            )
         flies = not self.vanes or observer.part > 0.0
         require(flies, "observer.vanes", "part 0 beside it", "a part above 0: the observer flies")
         yield
@@ -349,8 +509,12 @@ class ControllerConfig(NodeConfig):
             for part in MARGIN_PARTS:
                 late = part * max(observer.margin, self.delay)
                 stable = is_stable(plant, linear, loop, np.full(m, late))
-                unstable_loop = f"a nominal loop that is unstable with u {1e3 * late:g} ms late{frozen_text}"
-                expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
+                unstable_loop = (
+                    f"a nominal loop that is unstable with u {1e3 * late:g} ms late{frozen_text}"
+                )
+                expected_margin = (
+                    f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
+                )
                 require(stable, "observer.margin", unstable_loop, expected_margin)
                 yield
 
@@ -360,7 +524,11 @@ class ControllerConfig(NodeConfig):
     @property
     def vanes(self) -> tuple[str, ...]:
         """The channels of y for the observer alone."""
-        return () if self.observer is None or self.observer.vanes is None else self.observer.vanes.channels
+        return (
+            ()
+            if self.observer is None or self.observer.vanes is None
+            else self.observer.vanes.channels
+        )
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -371,10 +539,14 @@ class ControllerConfig(NodeConfig):
         """The parameters with the observer of y alone."""
         if self.observer is None or not self.vanes:
             return self
-        return self.model_copy(update={"observer": self.observer.model_copy(update={"vanes": None})})
+        return self.model_copy(
+            update={"observer": self.observer.model_copy(update={"vanes": None})}
+        )
 
     def check_law(self) -> None:
-        """Checks of the law's own parameters against each other and the channels. Raises ParameterError."""
+        """Checks of the law's own parameters against each other and the channels. Raises
+        ParameterError.
+        """
 
     def control_law(self) -> ControlLaw:
         """The law."""
@@ -406,23 +578,34 @@ class ControllerConfig(NodeConfig):
         if section is not None:
             vanes = section.params(self.outputs, self._model_states(), len(Phi))
         observed = ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate), vanes)
-        return TunedLaw(with_observer(law) if section is None else with_observer(law, vanes=True), observed)
+        return TunedLaw(
+            with_observer(law) if section is None else with_observer(law, vanes=True), observed
+        )
 
     def models(self) -> tuple[Any, ...]:
         """The sections with a model of the aircraft, for a learner to replace."""
         return self.feedforward, self.observer
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Groups of channels of `internals` and the names in each; `law` is the result of `tuned_law`, if known."""
+        """Groups of channels of `internals` and the names in each; `law` is the result of
+        `tuned_law`, if known.
+        """
         estimates = () if self.observer is None else self.observer.states
         effectors = () if self.allocation is None else self.allocation.effectors
         return internals.groups(
-            law or self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors, self.vanes
+            law or self.tuned_law().control_law,
+            self.outputs,
+            self.inputs,
+            estimates,
+            effectors,
+            self.vanes,
         )
 
     @property
     def effectors(self) -> tuple[str, ...]:
-        """The channels of u as published: the effectors of an allocation, else the inputs of the law."""
+        """The channels of u as published: the effectors of an allocation, else the inputs of the
+        law.
+        """
         return self.inputs if self.allocation is None else self.allocation.effectors
 
     def effector_limits(self) -> Limits:
@@ -431,7 +614,9 @@ class ControllerConfig(NodeConfig):
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def given_up(self) -> FloatArray:
-        """1 for an output without a model to the end of the engagement, else 0, (m,); empty without a learner."""
+        """1 for an output without a model to the end of the engagement, else 0, (m,); empty without
+        a learner.
+        """
         return np.zeros(0)
 
     def history_ticks(self) -> int:
@@ -440,10 +625,16 @@ class ControllerConfig(NodeConfig):
 
     def nominal(self) -> Nominal | None:
         """The arrays of the feedforward, None where there is none."""
-        return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
+        return (
+            None
+            if self.feedforward is None
+            else self.feedforward.nominal(self.outputs, self.inputs, self.D)
+        )
 
     def _flown_nominal(self) -> Nominal | None:
-        """The nominal model along y_m. Beside an observer of part 0 no input is added: only a learner needs the states."""
+        """The nominal model along y_m. Beside an observer of part 0 no input is added: only a
+        learner needs the states.
+        """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
             return nominal
@@ -452,12 +643,17 @@ class ControllerConfig(NodeConfig):
     def digest(self) -> int:
         """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
 
-        BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
+        BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern
+        only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
-        if content["law"] == "rise_di":  # logs of versions that had no other law have no name either
+        if (
+            content["law"] == "rise_di"
+        ):  # logs of versions that had no other law have no name either
             del content["law"]
-        return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
+        return int.from_bytes(
+            blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big"
+        )
 
     def _limits(self) -> Limits:
         """The limits of u, infinite where there is none."""
@@ -483,7 +679,9 @@ class ControllerConfig(NodeConfig):
             ramp_ns=nanoseconds(self.ramp),
             deactivation_holds=self.on_deactivate == "hold",
             limits=self._limits(),
-            samples=samples.bounds(self.outputs, self._authority(), self.y_max, period_ns(self.rate, "rate")),
+            samples=samples.bounds(
+                self.outputs, self._authority(), self.y_max, period_ns(self.rate, "rate")
+            ),
             history=self.history_ticks(),
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=self._flown_nominal(),
@@ -499,4 +697,6 @@ def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
 
 def as_controller(value: object, key: str) -> ControllerConfig:
     """The value, parameters of a controller. Raises ParameterError for another value."""
-    return as_instance(value, ControllerConfig, key, "the parameters of a controller, as scenario.controller")
+    return as_instance(
+        value, ControllerConfig, key, "the parameters of a controller, as scenario.controller"
+    )

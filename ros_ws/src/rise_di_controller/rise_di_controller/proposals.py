@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models learned in flight, on the side of the controller: when identifications begin, which proposals fly, the fallback.
+"""Models learned in flight, on the side of the controller: when identifications begin, which
+proposals fly, the fallback.
 
 Pure: for the node and for the loop in one process.
 """
@@ -23,12 +24,26 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 DESIGNED = frozenset(
-    {"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer", "schedule"}
+    {
+        "k_g",
+        "k_d",
+        "Lambda",
+        "beta",
+        "softening",
+        "input_scale",
+        "omega",
+        "sign",
+        "feedforward",
+        "observer",
+        "schedule",
+    }
 )
-"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs, at every speed."""
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer`
+designs, at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
-"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
+"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has
+one with its model."""
 
 
 class EventKind(StrEnum):
@@ -38,7 +53,9 @@ class EventKind(StrEnum):
     REFUSED = "refused"  # a proposal fails a check of the controller
     NO_MODEL = "no model"  # the learner has refused what it identified
     FALLBACK = "fallback"  # to the law of the start, in all parts or in some
-    RESTART = "restart"  # the law was deactivated, and begins again with the parameters of the start
+    RESTART = (
+        "restart"  # the law was deactivated, and begins again with the parameters of the start
+    )
 
 
 class Proposal(NamedTuple):
@@ -47,12 +64,16 @@ class Proposal(NamedTuple):
     stamp_ns: int  # the end of the window: the instant of its last tick
     start: int  # digest of the parameters of the start, for which the learner was started
     flown: int  # digest of the parameters that flew at the end of the window
-    change: Mapping[str, Any]  # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    change: Mapping[
+        str, Any
+    ]  # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
     sentence: str  # what was learned, or why there is no model
 
 
 class Event(NamedTuple):
-    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none, and why."""
+    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none,
+    and why.
+    """
 
     stamp_ns: int
     kind: EventKind
@@ -61,7 +82,8 @@ class Event(NamedTuple):
 
 
 FALLBACKS = 2
-"""Fallbacks of a part in an engagement after which the part has no further model: the second model was certified, too."""
+"""Fallbacks of a part in an engagement after which the part has no further model: the second model
+was certified, too."""
 
 AUTHORITY_TICKS = 10
 """Ticks of the controller from one sample of `authority` to the next."""
@@ -75,7 +97,9 @@ class Fallback(NamedTuple):
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, flown: int) -> bool:
-        """Whether a proposal beside the parameters before holds an input more, one without effect, and nothing else changed."""
+        """Whether a proposal beside the parameters before holds an input more, one without effect,
+        and nothing else changed.
+        """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
             return False
@@ -83,7 +107,9 @@ class Fallback(NamedTuple):
 
 
 class Updates:
-    """When identifications and tests begin: at the first tick at or after each of the times, counted from the first tick."""
+    """When identifications and tests begin: at the first tick at or after each of the times,
+    counted from the first tick.
+    """
 
     def __init__(self, settings: LearnConfig) -> None:
         self._check_ns = nanoseconds(settings.check)
@@ -105,11 +131,14 @@ class Updates:
 class Learning:
     """The proposals of a flight and the fallback, stepped between two ticks of the controller.
 
-    In simulated time a proposal acts `learn.latency` after the end of its window, for which the flight waits. Else it acts
-    when it is certified: a part of the certificate a step, so that no tick waits for it.
+    In simulated time a proposal acts `learn.latency` after the end of its window, for which the
+    flight waits. Else it acts when it is certified: a part of the certificate a step, so that no
+    tick waits for it.
     """
 
-    def __init__(self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool) -> None:
+    def __init__(
+        self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool
+    ) -> None:
         assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
         self.start = parameters
         self._digest = parameters.digest()
@@ -117,12 +146,18 @@ class Learning:
         self._announce = announce
         self._simulated = simulated
         self._updates = Updates(parameters.learn)
-        self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
+        self._due = deque[
+            int
+        ]()  # ends of the windows whose proposals have not acted, in simulated time
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
-        self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
-        self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
+        self._last_ns: int | None = (
+            None  # end of the window of the last proposal that was not refused at once
+        )
+        self._since_ns: int | None = (
+            None  # when the law was last inactive: an earlier window is of another engagement
+        )
         self._fallback: Fallback | None = None  # the last one
         self._fallbacks = Counter[str]()  # of this engagement, by output
         self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
@@ -134,7 +169,9 @@ class Learning:
         return authority(flown, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
-        """Note a tick; whether an identification begins with it. None begins while the law is deactivated."""
+        """Note a tick; whether an identification begins with it. None begins while the law is
+        deactivated.
+        """
         due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
         if due and self._simulated:
             self._due.append(now_ns)
@@ -142,7 +179,9 @@ class Learning:
 
     def waits(self, now_ns: int) -> bool:
         """In simulated time: whether the tick at `now_ns` waits for a proposal."""
-        return any(self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due)
+        return any(
+            self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
+        )
 
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
@@ -157,13 +196,16 @@ class Learning:
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify, let the proposals act that are due, and fall back where the law diverges.
 
-        A deactivated law begins again with the parameters of the start: it may have been deactivated because of its model.
-        Returns the parameters that the controller has taken; None where it keeps its own.
+        A deactivated law begins again with the parameters of the start: it may have been
+        deactivated because of its model. Returns the parameters that the controller has taken; None
+        where it keeps its own.
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
         adopted = None
-        while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
+        while (
+            self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received
+        ):
             self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
             adopted = self._certify(controller, now_ns) or adopted
         if not self._simulated:
@@ -174,11 +216,19 @@ class Learning:
             adopted = self._end_divergence(diverging, controller, now_ns)
         return adopted
 
-    def _end_divergence(self, diverging: Collection[str], controller: Controller, now_ns: int) -> RiseDiConfig:
-        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to the end of the engagement."""
+    def _end_divergence(
+        self, diverging: Collection[str], controller: Controller, now_ns: int
+    ) -> RiseDiConfig:
+        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to
+        the end of the engagement.
+        """
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
-        part = [name for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True) if diverges]
+        part = [
+            name
+            for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True)
+            if diverges
+        ]
         self._fallbacks.update(part)
         ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
         fallen = without_models(self.start, self.start, {*outputs_without(flown), *ended})
@@ -190,15 +240,30 @@ class Learning:
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
-    def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
-        """Take the law of the start, to the end of the engagement, in the parts of the model whose outputs oscillate."""
+    def _end_oscillations(
+        self, periods: Mapping[str, float], controller: Controller, now_ns: int
+    ) -> RiseDiConfig:
+        """Take the law of the start, to the end of the engagement, in the parts of the model whose
+        outputs oscillate.
+        """
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
-        fallen = without_models(self.start, flown, [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare])
-        rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
-        outputs = ", ".join(name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare)
-        what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
+        fallen = without_models(
+            self.start,
+            flown,
+            [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare],
+        )
+        rates = " and ".join(
+            f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items()
+        )
+        outputs = ", ".join(
+            name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare
+        )
+        what = (
+            f"falls back to the law of the start in {outputs}, to the end of the engagement: "
+            f"{rates}"
+        )
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
@@ -212,7 +277,9 @@ class Learning:
         self._received.clear()
         self._fallbacks.clear()
         self._diverged.clear()
-        if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self.start):
+        if not controller.has_learned_model and outputs_without(
+            controller.parameters
+        ) == outputs_without(self.start):
             return None
         what = "goes back to the law of the start: it was deactivated"
         self._take(controller, now_ns, prepared(self.start), EventKind.RESTART, what)
@@ -222,13 +289,22 @@ class Learning:
         return end_ns + nanoseconds(self._settings.latency)
 
     def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
-        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds, whatever the proposal."""
+        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds,
+        whatever the proposal.
+        """
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
-            return f"found a proposal for the parameters {proposal.start}, expected {self._digest}, those of the start"
+            return (
+                f"found a proposal for the parameters {proposal.start}, expected "
+                f"{self._digest}, those of the start"
+            )
         if self._simulated:
             known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
-            return "" if known else f"found {window}, expected that of an identification that is due, once"
+            return (
+                ""
+                if known
+                else f"found {window}, expected that of an identification that is due, once"
+            )
         longest = nanoseconds(self._settings.window)
         if self._since_ns is not None:
             longest = min(longest, now_ns - self._since_ns)
@@ -237,18 +313,26 @@ class Learning:
         if self._certificate is not None:
             return f"found {window} while another proposal is certified, expected one at a time"
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
-            later = f"one that ends at least {seconds(self._spacing_ns):g} s after that of the last proposal"
+            later = (
+                f"one that ends at least {seconds(self._spacing_ns):g} s after that of the "
+                "last proposal"
+            )
             return f"found {window}, expected {later}"
         return self._unfit(proposal, controller)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
-            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self.start)
+            self._certificate = (
+                proposal,
+                _certificate(controller.parameters, proposal.change, self.start),
+            )
         elif proposal.sentence:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """A part of the certificate, in simulated time all of it; the parameters taken at its end."""
+        """A part of the certificate, in simulated time all of it; the parameters taken at its
+        end.
+        """
         if self._certificate is None:
             return None
         proposal, certificate = self._certificate
@@ -263,12 +347,18 @@ class Learning:
                 refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
                 bare_outputs = outputs_without(end.value.parameters)
-                what = f"flies {proposal.sentence}{', without ' * bool(bare_outputs)}{', '.join(bare_outputs)}"
+                without = f", without {', '.join(bare_outputs)}" if bare_outputs else ""
+                what = f"flies {proposal.sentence}{without}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
-            refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
-        except ValueError as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
+            refusal = (
+                f"found numbers too large or too small ({error.args[-1]}), expected those "
+                "of a flight"
+            )
+        except (
+            ValueError
+        ) as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
             refusal = str(error)
         else:
             return None
@@ -277,19 +367,29 @@ class Learning:
         return None
 
     def _unfit(self, proposal: Proposal, controller: Controller) -> str:
-        """The refusal of a proposal for a law that is not engaged, or that lost the race with another change; else empty.
+        """The refusal of a proposal for a law that is not engaged, or that lost the race with
+        another change; else empty.
 
-        An input that has lost its effect has none after a fallback either, which its loss may have caused.
+        An input that has lost its effect has none after a fallback either, which its loss may have
+        caused.
         """
         if controller.mode is not Mode.ENGAGED:
-            return f"found the mode {controller.mode.name}, expected a model only while the law is engaged"
+            return (
+                f"found the mode {controller.mode.name}, expected a model only while the law "
+                "is engaged"
+            )
         if proposal.flown == controller.digest:
             return ""
         if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
             return ""
-        return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
+        return (
+            f"found a proposal beside the parameters {proposal.flown}, expected "
+            f"{controller.digest}: they changed meanwhile"
+        )
 
-    def _take(self, controller: Controller, now_ns: int, new: Prepared, kind: EventKind, sentence: str) -> None:
+    def _take(
+        self, controller: Controller, now_ns: int, new: Prepared, kind: EventKind, sentence: str
+    ) -> None:
         change = changes(controller.parameters, new.parameters)
         controller.retune(new)
         self._announce(Event(now_ns, kind, change, sentence))
@@ -298,10 +398,19 @@ class Learning:
         self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}"))
 
 
-def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
-    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
+def _certificate(
+    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
+) -> Generator[None, None, Prepared]:
+    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms.
+    Raises ParameterError.
+    """
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
-    require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
+    require(
+        not foreign,
+        "proposal",
+        f"a change of {', '.join(foreign)}",
+        f"changes of {', '.join(sorted(DESIGNED))} alone",
+    )
     proposed = RiseDiConfig.validate_mapping(flown.changed(change), "controller", check=False)
     yield
     require(proposed.observer is not None, "proposal", "no observer", "one")
@@ -322,7 +431,12 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
     )
     least = start.observer.margin
     margin = proposed.observer.margin
-    require(margin >= least, "controller.observer.margin", f"{margin:g} s", f"at least {least:g} s, that of the start")
+    require(
+        margin >= least,
+        "controller.observer.margin",
+        f"{margin:g} s",
+        f"at least {least:g} s, that of the start",
+    )
     if bare_outputs := outputs_without(flown):
         others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
         require(proposed.feedforward is not None, "proposal", "no feedforward", others)
@@ -349,19 +463,28 @@ def _speeds(parameters: RiseDiConfig) -> str:
 
 
 def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies meanwhile, may have besides."""
+    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies
+    meanwhile, may have besides.
+    """
     before, after = (
-        {name: value for name, value in flatten(parameters.model_dump()) if name.split(".")[0] in DESIGNED}
+        {
+            name: value
+            for name, value in flatten(parameters.model_dump())
+            if name.split(".")[0] in DESIGNED
+        }
         for parameters in (old, new)
     )
     return dict.fromkeys([*before, *OPTIONAL]) | after
 
 
-def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]) -> RiseDiConfig:
-    """A controller with the gains of `start` in some channels, without feedforward and observer there; not checked.
+def with_channels_of(
+    start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
+) -> RiseDiConfig:
+    """A controller with the gains of `start` in some channels, without feedforward and observer
+    there; not checked.
 
-    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
-    input scale, so that the law holds it.
+    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A
+    dead input gets the least input scale, so that the law holds it.
     """
     law = start.law_params()
     design = designed.law_params()
@@ -372,12 +495,19 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
     share = np.where(channels, law.K / K, 1.0)
     scale = np.where(channels, law.input_scale * share, design.input_scale)
     start_values, design_values = (
-        (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
+        (
+            np.array(part.beta),
+            np.array(part.Lambda),
+            np.array(part.omega),
+            np.broadcast_to(part.softening, K.shape),
+        )
         for part in (start, designed)
     )
     beta, Lambda, omega, softening = (
         np.where(channels, old * factor, new)
-        for old, new, factor in zip(start_values, design_values, (1.0 / share, 1.0, share, 1.0), strict=True)
+        for old, new, factor in zip(
+            start_values, design_values, (1.0 / share, 1.0, share, 1.0), strict=True
+        )
     )
     changed: dict[str, Any] = {
         "k_d": tuple((K[:-1] - last).tolist()),
@@ -393,10 +523,16 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
     if channels.any() and observer is not None and feedforward is not None:
 
         def without(F: Sequence[float]) -> dict[str, Any]:
-            return {"F": tuple((np.reshape(F, (len(bare), -1)) * ~channels[:, None]).ravel().tolist())}
+            return {
+                "F": tuple((np.reshape(F, (len(bare), -1)) * ~channels[:, None]).ravel().tolist())
+            }
 
         acting = feedforward.inputs or start.inputs
-        flown = tuple(name for name, is_bare in zip(start.inputs, bare, strict=True) if name in acting and not is_bare)
+        flown = tuple(
+            name
+            for name, is_bare in zip(start.inputs, bare, strict=True)
+            if name in acting and not is_bare
+        )
         changed["observer"] = observer.model_copy(update=without(observer.F))
         if schedule is not None and schedule.slow is not None and schedule.fast is not None:
             slow, fast = (model.model_copy(update=without(model.F)) for model in schedule.models)
@@ -412,7 +548,13 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
     inputs = parameters.inputs
     fed = () if feedforward is None else feedforward.inputs or inputs
     models = () if parameters.schedule is None else parameters.schedule.models
-    F = np.hstack([np.reshape(model.F, (len(inputs), -1)) for model in (observer, *models) if model is not None])
+    F = np.hstack(
+        [
+            np.reshape(model.F, (len(inputs), -1))
+            for model in (observer, *models)
+            if model is not None
+        ]
+    )
     return tuple(name for name, row in zip(inputs, F, strict=True) if name in fed or row.any())
 
 
@@ -422,13 +564,16 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit, (2m,), units/s:
+    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit,
+    (2m,), units/s:
 
-        y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),  Omega = C B of the model learned in flight
+        y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
+            Omega = C B of the model learned in flight
 
-    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i, and above 0 for any. Beside
-    models at further speeds it is the least over the speeds.
-    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the start.
+    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i,
+    and above 0 for any. Beside models at further speeds it is the least over the speeds.
+    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the
+    start.
     """  # noqa: D400, D415 - what follows is an equation
     m = len(flown.outputs)
     model = flown.feedforward
@@ -442,7 +587,9 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
     least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
     for scheduled in () if flown.schedule is None else flown.schedule.models:
-        least = least * np.minimum(np.abs(np.reshape(scheduled.B, (-1, m))[rows].diagonal() / B), 1.0)
+        least = least * np.minimum(
+            np.abs(np.reshape(scheduled.B, (-1, m))[rows].diagonal() / B), 1.0
+        )
     for k, limits in enumerate((flown.lower, flown.upper)):
         if limits is None:
             continue
@@ -453,10 +600,14 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
-    """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
+    """What flies, with the law of the start in further channels; the start itself where no channel
+    keeps a model.
+    """
     acting = acting_inputs(flown)
     is_first = flown.models() == start.models()
-    if is_first or all(is_bare or name not in acting for name, is_bare in zip(flown.inputs, bare, strict=True)):
+    if is_first or all(
+        is_bare or name not in acting for name, is_bare in zip(flown.inputs, bare, strict=True)
+    ):
         return start
     mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
     return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
@@ -468,12 +619,20 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
     return () if learn is None else learn.without or ()
 
 
-def without_models(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]) -> RiseDiConfig:
-    """What flies, with the law of the start in some outputs to the end of the engagement, added to `learn.without`."""
+def without_models(
+    start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]
+) -> RiseDiConfig:
+    """What flies, with the law of the start in some outputs to the end of the engagement, added to
+    `learn.without`.
+    """
     fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
-    bare_outputs = tuple(name for name in start.outputs if name in {*outputs_without(flown), *outputs})
-    return fallen.model_copy(update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})})
+    bare_outputs = tuple(
+        name for name in start.outputs if name in {*outputs_without(flown), *outputs}
+    )
+    return fallen.model_copy(
+        update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})}
+    )
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
@@ -481,15 +640,22 @@ def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies
     n = len(model.states)
-    A, gravity, B = (np.reshape(values, (n, -1)) != 0.0 for values in (model.A, model.gravity or np.zeros(n), model.B))
+    A, gravity, B = (
+        np.reshape(values, (n, -1)) != 0.0
+        for values in (model.A, model.gravity or np.zeros(n), model.B)
+    )
     links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
     reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
     states = [model.states.index(name) for name in names]
-    return [bool(np.any(reached[model.states.index(output), states])) for output in parameters.outputs]
+    return [
+        bool(np.any(reached[model.states.index(output), states])) for output in parameters.outputs
+    ]
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """What differs between two parameter sets, by dotted name; None for a parameter that is gone."""
+    """What differs between two parameter sets, by dotted name; None for a parameter that is
+    gone.
+    """
     before = dict(flatten(old.model_dump()))
     after = dict(flatten(new.model_dump()))
     return {name: after.get(name) for name in before | after if before.get(name) != after.get(name)}

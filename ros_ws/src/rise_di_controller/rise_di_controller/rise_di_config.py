@@ -10,7 +10,15 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from flight_core.fields import Field
-from flight_core.parameters import Config, Numbers, ParameterError, Positive, Positives, require, require_length
+from flight_core.parameters import (
+    Config,
+    Numbers,
+    ParameterError,
+    Positive,
+    Positives,
+    require,
+    require_length,
+)
 from flight_core.vectors import FloatArray
 from rise_di_controller import internals
 from rise_di_controller.control_law import ControlLaw, TunedLaw
@@ -29,11 +37,14 @@ from rise_di_controller.schedule import (
     with_schedule,
 )
 
-HISTORY = 5.0  # s, over which a new observer runs before it flies: its disturbances then hold what the law held
+# s, over which a new observer runs before it flies: its disturbances then hold what the law held
+HISTORY = 5.0
 
 
 class SpeedConfig(Config):
-    """The models of feedforward and observer at another airspeed. SI units, matrices row by row as in these sections."""
+    """The models of feedforward and observer at another airspeed. SI units, matrices row by row as
+    in these sections.
+    """
 
     ratio: Positive = Field(description="this airspeed over the trim speed")
     A: Numbers = Field(description="A of the feedforward")
@@ -51,9 +62,12 @@ class ScheduleConfig(Config):
     speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s")
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
     slow: SpeedConfig | None = Field(
-        default=None, description="beside an observer: models below the trim speed, interpolated between"
+        default=None,
+        description="beside an observer: models below the trim speed, interpolated between",
     )
-    fast: SpeedConfig | None = Field(default=None, description="beside an observer: models above the trim speed")
+    fast: SpeedConfig | None = Field(
+        default=None, description="beside an observer: models above the trim speed"
+    )
 
     @property
     def models(self) -> tuple[SpeedConfig, ...]:
@@ -62,9 +76,13 @@ class ScheduleConfig(Config):
 
 
 class LearnConfig(Config):
-    """Learning in the air, an extension of the paper: A and B are identified in flight, and the observer is designed again."""
+    """Learning in the air, an extension of the paper: A and B are identified in flight, and the
+    observer is designed again.
+    """
 
-    window: Annotated[float, Field(ge=6, le=600)] = Field(default=30.0, description="length of the record of y and u, s")
+    window: Annotated[float, Field(ge=6, le=600)] = Field(
+        default=30.0, description="length of the record of y and u, s"
+    )
     updates: Positives = Field(
         default=(10.0, 15.0, 20.0, 30.0, 60.0),
         description="when identifications begin, from the first tick, s; then one a window",
@@ -73,7 +91,8 @@ class LearnConfig(Config):
         default=10.0, description="after these times: period of the test for a changed aircraft, s"
     )
     prior: str | None = Field(
-        default=None, description="the airframe file of the rough model, by `rise-di learn`; none: the airframe"
+        default=None,
+        description="the airframe file of the rough model, by `rise-di learn`; none: the airframe",
     )
     without: tuple[str, ...] | None = Field(
         default=None,
@@ -94,18 +113,31 @@ class RiseDiConfig(ControllerConfig):
     """The controller under RISE dynamic inversion, the paper's law."""
 
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
-    k_d: tuple[Positive, ...] = Field(description="k_d of equation (22), one per channel except the last, 1/s")
-    Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
-    beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
-    omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
-    sign: Literal["auto", "literal", "implicit", "soft"] = Field(
-        description="how the sign of (21) is sampled; auto: implicit with lag and delay below half a period, else soft"
+    k_d: tuple[Positive, ...] = Field(
+        description="k_d of equation (22), one per channel except the last, 1/s"
     )
-    softening: Positive | Positives = Field(description="width of the softened sign in total lags; stable above 1, 3 is usual")
+    Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
+    beta: Positives = Field(
+        description="the diagonal of beta (21) in scaled inputs, units of y / s^2"
+    )
+    omega: Positives = Field(
+        description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)"
+    )
+    sign: Literal["auto", "literal", "implicit", "soft"] = Field(
+        description="how the sign of (21) is sampled; auto: implicit with lag and delay below "
+        "half a period, else soft"
+    )
+    softening: Positive | Positives = Field(
+        description="width of the softened sign in total lags; stable above 1, 3 is usual"
+    )
 
-    schedule: ScheduleConfig | None = Field(default=None, description="extension: input_scale follows the dynamic pressure")
+    schedule: ScheduleConfig | None = Field(
+        default=None, description="extension: input_scale follows the dynamic pressure"
+    )
 
-    learn: LearnConfig | None = Field(default=None, description="extension: A and B are identified in flight")
+    learn: LearnConfig | None = Field(
+        default=None, description="extension: A and B are identified in flight"
+    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
@@ -113,7 +145,9 @@ class RiseDiConfig(ControllerConfig):
         return (super().tunable() | {"input_scale", "feedforward", "observer"}) - {"learn"}
 
     def check_law(self) -> None:
-        """A value per channel; k_d has no value for the last. A schedule needs V, and no model of the trim besides."""
+        """A value per channel; k_d has no value for the last. A schedule needs V, and no model of
+        the trim besides.
+        """
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
             require_length(key, getattr(self, key), self.outputs)
@@ -122,23 +156,50 @@ class RiseDiConfig(ControllerConfig):
         if self.schedule is not None:
             self._check_schedule(self.schedule)
         if self.learn is not None:
-            require(self.observer is not None, "learn", "no observer", "one, with part 0 if it does not fly yet")
             require(
-                self.allocation is None, "learn", "an allocation beside it", "none: A and B are those of the inputs of the law"
+                self.observer is not None,
+                "learn",
+                "no observer",
+                "one, with part 0 if it does not fly yet",
             )
-            require(not self.vanes, "learn", "observer.vanes beside it", "none: a learner designs the observer of y alone")
+            require(
+                self.allocation is None,
+                "learn",
+                "an allocation beside it",
+                "none: A and B are those of the inputs of the law",
+            )
+            require(
+                not self.vanes,
+                "learn",
+                "observer.vanes beside it",
+                "none: a learner designs the observer of y alone",
+            )
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
             known = set(self.learn.without or ()) <= set(self.outputs)
-            require(known, "learn.without", self.learn.without, f"outputs among {', '.join(self.outputs)}")
+            require(
+                known,
+                "learn.without",
+                self.learn.without,
+                f"outputs among {', '.join(self.outputs)}",
+            )
             spacing = self.learn.spacing()
             least = f"at most {spacing:g} s, the shortest time between two identifications"
-            require(self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least)
+            require(
+                self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least
+            )
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """V is an output beside others, and a feedforward and an observer have models below and above the trim speed."""
+        """V is an output beside others, and a feedforward and an observer have models below and
+        above the trim speed.
+        """
         followed = "V" in self.outputs and len(self.outputs) > 1
-        require(followed, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them, and one that follows V")
+        require(
+            followed,
+            "schedule",
+            f"the outputs {', '.join(self.outputs)}",
+            "V among them, and one that follows V",
+        )
         if self.feedforward is None and self.observer is None:
             require(
                 schedule.slow is None and schedule.fast is None,
@@ -148,14 +209,34 @@ class RiseDiConfig(ControllerConfig):
             )
             return
         both = self.observer is not None and len(schedule.models) == len(("slow", "fast"))
-        expected = "an observer with slow and fast, as rise-di gains --observer --set speeds=LOW,HIGH writes them"
-        require(both, "schedule", "a feedforward or an observer that holds at the trim speed alone", expected)
+        expected = (
+            "an observer with slow and fast, as rise-di gains --observer --set "
+            "speeds=LOW,HIGH writes them"
+        )
+        require(
+            both,
+            "schedule",
+            "a feedforward or an observer that holds at the trim speed alone",
+            expected,
+        )
         slow, fast = (model.ratio for model in schedule.models)
-        require(slow < 1.0 < fast, "schedule", f"ratios of {slow:g} and {fast:g}", "one below 1 and one above")
-        require(not self.vanes, "observer.vanes", "a schedule beside them", "none: they read the model of the trim speed")
+        require(
+            slow < 1.0 < fast,
+            "schedule",
+            f"ratios of {slow:g} and {fast:g}",
+            "one below 1 and one above",
+        )
+        require(
+            not self.vanes,
+            "observer.vanes",
+            "a schedule beside them",
+            "none: they read the model of the trim speed",
+        )
 
     def checks(self) -> Iterator[None]:
-        """Beside models at two more speeds: of the controller at the trim speed, at these speeds, and halfway to either."""
+        """Beside models at two more speeds: of the controller at the trim speed, at these speeds,
+        and halfway to either.
+        """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()
             return
@@ -177,11 +258,17 @@ class RiseDiConfig(ControllerConfig):
             try:
                 yield from self._at_speed(ratio, feedforward, observer).checks()
             except ParameterError as error:
-                raise ParameterError(f"schedule, at {ratio:.3g} of the trim speed: {error}") from None
+                raise ParameterError(
+                    f"schedule, at {ratio:.3g} of the trim speed: {error}"
+                ) from None
 
     def at_speed(self, ratio: float) -> Self:
-        """The parameters that fly at a part of the trim speed in steady flight, with the models of there and no schedule."""
-        return self._at_speed(ratio, self._nominal_over_speed(self.known_nominal()), self.tuned_law().params.observer)
+        """The parameters that fly at a part of the trim speed in steady flight, with the models of
+        there and no schedule.
+        """
+        return self._at_speed(
+            ratio, self._nominal_over_speed(self.known_nominal()), self.tuned_law().params.observer
+        )
 
     def _at_speed(self, ratio: float, feedforward: OverSpeed, observer: OverSpeed) -> Self:
         airspeed = self._airspeed()
@@ -197,10 +284,17 @@ class RiseDiConfig(ControllerConfig):
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
     def _with_models(self, models: SpeedConfig) -> Self:
-        """The parameters with `models` in place of the models of the trim speed, and no schedule."""
+        """The parameters with `models` in place of the models of the trim speed, and no
+        schedule.
+        """
         sections: dict[str, Any] = {"schedule": None}
-        for key, names in (("feedforward", ("A", "B", "gravity")), ("observer", ("Phi", "Gamma", "L", "F"))):
-            sections[key] = getattr(self, key).model_copy(update={name: getattr(models, name) for name in names})
+        for key, names in (
+            ("feedforward", ("A", "B", "gravity")),
+            ("observer", ("Phi", "Gamma", "L", "F")),
+        ):
+            sections[key] = getattr(self, key).model_copy(
+                update={name: getattr(models, name) for name in names}
+            )
         return self.model_copy(update=sections)
 
     def _airspeed(self) -> FloatArray:
@@ -220,7 +314,9 @@ class RiseDiConfig(ControllerConfig):
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
-        """The model of the feedforward over the airspeed, with leads and inputs of the model at the trim speed."""
+        """The model of the feedforward over the airspeed, with leads and inputs of the model at the
+        trim speed.
+        """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
             return nominal_side_by_side(config.known_nominal(), scale)
@@ -252,11 +348,15 @@ class RiseDiConfig(ControllerConfig):
         over = None
         if self.schedule.models:
             over = self._over_speed(
-                lambda config, scale: side_by_side(config.tuned_law().params, scale), partial(observer_of, law.params)
+                lambda config, scale: side_by_side(config.tuned_law().params, scale),
+                partial(observer_of, law.params),
             )
         speed = np.float64(self.schedule.speed)
         time = np.float64(self.schedule.time)
-        return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
+        return TunedLaw(
+            with_schedule(law.control_law),
+            ScheduleParams(law.params, speed, self._airspeed(), time, over),
+        )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
         """Also the outputs that are given up, of a controller that learns."""
@@ -287,13 +387,20 @@ class RiseDiConfig(ControllerConfig):
             D=np.array(self.D, dtype=np.float64),
             input_scale=np.array(self.input_scale),
             omega=np.array(self.omega),
-            eps=np.array(self.beta) / K * self.softening * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
+            eps=np.array(self.beta)
+            / K
+            * self.softening
+            * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
             sign=self.sampled_sign()[0],
         )
 
     def summary(self) -> str:
-        """How the sign is sampled, and the reason as a sentence; whether input_scale is scheduled."""
-        return self.sampled_sign()[1] + ("" if self.schedule is None else "; input_scale follows the dynamic pressure")
+        """How the sign is sampled, and the reason as a sentence; whether input_scale is
+        scheduled.
+        """
+        return self.sampled_sign()[1] + (
+            "" if self.schedule is None else "; input_scale follows the dynamic pressure"
+        )
 
     def sampled_sign(self) -> tuple[Sign, str]:
         """How the sign is sampled, and the reason as a sentence."""
@@ -302,5 +409,14 @@ class RiseDiConfig(ControllerConfig):
         lag = max(self.lag) + self.delay
         half = 0.5 / self.rate
         if lag < half:
-            return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
-        return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
+            return (
+                Sign.IMPLICIT,
+                (
+                    f"implicit sign, because lag and delay of {lag:g} s are below half a period "
+                    f"({half:g} s)"
+                ),
+            )
+        return (
+            Sign.SOFT,
+            f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)",
+        )

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples the controller takes. An impossible sample is lost, as a sample that did not arrive.
+"""Which samples the controller takes. An impossible sample is lost, as a sample that did not
+arrive.
 
 - `beyond`: a value is beyond the bound of the output. No sensor gives such a value.
-- `step`: y changes faster than an aircraft can. The test compares y with the y before and has no model, so a wrong model locks
-  nothing out. An aircraft that really jumps loses two samples: the controller takes the third in a row that agrees.
+- `step`: y changes faster than an aircraft can. The test compares y with the y before and has no
+  model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
+  controller takes the third in a row that agrees.
 """
 
 from collections.abc import Sequence
@@ -18,15 +20,22 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 TIMES = 5.0
-"""Largest possible change over the largest of the last minute. Noise changes by up to four standard deviations in a minute, so
-this is 20 deviations. In flights of seven of the scenarios no change was above a quarter of the limit."""
+"""Largest possible change over the largest of the last minute. Noise changes by up to four standard
+deviations in a minute, so this is 20 deviations. In flights of seven of the scenarios no change was
+above a quarter of the limit."""
 
 MEMORY = 60.0  # s, in which the largest change fades
 FIRST_NS = NANOSECONDS  # after the first sample, in which y shows how it changes
-AUTHORITY = 2.0  # change of y in a period over that by the full inputs: wind moves an aircraft as much as its inputs do
+# change of y in a period over that by the full inputs: wind moves an aircraft as much as its inputs
+# do
+AUTHORITY = 2.0
 UNLIMITED = 1.0  # SI, full input where it has no limit: 57 deg, or the weight as thrust
-LEAST = {"V": 1.0}  # m/s a sample, a change that counts as possible: above the knot in which an airspeed may come
-LEAST_RATE = 0.1  # rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
+LEAST = {
+    "V": 1.0
+}  # m/s a sample, a change that counts as possible: above the knot in which an airspeed may come
+LEAST_RATE = (
+    0.1  # rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
+)
 AGREEING = 3  # samples in a row after a jump that agree
 
 
@@ -56,8 +65,12 @@ class SampleState(NamedTuple):
     agreeing: int  # samples in a row up to `far` that are lost, and agree with the one before
 
 
-def bounds(names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int) -> SampleLimits:
-    """The limits of outputs by name; `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of parameters."""
+def bounds(
+    names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int
+) -> SampleLimits:
+    """The limits of outputs by name; `authority`: y_dot by the full inputs, (m,), units of y / s;
+    `largest`: of parameters.
+    """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
     bound = plausible.largest(names) if largest is None else np.array(largest, dtype=np.float64)
@@ -65,12 +78,17 @@ def bounds(names: Sequence[str], authority: FloatArray, largest: Sequence[float]
 
 
 def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
-    """The first of the m values that is beyond its bound, or NaN, as a sentence; empty for values inside."""
+    """The first of the m values that is beyond its bound, or NaN, as a sentence; empty for values
+    inside.
+    """
     inside = np.abs(value) <= limits.largest
     if inside.all():
         return ""
     i = int(np.argmin(inside))
-    return f"{names[i]} = {value[i]:g} is beyond {limits.largest[i]:g}, the bound of {names[i]} (controller.y_max)"
+    return (
+        f"{names[i]} = {value[i]:g} is beyond {limits.largest[i]:g}, the bound of {names[i]} "
+        "(controller.y_max)"
+    )
 
 
 def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> str:
@@ -85,21 +103,26 @@ def begun(sample: StampedVector) -> SampleState:
     return SampleState(sample.stamp_ns, sample, np.zeros_like(sample.value), sample, 0)
 
 
-def step(state: SampleState, sample: StampedVector, limits: SampleLimits) -> tuple[SampleState, Change]:
+def step(
+    state: SampleState, sample: StampedVector, limits: SampleLimits
+) -> tuple[SampleState, Change]:
     """The state after a sample of y with a later stamp, and what the sample is.
 
         change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
-        NEAR where change <= max(TIMES largest, reach) in all outputs; then largest = max(change, faded largest)
+        NEAR where change <= max(TIMES largest, reach) in all outputs; then largest = max(change,
+        faded largest)
 
-    The possible change grows with the time since the last sample taken: no sensor is locked out for ever. After lost
-    samples, largest takes the whole change, since y may be as noisy.
+    The possible change grows with the time since the last sample taken: no sensor is locked out for
+    ever. After lost samples, largest takes the whole change, since y may be as noisy.
     """
     near, change = _compared(state.last, sample, state.change, limits)
     if near or sample.stamp_ns - state.begin_ns < FIRST_NS:
         if state.agreeing:
             change = np.abs(sample.value - state.last.value)
         fading = 1.0 - min(seconds(sample.stamp_ns - state.last.stamp_ns) / MEMORY, 1.0)
-        return SampleState(state.begin_ns, sample, np.maximum(change, fading * state.change), sample, 0), Change.NEAR
+        return SampleState(
+            state.begin_ns, sample, np.maximum(change, fading * state.change), sample, 0
+        ), Change.NEAR
     agrees = state.agreeing > 0 and _compared(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:

@@ -8,7 +8,9 @@ from flight_core.vectors import Array, array_namespace
 
 
 class Limits(NamedTuple):
-    """Saturation limits, as deviations from trim in units of u; infinite where there is no limit."""
+    """Saturation limits, as deviations from trim in units of u; infinite where there is no
+    limit.
+    """
 
     lower: Array  # (m,)
     upper: Array  # (m,)
@@ -16,7 +18,8 @@ class Limits(NamedTuple):
 
 
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
-    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u returns to the last bit.
+    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u
+    returns to the last bit.
 
     Where u_before is outside of new limits, u moves to the limits at the rate.
     """
@@ -35,15 +38,20 @@ def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
 
 
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
-    """An integral after a tick, shape (m,): an outward increment beyond a limit is reduced (anti-windup).
+    """An integral after a tick, shape (m,): an outward increment beyond a limit is reduced
+    (anti-windup).
 
-        before + max(1 - beyond / change, 0) (after - before)    where change beyond > 0, otherwise `after`, to the last bit
+        before + max(1 - beyond / change, 0) (after - before)
+            where change beyond > 0, otherwise `after`, to the last bit
 
-    So u ends at the limit, and moves at the rate where a rate limit acts. Arguments: `change` of u by the increment;
-    `beyond`, u with the increment less u after saturation, in the same units. Source: conditional integration,
-    K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the reduced increment is this project's.
+    So u ends at the limit, and moves at the rate where a rate limit acts. Arguments: `change` of u
+    by the increment; `beyond`, u with the increment less u after saturation, in the same units.
+    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the
+    reduced increment is this project's.
     """
     xp = array_namespace(before)
     outward = change * beyond > 0.0
-    kept = xp.maximum(1.0 - beyond / xp.where(outward, change, xp.ones_like(change)), xp.zeros_like(change))
+    kept = xp.maximum(
+        1.0 - beyond / xp.where(outward, change, xp.ones_like(change)), xp.zeros_like(change)
+    )
     return xp.where(outward, before + kept * (after - before), after)

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedule of input_scale over dynamic pressure, an extension of the paper, off by default.
 
-A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of fixed gains falls as much.
-The schedule keeps Omega input_scale near the value of the trim. The schedule extends a law with the parameter input_scale; the
-law's own equations do not change. The models of a feedforward and of an observer beside it are those of the airspeed too.
+A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of
+fixed gains falls as much. The schedule keeps Omega input_scale near the value of the trim. The
+schedule extends a law with the parameter input_scale; the law's own equations do not change. The
+models of a feedforward and of an observer beside it are those of the airspeed too.
 """
 
 import math
@@ -25,7 +26,8 @@ SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
 
 
-STEPS = 128  # a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+# a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+STEPS = 128
 
 
 class OverSpeed(NamedTuple):
@@ -37,14 +39,19 @@ class OverSpeed(NamedTuple):
     airspeed: FloatArray  # (m,) 1 for the output V, else 0
 
     def at_scale(self, scale: FloatArray) -> Any:
-        """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
+        """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all
+        channels but V.
+        """
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
         """The models of T factors, (T, m), as from `at_scale`, at once."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
-        return [self.model(place) for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()]
+        return [
+            self.model(place)
+            for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()
+        ]
 
 
 def over_speed(
@@ -53,10 +60,12 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """The model of matrices trim + d (slope + d curvature), through `values` at the trim speed and at two ratios to it.
+    """The model of matrices trim + d (slope + d curvature), through `values` at the trim speed and
+    at two ratios to it.
 
-    The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and the inverse of Omega, is over
-    the factor of input_scale in `values`: `model` takes the matrices and these factors, (m,).
+    The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and
+    the inverse of Omega, is over the factor of input_scale in `values`: `model` takes the matrices
+    and these factors, (m,).
     """
     trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
@@ -65,7 +74,9 @@ def over_speed(
 
     @lru_cache(maxsize=512)
     def model_at(d: float) -> Any:
-        return model(trim + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2)
+        return model(
+            trim + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2
+        )
 
     return OverSpeed(model_at, least, most, airspeed)
 
@@ -77,7 +88,9 @@ class ScheduleParams(NamedTuple):
     speed: Array  # () trim speed V0, m/s
     airspeed: Array  # (m,) 1 for the output V, else 0
     time: Array  # () time constant, s
-    observer: OverSpeed | None = None  # the law's parameters over the airspeed, of a law with an observer
+    observer: OverSpeed | None = (
+        None  # the law's parameters over the airspeed, of a law with an observer
+    )
 
 
 class ScheduleState(NamedTuple):
@@ -93,10 +106,11 @@ def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
 
 
 def target_scale(y: Array, params: ScheduleParams) -> Array:
-    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within SCALE_RANGE; 1 in channel V.
+    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within
+    SCALE_RANGE; 1 in channel V.
 
-    A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any altitude, for true airspeed
-    near the altitude of the trim. A thrust does not follow the ratio.
+    A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any
+    altitude, for true airspeed near the altitude of the trim. A thrust does not follow the ratio.
     """
     xp = array_namespace(y)
     least, largest = airspeed_range(params)
@@ -110,33 +124,49 @@ def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
     return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
 
 
-def observer_of(observer: ObserverParams, matrices: FloatArray, scale: FloatArray) -> ObserverParams:
+def observer_of(
+    observer: ObserverParams, matrices: FloatArray, scale: FloatArray
+) -> ObserverParams:
     """An observer with other matrices, the inverse of `side_by_side`."""
     s, m = observer.Gamma.shape
     F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
-    return observer._replace(Phi=matrices[:, :s], Gamma=matrices[:, s : s + m], L=matrices[:, s + m : s + 2 * m], F=F)
+    return observer._replace(
+        Phi=matrices[:, :s], Gamma=matrices[:, s : s + m], L=matrices[:, s + m : s + 2 * m], F=F
+    )
 
 
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
-    """[A, gravity, B, path A, path gravity, inverse'] of a feedforward with the factors `scale`; the last in n rows."""
+    """[A, gravity, B, path A, path gravity, inverse'] of a feedforward with the factors `scale`;
+    the last in n rows.
+    """
     n, m = nominal.B.shape
     inverse = np.zeros((n, m))
     inverse[:m] = (nominal.inverse / scale[:, None]).T
-    return np.hstack([nominal.A, nominal.gravity, nominal.B, nominal.path_A, nominal.path_gravity, inverse])
+    return np.hstack(
+        [nominal.A, nominal.gravity, nominal.B, nominal.path_A, nominal.path_gravity, inverse]
+    )
 
 
 def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
     """A nominal model of other matrices, the inverse of `nominal_side_by_side`."""
     n, m = nominal.B.shape
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
-    A, gravity, B, path_A, path_gravity, inverse = (matrices[:, first:last] for first, last in pairwise(ends))
+    A, gravity, B, path_A, path_gravity, inverse = (
+        matrices[:, first:last] for first, last in pairwise(ends)
+    )
     inverse = inverse[:m].T * scale[:, None]
-    return nominal._replace(A=A, gravity=gravity, B=B, path_A=path_A, path_gravity=path_gravity, inverse=inverse)
+    return nominal._replace(
+        A=A, gravity=gravity, B=B, path_A=path_A, path_gravity=path_gravity, inverse=inverse
+    )
 
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
-    """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer the models there."""
-    return _scaled(params.law if params.observer is None else params.observer.at_scale(scale), scale)
+    """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer
+    the models there.
+    """
+    return _scaled(
+        params.law if params.observer is None else params.observer.at_scale(scale), scale
+    )
 
 
 def _scaled(params: Any, scale: Array) -> Any:
@@ -150,7 +180,11 @@ def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverPa
     """The observers of some ticks, with the factors of input_scale there beside a schedule."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
-    return [params.law] * len(scales) if params.observer is None else params.observer.at_scales(np.array(scales))
+    return (
+        [params.law] * len(scales)
+        if params.observer is None
+        else params.observer.at_scales(np.array(scales))
+    )
 
 
 @lru_cache(maxsize=64)
@@ -160,36 +194,54 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         scale += min(dt / time, 1) (target_scale(y) - scale)
         the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
-    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An observer keeps the
-    estimates, of the same meaning at every speed, and u_o goes on to -F z at its own rate.
+    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An
+    observer keeps the estimates, of the same meaning at every speed, and u_o goes on to -F z at its
+    own rate.
     """  # noqa: D400, D415 - what follows is an equation
 
-    def followed(state: ScheduleState, y: Array, dt: Array, params: ScheduleParams) -> ScheduleState:
+    def followed(
+        state: ScheduleState, y: Array, dt: Array, params: ScheduleParams
+    ) -> ScheduleState:
         xp = array_namespace(y)
         part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
         scale = state.scale + part * (target_scale(y, params) - state.scale)
-        return ScheduleState(law.retune(state.law, _scaled(params.law, state.scale), _scaled(params.law, scale)), scale)
+        return ScheduleState(
+            law.retune(state.law, _scaled(params.law, state.scale), _scaled(params.law, scale)),
+            scale,
+        )
 
     def engage(measured: Measurements, params: ScheduleParams) -> ScheduleState:
         scale = target_scale(measured.y, params)
         return ScheduleState(law.engage(measured, law_at(params, scale)), scale)
 
-    def step(state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams) -> tuple[ScheduleState, Array]:
+    def step(
+        state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams
+    ) -> tuple[ScheduleState, Array]:
         state = followed(state, measured.y, dt, params)
         law_state, u = law.step(state.law, measured, dt, law_at(params, state.scale))
         return state._replace(law=law_state), u
 
     def limited(
-        state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams, limits: Limits
+        state: ScheduleState,
+        measured: Measurements,
+        dt: Array,
+        params: ScheduleParams,
+        limits: Limits,
     ) -> tuple[ScheduleState, Array, Array]:
         state = followed(state, measured.y, dt, params)
-        law_state, u_free, u = law.limited(state.law, measured, dt, law_at(params, state.scale), limits)
+        law_state, u_free, u = law.limited(
+            state.law, measured, dt, law_at(params, state.scale), limits
+        )
         return state._replace(law=law_state), u_free, u
 
     def retune(state: ScheduleState, old: ScheduleParams, new: ScheduleParams) -> ScheduleState:
-        return state._replace(law=law.retune(state.law, _scaled(old.law, state.scale), _scaled(new.law, state.scale)))
+        return state._replace(
+            law=law.retune(state.law, _scaled(old.law, state.scale), _scaled(new.law, state.scale))
+        )
 
-    def missed(state: ScheduleState, measured: Measurements, params: ScheduleParams) -> ScheduleState:
+    def missed(
+        state: ScheduleState, measured: Measurements, params: ScheduleParams
+    ) -> ScheduleState:
         return state._replace(law=law.missed(state.law, measured, law_at(params, state.scale)))
 
     return ControlLaw(ScheduleState, engage, step, limited, retune, missed, inner=law)

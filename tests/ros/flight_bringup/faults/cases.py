@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: injection, detection (by which node, how, within what time), response of u, and time of recovery.
+"""The faults: injection, detection (by which node, how, within what time), response of u, and time
+of recovery.
 
-Among them: nodes killed and stopped (failsafe, re-engagement), message storms and conflicting publishers (publisher lock),
-malformed samples, incompatible QoS, overruns, a full disk and steps of the clock.
+Among them: nodes killed and stopped (failsafe, re-engagement), message storms and conflicting
+publishers (publisher lock), malformed samples, incompatible QoS, overruns, a full disk and steps of
+the clock.
 """
 
 import json
@@ -58,13 +60,18 @@ from flight_ros.messages import to_message
 from flight_view.server import TOKEN_HEADER
 
 SLACK = 0.05
-"""s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each. Host scheduling delays
-(`Flight.host_delay`) are allowed in addition."""
+"""s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each.
+Host scheduling delays (`Flight.host_delay`) are allowed in addition."""
 
-REFUSAL_PERIOD, QOS_PERIOD = 2.1, 5.1  # s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
+REFUSAL_PERIOD, QOS_PERIOD = (
+    2.1,
+    5.1,
+)  # s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
 REPORT = 1.0  # s, the period of the diagnostics
 DISCOVERY = 0.5  # s, of a new node by all others
-RESTART = 0.5  # s, from being ready to full traffic, and until a recorder has received the history of the publishers
+# s, from being ready to full traffic, and until a recorder has received the history of the
+# publishers
+RESTART = 0.5
 STOP = 1.2  # s: beyond the age limits, hold and ramp
 
 
@@ -97,7 +104,9 @@ class Case(NamedTuple):
     victim: str = ""  # the role that is killed or stopped
     needs: tuple[str, ...] = ()  # the roles that detect the fault, or that the injection needs
     alone: bool = False  # beside no other fault: it concerns every node, or the log of what it left
-    host_delays: float = 2.0  # by which the time limits grow: the delays of two processes add up, of the node and of the probe
+    # by which the time limits grow: the delays of two processes add up, of the node and of the
+    # probe
+    host_delays: float = 2.0
 
 
 # Detection
@@ -126,7 +135,10 @@ def counts(role: str, key: str) -> Detection:
         reports = flight.diagnostics(role, flight.begin - 2.5 * REPORT)
         values = [(at, float(report[key])) for at, _, report in reports if key in report]
         before = [value for at, value in values if at < flight.begin]
-        return next((at for at, value in values if at >= flight.begin and value > (before or [0.0])[-1]), None)
+        return next(
+            (at for at, value in values if at >= flight.begin and value > (before or [0.0])[-1]),
+            None,
+        )
 
     return detection
 
@@ -138,15 +150,23 @@ def refusal(topic: str, reason: str) -> str:
 
 def conflicting(topic: str, publisher: str) -> Detection:
     """By the line of the publisher lock that logs a conflicting publisher."""
-    return logs(CONSUMERS[topic], refusal(topic, rf"conflicting publisher /{publisher}(#\d+)? ignored"))
+    return logs(
+        CONSUMERS[topic], refusal(topic, rf"conflicting publisher /{publisher}(#\d+)? ignored")
+    )
 
 
 # Injection
 
 
 def until_logged_again(flight: Flight, role: str, pattern: str, period: float) -> None:
-    """Wait until the rate limit of a log line is over, so that a node would log it again at once."""
-    flight.until(lambda: flight.first_line(role, pattern, time.time() - period) is None, 10.0, "end of the rate limit")
+    """Wait until the rate limit of a log line is over, so that a node would log it again at
+    once.
+    """
+    flight.until(
+        lambda: flight.first_line(role, pattern, time.time() - period) is None,
+        10.0,
+        "end of the rate limit",
+    )
 
 
 def until_refusal_logged_again(flight: Flight, topic: str, reason: str) -> None:
@@ -172,10 +192,16 @@ def kill(role: str) -> Injection:
         begin = flight.begin_fault()
         flight.kill(role)
         if role in {"aircraft", "reference_model"}:
-            flight.until(lambda: flight.ticks(begin).mode[-1:].tolist() == [Mode.TRIM], 10.0, "u at trim")
+            flight.until(
+                lambda: flight.ticks(begin).mode[-1:].tolist() == [Mode.TRIM], 10.0, "u at trim"
+            )
         elif role == "controller":
             trim = [[0.0] * len(INPUTS)]
-            flight.until(lambda: flight.actuator_positions(time.time() - 1.0)[1][-1:].tolist() == trim, 10.0, "inputs at trim")
+            flight.until(
+                lambda: flight.actuator_positions(time.time() - 1.0)[1][-1:].tolist() == trim,
+                10.0,
+                "inputs at trim",
+            )
         restart(flight, role)
 
     return inject
@@ -187,20 +213,30 @@ def restart(flight: Flight, role: str) -> None:
     flight.processes[role].wait_for("ready")
     run, waited = flight.spent(role)
     flight.end_fault()
-    ready = flight.until(lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout")
-    traffic = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}")
-    traffic = max(traffic, ready)  # the first tick of a recorder writes what it received before it was ready
+    ready = flight.until(
+        lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout"
+    )
+    traffic = flight.until(
+        lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}"
+    )
+    traffic = max(
+        traffic, ready
+    )  # the first tick of a recorder writes what it received before it was ready
     flight.end = ready
     flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
     flight.measured |= {"exec_to_ready": ready - started, "start_run": run, "start_waited": waited}
     if role == "recorder":
-        caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log")
+        caught_up = flight.until(
+            lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log"
+        )
         flight.measured["ready_to_caught_up"] = caught_up - ready
 
 
 def disturb(flight: Flight, *words: str) -> float:
     """Run a process of `foreign.py`, which is the fault; how much it sent."""
-    process = Process("tests.ros.flight_bringup.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION)
+    process = Process(
+        "tests.ros.flight_bringup.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION
+    )
     try:
         process.wait_for("begins at")
         flight.begin = float(process.lines[-1].split()[-1])
@@ -217,7 +253,9 @@ LEVEL = 10.0  # s after the loss of u_m, until the wings have to be level
 
 
 def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
-    """Guidance killed at any bank of a roll-in to either side, and started again when the wings have to be level."""
+    """Guidance killed at any bank of a roll-in to either side, and started again when the wings
+    have to be level.
+    """
     bank = float(random.choice((-BANK, BANK)))
     fraction = random.uniform(0.0, 0.95)
 
@@ -228,7 +266,9 @@ def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
     flight.until(rolled_in, 20.0, f"a bank of {bank * fraction:.2f} rad")
     flight.begin_fault()
     flight.kill("guidance")
-    flight.until(lambda: flight.bank(flight.begin + LEVEL)[0].size, LEVEL + 5.0, "the end of the levelling")
+    flight.until(
+        lambda: flight.bank(flight.begin + LEVEL)[0].size, LEVEL + 5.0, "the end of the levelling"
+    )
     restart(flight, "guidance")
     flight.until(flight.is_level, 20.0, "level flight under guidance")
 
@@ -243,18 +283,23 @@ def pose_fault(word: str, *back: str) -> Injection:
             pause(flight, STOP)
         flight.end_fault()
         for line in back:
-            flight.until(lambda line=line: flight.first_line("guidance", line, flight.begin), 20.0, line)  # type: ignore[misc]
+            returns = partial(flight.first_line, "guidance", line, flight.begin)
+            flight.until(returns, 20.0, line)
         flight.until(flight.is_level, 20.0, "level flight under guidance")
 
     return inject
 
 
 def reboot(flight: Flight, random: Generator) -> None:
-    """The autopilot killed and started again. The bridge engages when it is requested to, not before."""
+    """The autopilot killed and started again. The bridge engages when it is requested to, not
+    before.
+    """
     at_random(flight, random)
     begin = flight.begin_fault()
     flight.kill("autopilot")
-    flight.until(lambda: flight.first_line("bridge", "RELEASE -> DISENGAGED", begin), 5.0, "disengaged")
+    flight.until(
+        lambda: flight.first_line("bridge", "RELEASE -> DISENGAGED", begin), 5.0, "disengaged"
+    )
     started = flight.start("autopilot")
     back = flight.until(lambda: flight.first_message("y", started), 20.0, "y of the autopilot")
     flight.until(lambda: time.time() - back >= 1.0, 2.0, "a second with y")
@@ -272,7 +317,9 @@ class Page(NamedTuple):
     address: str
 
     def state(self) -> str:
-        """What the page says of the recording, by one request of a browser that has just loaded it; empty without an answer."""
+        """What the page says of the recording, by one request of a browser that has just loaded it;
+        empty without an answer.
+        """
         base, _, token = self.address.partition("#token=")
         request = urllib.request.Request(f"{base}data/0", headers={TOKEN_HEADER: token})  # noqa: S310 - http of this host
         try:
@@ -305,10 +352,13 @@ CONNECTIONS, PAGE_STORM = 1000, 2.0  # s
 
 
 def storm_on_the_page(flight: Flight, random: Generator) -> None:
-    """A thousand connections to the live page that ask for all samples at once and read nothing; it answers afterwards."""
+    """A thousand connections to the live page that ask for all samples at once and read nothing; it
+    answers afterwards.
+    """
     with live_page(flight) as page:
         disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
-        # The goal is 2 s. A busy host takes longer: each connection has one answer of some megabytes ahead of this one.
+        # The goal is 2 s. A busy host takes longer: each connection has one answer of some
+        # megabytes ahead of this one.
         flight.until(lambda: page.state() == "recording", 60.0, "a page that answers again")
         flight.measured["page"] = time.time() - flight.end
 
@@ -327,7 +377,9 @@ def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
 
 
 def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
-    """The stamp of a node's line "ready". The line is received later, when the probe has discovered the node."""
+    """The stamp of a node's line "ready". The line is received later, when the probe has discovered
+    the node.
+    """
     for arrival in flight.probe.since("/rosout", begin):
         if arrival.message.name == role and arrival.message.msg == "ready":
             stamp = arrival.message.stamp
@@ -336,7 +388,9 @@ def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
 
 
 def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
-    """When the last of a node's topics had its first message; of the recorder, when the log had a message of every topic."""
+    """When the last of a node's topics had its first message; of the recorder, when the log had a
+    message of every topic.
+    """
     if role == "recorder":
         return recorded_since(flight.runs[-1], 0.0)
     firsts = [flight.first_message(topic, begin) for topic in PUBLISHED[role]]
@@ -386,12 +440,26 @@ def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
 
 
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u": INPUTS}
-PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller", "u_m": "guidance", "proposal": "learner"}
-CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft", "u_m": "reference_model", "target": "guidance"}
+PUBLISHERS = {
+    "y": "aircraft",
+    "y_m": "reference_model",
+    "u": "controller",
+    "u_m": "guidance",
+    "proposal": "learner",
+}
+CONSUMERS = {
+    "y": "controller",
+    "y_m": "controller",
+    "u": "aircraft",
+    "u_m": "reference_model",
+    "target": "guidance",
+}
 CONSUMERS["proposal"] = "controller"
 
 Names = tuple[str, ...]
-BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
+BadSample = tuple[
+    float, Names, FloatArray
+]  # the offset of its stamp from the present, s; names; values
 
 
 def not_finite(values: tuple[float, ...], names: Names, random: Generator) -> BadSample:
@@ -402,7 +470,9 @@ def not_finite(values: tuple[float, ...], names: Names, random: Generator) -> Ba
 
 def wrong_names(names: Names, random: Generator) -> BadSample:
     bad = list(names)
-    bad[random.integers(len(names))] = random.choice(("", "x", f"{names[0]} ", "q_deg", "\N{GREEK SMALL LETTER DELTA}"))
+    bad[random.integers(len(names))] = random.choice(
+        ("", "x", f"{names[0]} ", "q_deg", "\N{GREEK SMALL LETTER DELTA}")
+    )
     return 0.0, tuple(bad), random.uniform(-1.0, 1.0, len(names))
 
 
@@ -420,7 +490,9 @@ def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
     return sign * 10.0 ** random.uniform(0.0, 8.0), names, random.uniform(-1.0, 1.0, len(names))
 
 
-BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line
+BAD: dict[
+    str, tuple[Callable[[Names, Generator], BadSample], str, str]
+] = {  # sample, key of the counter, log line
     "NaN": (partial(not_finite, (math.nan,)), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
     "wrong length": (wrong_length, "length", "names for"),
@@ -444,12 +516,23 @@ def malformed(topic: str, kind: str) -> Injection:
             flight.begin_fault()
             for k in range(BAD_COUNT):
                 offset, names, bad = make(NAMES[topic], random)
-                publish(to_message(time.time_ns() + nanoseconds(offset), names, bad, flight.instance(PUBLISHERS[topic])))
+                publish(
+                    to_message(
+                        time.time_ns() + nanoseconds(offset),
+                        names,
+                        bad,
+                        flight.instance(PUBLISHERS[topic]),
+                    )
+                )
                 at = flight.begin + 0.01 * k  # good samples arrive between the bad ones
                 flight.until(lambda at=at: time.time() >= at, 1.0, "the next bad sample")  # type: ignore[misc]
             flight.end_fault()
             least = before + BAD_COUNT // 2  # best effort: a busy host may lose some
-            flight.until(lambda: flight.count(consumer, key) >= least, 10.0, f"{BAD_COUNT // 2} more of {key!r}")
+            flight.until(
+                lambda: flight.count(consumer, key) >= least,
+                10.0,
+                f"{BAD_COUNT // 2} more of {key!r}",
+            )
 
     return inject
 
@@ -458,7 +541,12 @@ def malformed(topic: str, kind: str) -> Injection:
 def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
     """A second publisher of a topic in a process of its own, discovered by all subscribers."""
     process = Process(
-        "tests.ros.flight_bringup.faults.foreign", "relay", topic, cwd=REPOSITORY, within=OWN_SESSION, stdin=subprocess.PIPE
+        "tests.ros.flight_bringup.faults.foreign",
+        "relay",
+        topic,
+        cwd=REPOSITORY,
+        within=OWN_SESSION,
+        stdin=subprocess.PIPE,
     )
     stdin = process.popen.stdin
     assert stdin is not None
@@ -512,7 +600,9 @@ def second(role: str, topic: str) -> Injection:
         received = flight.until(first, 30.0, f"{topic} of a second {role}")
         # the flight's node may have discovered the second publisher before the probe has
         flight.begin = min(received, conflicting(topic, role)(flight) or received)
-        flight.until(lambda: time.time() - flight.begin >= 2.0, 5.0, "two seconds with two publishers")
+        flight.until(
+            lambda: time.time() - flight.begin >= 2.0, 5.0, "two seconds with two publishers"
+        )
         process.popen.terminate()
         assert process.end() == 0, process.output
         flight.end_fault()
@@ -520,7 +610,9 @@ def second(role: str, topic: str) -> Injection:
     return inject
 
 
-def incompatible_qos(role: str, create: Callable[[Node], object], detection: Detection) -> Injection:
+def incompatible_qos(
+    role: str, create: Callable[[Node], object], detection: Detection
+) -> Injection:
     """A publisher or a subscriber whose quality of service is incompatible with that of a node."""
 
     def inject(flight: Flight, random: Generator) -> None:
@@ -528,24 +620,36 @@ def incompatible_qos(role: str, create: Callable[[Node], object], detection: Det
         with peer(topics=()) as peer_node:
             flight.begin_fault()
             create(peer_node.node)
-            flight.until(lambda: detection(flight), 20.0, "a report of the incompatible quality of service")
+            flight.until(
+                lambda: detection(flight), 20.0, "a report of the incompatible quality of service"
+            )
         flight.end_fault()
 
     return inject
 
 
-WEAK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # the recorder requests a reliable publisher of y
-STRONG = QoSProfile(depth=1, deadline=Duration(seconds=0.02))  # the controller does not offer a deadline for u
+WEAK = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)  # the recorder requests a reliable publisher of y
+STRONG = QoSProfile(
+    depth=1, deadline=Duration(seconds=0.02)
+)  # the controller does not offer a deadline for u
 UNRELIABLE = logs("recorder", r"/y: .*/peer .*[Rr]eliab")
 DEADLINE = logs("controller", r"/u: .*/peer.*[Dd]eadline")
-weaker_qos = incompatible_qos("recorder", lambda node: node.create_publisher(JointState, "y", WEAK), UNRELIABLE)
+weaker_qos = incompatible_qos(
+    "recorder", lambda node: node.create_publisher(JointState, "y", WEAK), UNRELIABLE
+)
 stronger_qos = incompatible_qos(
-    "controller", lambda node: node.create_subscription(JointState, "u", lambda _: None, STRONG), DEADLINE
+    "controller",
+    lambda node: node.create_subscription(JointState, "u", lambda _: None, STRONG),
+    DEADLINE,
 )
 
 
 def step_of_clock(by: float) -> Injection:
-    """The system clock of all processes of the flight, set by so many seconds, and corrected when all nodes have logged it."""
+    """The system clock of all processes of the flight, set by so many seconds, and corrected when
+    all nodes have logged it.
+    """
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
@@ -562,7 +666,11 @@ def step_of_clock(by: float) -> Injection:
 def until_all_log(flight: Flight, pattern: str, begin: float) -> None:
     """Wait until each node has logged a line that matches the pattern."""
     roles = ROLES[flight.kind]
-    flight.until(lambda: all(flight.first_line(role, pattern, begin) for role in roles), 5.0, f"{pattern!r} of all nodes")
+    flight.until(
+        lambda: all(flight.first_line(role, pattern, begin) for role in roles),
+        5.0,
+        f"{pattern!r} of all nodes",
+    )
 
 
 def starve(flight: Flight, random: Generator) -> None:
@@ -570,7 +678,10 @@ def starve(flight: Flight, random: Generator) -> None:
     core = max(os.sched_getaffinity(0))
     nodes = [psutil.Process(process.popen.pid) for process in flight.processes.values()]
     before = [node.cpu_affinity() for node in nodes]
-    busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"], start_new_session=True) for _ in range(6)]
+    busy = [
+        subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"], start_new_session=True)
+        for _ in range(6)
+    ]
     try:
         for process in busy:
             os.sched_setaffinity(process.pid, {core})
@@ -601,7 +712,11 @@ def full_disk(flight: Flight, random: Generator) -> None:
         flight.until(lambda: recorded_since(folder / "run", 0.0), 5.0, "all topics in the log")
         flight.begin_fault()
         fill(folder / "other")
-        flight.until(lambda: flight.first_line("recorder", "recording ended", flight.begin), 5.0, "the end of the recording")
+        flight.until(
+            lambda: flight.first_line("recorder", "recording ended", flight.begin),
+            5.0,
+            "the end of the recording",
+        )
         flight.processes["recorder"].popen.terminate()
         assert flight.processes["recorder"].end() == 0
         flight.runs.pop()
@@ -613,26 +728,36 @@ def full_disk(flight: Flight, random: Generator) -> None:
         assert flight.begin - seconds(max(times)) <= 0.3, "and all messages until the fault"
         flight.end_fault()
     flight.processes["recorder"].wait_for("ready")
-    flight.until(lambda: recorded_since(flight.runs[-1], time.time() - 1.0), 10.0, "the last two seconds in the new log")
+    flight.until(
+        lambda: recorded_since(flight.runs[-1], time.time() - 1.0),
+        10.0,
+        "the last two seconds in the new log",
+    )
 
 
 CHANGES, IN_FLIGHT = 300, 8  # requests; a service queues ten
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Three hundred changes of the controller's gains, half of them invalid, also the first one; eight requests at once."""
+    """Three hundred changes of the controller's gains, half of them invalid, also the first one;
+    eight requests at once.
+    """
     valid = random.random(CHANGES) < 0.5
     valid[0] = False
     with peer(topics=()) as peer_node:
         client = peer_node.node.create_client(SetParameters, "controller/set_parameters")
 
         def request(name: str, value: object) -> Any:
-            return client.call_async(SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()]))
+            return client.call_async(
+                SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+            )
 
         peer_node.until(client.service_is_ready, "the service of parameters")
         k_g = load_scenario(flight.scenario).rise_di().k_g
         first = request("k_g", k_g)
-        peer_node.until(first.done, "the first answer")  # both ends of the service have discovered each other
+        peer_node.until(
+            first.done, "the first answer"
+        )  # both ends of the service have discovered each other
         flight.begin_fault()
         futures: list[Any] = []
         done = 0
@@ -642,7 +767,10 @@ def parameters(flight: Flight, random: Generator) -> None:
             while done < len(futures) and futures[done].done():
                 done += 1
             while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
-                lower = ("k_g", k_g * float(random.uniform(0.8, 1.0)))  # a larger one may cost an observer's loop its margin
+                lower = (
+                    "k_g",
+                    k_g * float(random.uniform(0.8, 1.0)),
+                )  # a larger one may cost an observer's loop its margin
                 futures.append(request(*(lower if valid[len(futures)] else invalid_change(random))))
 
         feed()
@@ -703,19 +831,24 @@ IN_SUITE = {
     "CPU starved",
     "guidance killed in a roll-in",
 }
-"""The cases of each test run: what processes, the middleware and the host do to a flight. The benchmark injects the others too,
-whose checks tests/nodes makes on the nodes alone."""
+"""The cases of each test run: what processes, the middleware and the host do to a flight. The
+benchmark injects the others too, whose checks tests/nodes makes on the nodes alone."""
 
 CASES = (
     Case("aircraft killed", kill("aircraft"), *STALE_INPUT, RESTART, **AIRCRAFT),
-    Case("reference model killed", kill("reference_model"), *STALE_INPUT, RESTART, **REFERENCE_MODEL),
+    Case(
+        "reference model killed", kill("reference_model"), *STALE_INPUT, RESTART, **REFERENCE_MODEL
+    ),
     Case("controller killed", kill("controller"), *STALE_U, RESTART, **CONTROLLER),
     Case("recorder killed", kill("recorder"), None, **RECORDER),
     Case("aircraft stopped", stop("aircraft"), *STALE_INPUT, **AIRCRAFT),
     Case("reference model stopped", stop("reference_model"), *STALE_INPUT, **REFERENCE_MODEL),
     Case("controller stopped", stop("controller"), *STALE_U, **CONTROLLER),
     Case("recorder stopped", stop("recorder"), None, **RECORDER),
-    *(Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign"), needs=ends_of(topic)) for topic in NAMES),
+    *(
+        Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign"), needs=ends_of(topic))
+        for topic in NAMES
+    ),
     *(
         Case(
             f"{kind} on {topic}",
@@ -726,11 +859,34 @@ CASES = (
         for topic in NAMES
         for kind in BAD
     ),
-    Case("second controller", second("controller", "u"), conflicting("u", "controller"), needs=ends_of("u")),
-    Case("second aircraft", second("aircraft", "y"), conflicting("y", "aircraft"), needs=ends_of("y")),
-    Case("weaker quality of service", weaker_qos, UNRELIABLE, REPORT + DISCOVERY, needs=("recorder",)),
-    Case("stronger quality of service", stronger_qos, DEADLINE, REPORT + DISCOVERY, needs=("controller",)),
-    Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5, alone=True),
+    Case(
+        "second controller",
+        second("controller", "u"),
+        conflicting("u", "controller"),
+        needs=ends_of("u"),
+    ),
+    Case(
+        "second aircraft", second("aircraft", "y"), conflicting("y", "aircraft"), needs=ends_of("y")
+    ),
+    Case(
+        "weaker quality of service", weaker_qos, UNRELIABLE, REPORT + DISCOVERY, needs=("recorder",)
+    ),
+    Case(
+        "stronger quality of service",
+        stronger_qos,
+        DEADLINE,
+        REPORT + DISCOVERY,
+        needs=("controller",),
+    ),
+    Case(
+        "CPU starved",
+        starve,
+        counts("aircraft", "missed ticks"),
+        REPORT + 3.0,
+        Response.LATE,
+        0.5,
+        alone=True,
+    ),
     Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1, alone=True),
     # A request that the host delays is followed by a pause without requests.
     Case(
@@ -757,19 +913,63 @@ CASES = (
         alone=True,
     ),
     Case("storm on the live page", storm_on_the_page, None, needs=("recorder",)),
-    Case("recorder killed under a live page", recorder_killed_under_the_page, None, victim="recorder"),
-    Case("guidance killed in a roll-in", kill_in_a_roll_in, *STALE_U_M, Response.WINGS_LEVELLED, kind=Kind.GUIDED, **GUIDANCE),
+    Case(
+        "recorder killed under a live page", recorder_killed_under_the_page, None, victim="recorder"
+    ),
+    Case(
+        "guidance killed in a roll-in",
+        kill_in_a_roll_in,
+        *STALE_U_M,
+        Response.WINGS_LEVELLED,
+        kind=Kind.GUIDED,
+        **GUIDANCE,
+    ),
     Case("guidance stopped", stop("guidance"), *STALE_U_M, kind=Kind.GUIDED, **GUIDANCE),
-    Case("second guidance", second("guidance", "u_m"), conflicting("u_m", "guidance"), **GUIDED, needs=ends_of("u_m")),
-    Case("storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), **GUIDED, needs=ends_of("u_m")),
-    Case("storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, **GUIDED, needs=("guidance",)),
-    Case("pose frozen", pose_fault("repeat", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, **POSE_GATE),
-    Case("pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
+    Case(
+        "second guidance",
+        second("guidance", "u_m"),
+        conflicting("u_m", "guidance"),
+        **GUIDED,
+        needs=ends_of("u_m"),
+    ),
+    Case(
+        "storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), **GUIDED, needs=ends_of("u_m")
+    ),
+    Case(
+        "storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, **GUIDED, needs=("guidance",)
+    ),
+    Case(
+        "pose frozen",
+        pose_fault("repeat", POSE_IS_BACK),
+        *STALE_POSE,
+        kind=Kind.GUIDED,
+        **POSE_GATE,
+    ),
+    Case(
+        "pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK
+    ),
     Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
-    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **POSE_BENCHMARK),
+    Case(
+        "pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **POSE_BENCHMARK
+    ),
     Case("learner killed", learner_killed, None, **LEARNING, victim="learner"),
     Case("learner stopped", stop("learner"), None, **LEARNING, victim="learner"),
-    Case("second learner", second_learner, conflicting("proposal", "learner"), 0.02, **LEARNING, needs=ends_of("proposal")),
-    Case("storm on proposal", storm("proposal"), conflicting("proposal", "foreign"), **LEARNING, needs=ends_of("proposal")),
-    Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED),
+    Case(
+        "second learner",
+        second_learner,
+        conflicting("proposal", "learner"),
+        0.02,
+        **LEARNING,
+        needs=ends_of("proposal"),
+    ),
+    Case(
+        "storm on proposal",
+        storm("proposal"),
+        conflicting("proposal", "foreign"),
+        **LEARNING,
+        needs=ends_of("proposal"),
+    ),
+    Case(
+        "autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED
+    ),
 )

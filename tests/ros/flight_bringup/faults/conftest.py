@@ -17,7 +17,9 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 
 Row = dict[str, str | int | float | bool | None]
-LINES = 12  # of an error in a row: what failed, and the first output of a process that did not answer
+LINES = (
+    12  # of an error in a row: what failed, and the first output of a process that did not answer
+)
 
 
 def described(error: BaseException) -> str:
@@ -26,13 +28,32 @@ def described(error: BaseException) -> str:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--faults-table", type=Path, default=None, help="append a row for each fault to this file of JSON lines")
+    parser.addoption(
+        "--faults-table",
+        type=Path,
+        default=None,
+        help="append a row for each fault to this file of JSON lines",
+    )
     parser.addoption("--faults-seed", type=int, default=1, help="seed of the faults")
-    parser.addoption("--faults-scenario", default="osprey_gust", help="scenario of the flight without guidance")
-    parser.addoption("--faults-guided", default="osprey_route", help="scenario of the flight with guidance")
-    parser.addoption("--faults-random", type=int, default=0, help="how many random faults are injected; seeds count up")
+    parser.addoption(
+        "--faults-scenario", default="osprey_gust", help="scenario of the flight without guidance"
+    )
+    parser.addoption(
+        "--faults-guided", default="osprey_route", help="scenario of the flight with guidance"
+    )
+    parser.addoption(
+        "--faults-random",
+        type=int,
+        default=0,
+        help="how many random faults are injected; seeds count up",
+    )
     parser.addoption("--faults-lockstep", type=int, default=0, help="how many of lockstep flights")
-    parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
+    parser.addoption(
+        "--faults-times",
+        type=int,
+        default=1,
+        help="how often each fault is injected in a row; seeds count up",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +78,12 @@ def seeds(pytestconfig: pytest.Config) -> range:
 
 @pytest.fixture(scope="session")
 def draws(pytestconfig: pytest.Config) -> list[Draw]:
-    """Failures of the past and random faults, those of one kind of flight after one another; none outside the campaign."""
-    first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random"))
+    """Failures of the past and random faults, those of one kind of flight after one another; none
+    outside the campaign.
+    """
+    first, count = (
+        int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random")
+    )
     drawn = [*found(), *map(draw, range(first, first + count))] if count else []
     return sorted(drawn, key=lambda fault: fault.cases[0].kind.name)
 
@@ -66,12 +91,16 @@ def draws(pytestconfig: pytest.Config) -> list[Draw]:
 @pytest.fixture(scope="session")
 def lockstep_seeds(pytestconfig: pytest.Config) -> range:
     """One for each lockstep flight with a random fault."""
-    first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "lockstep"))
+    first, count = (
+        int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "lockstep")
+    )
     return range(first, first + count)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """The cases of the suite; all of them where benchmarks/faults.py runs the tests, with a table."""
+    """The cases of the suite; all of them where benchmarks/faults.py runs the tests, with a
+    table.
+    """
     if "case" in metafunc.fixturenames:
         every = metafunc.config.getoption("--faults-table", None) is not None
         chosen = [case for case in CASES if every or case.name in IN_SUITE]
@@ -87,7 +116,11 @@ CAMPAIGNS = {
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the random faults where no option asks for them."""
-    left = [item for item in items if item.name in CAMPAIGNS and not config.getoption(CAMPAIGNS[item.name], 0)]
+    left = [
+        item
+        for item in items
+        if item.name in CAMPAIGNS and not config.getoption(CAMPAIGNS[item.name], 0)
+    ]
     config.hook.pytest_deselected(items=left)
     items[:] = [item for item in items if item not in left]
 
@@ -114,7 +147,9 @@ class Flights:
         self.all: list[Flight] = []  # including those that have ended
 
     def steady(self, kind: Kind) -> Flight:
-        """A flight that is steady and near trim: the running one, or a new one where a fault has upset that."""
+        """A flight that is steady and near trim: the running one, or a new one where a fault has
+        upset that.
+        """
         if kind in self._running:
             with suppress(AssertionError):
                 self._running[kind].until_steady(20.0)
@@ -135,7 +170,10 @@ class Flights:
         folder = self._folder / f"flight{len(self.all) + 1}"
         folder.mkdir()
         flight = self._running[kind] = Flight(
-            folder, self._scenarios[kind].path, kind, settable_clock(folder) if kind is Kind.OWN_CLOCK else None
+            folder,
+            self._scenarios[kind].path,
+            kind,
+            settable_clock(folder) if kind is Kind.OWN_CLOCK else None,
         )
         self.all.append(flight)
         return flight
@@ -147,14 +185,24 @@ class Flights:
 
 
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Iterator[Flights]:
+def flights(
+    tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
+) -> Iterator[Flights]:
     plain = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
     guided = find_scenario(str(pytestconfig.getoption("--faults-guided", "osprey_route")))
     bridged = find_scenario("osprey_observer")
     # a proposal a second, from 3 s on
-    learning = find_scenario("osprey_learn").vary(controller={"learn": {"updates": [3.0], "check": 1.0, "latency": 1.0}})
+    learning = find_scenario("osprey_learn").vary(
+        controller={"learn": {"updates": [3.0], "check": 1.0, "latency": 1.0}}
+    )
     learning = written(learning, tmp_path_factory.mktemp("learning") / "learn.yaml")
-    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided, Kind.BRIDGED: bridged, Kind.LEARNING: learning}
+    scenarios = {
+        Kind.PLAIN: plain,
+        Kind.OWN_CLOCK: plain,
+        Kind.GUIDED: guided,
+        Kind.BRIDGED: bridged,
+        Kind.LEARNING: learning,
+    }
     made = Flights(tmp_path_factory.mktemp("faults"), scenarios)
     yield made
     made.close()

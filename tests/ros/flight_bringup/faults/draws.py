@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults: any case at any instant, a tenth of them two at a time, repeatable by their seed."""
+"""Random faults: any case at any instant, a tenth of them two at a time, repeatable by their
+seed.
+"""
 
 import threading
 from copy import copy
@@ -43,7 +45,9 @@ FOUND: tuple[tuple[int, tuple[str, ...]], ...] = (
 
 def together(one: Case, other: Case) -> bool:
     """Whether each of two faults leaves the nodes that the other one needs, and a processor."""
-    apart = all(a.victim not in (b.victim, *b.needs) for a, b in ((one, other), (other, one)) if a.victim)
+    apart = all(
+        a.victim not in (b.victim, *b.needs) for a, b in ((one, other), (other, one)) if a.victim
+    )
     storms = one.name.startswith("storm") and other.name.startswith("storm")
     same = one.kind is other.kind and one.kind in {Kind.PLAIN, Kind.GUIDED} and one is not other
     return same and apart and not (one.alone or other.alone or storms)
@@ -66,7 +70,9 @@ def found() -> list[Draw]:
 
 
 def inject(flight: Flight, draw: Draw) -> list[Flight]:
-    """Inject the faults of a draw. The flight as each of them sees it: with its own begin, end and figures."""
+    """Inject the faults of a draw. The flight as each of them sees it: with its own begin, end and
+    figures.
+    """
     views = [copy(flight) for _ in draw.cases]
     errors: list[BaseException] = []
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight under test: processes that can be killed and stopped, and a probe that receives and times their messages."""
+"""A flight under test: processes that can be killed and stopped, and a probe that receives and
+times their messages.
+"""
 
 import os
 import re
@@ -34,7 +36,15 @@ from tests.ros.peer import peer
 from tests.ros.waiting import until
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_bringup.graph import AIRCRAFT, BRIDGE, CONTROLLER, GUIDANCE, LEARNER, RECORDER, REFERENCE_MODEL
+from flight_bringup.graph import (
+    AIRCRAFT,
+    BRIDGE,
+    CONTROLLER,
+    GUIDANCE,
+    LEARNER,
+    RECORDER,
+    REFERENCE_MODEL,
+)
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -42,7 +52,20 @@ from flight_ros import transport
 from flight_ros.messages import Decoder, to_message
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import DIAGNOSTICS, HISTORY_NS, INTERNALS, POSE, PUBLISH, TARGET, TRUTH, U_M, Y_M, Topic, U, Y
+from flight_ros.topics import (
+    DIAGNOSTICS,
+    HISTORY_NS,
+    INTERNALS,
+    POSE,
+    PUBLISH,
+    TARGET,
+    TRUTH,
+    U_M,
+    Y_M,
+    Topic,
+    U,
+    Y,
+)
 
 
 class Kind(Enum):
@@ -56,7 +79,8 @@ class Kind(Enum):
 
 
 MODULES = {
-    node.executable: node.module for node in (RECORDER, CONTROLLER, AIRCRAFT, REFERENCE_MODEL, GUIDANCE, LEARNER, BRIDGE)
+    node.executable: node.module
+    for node in (RECORDER, CONTROLLER, AIRCRAFT, REFERENCE_MODEL, GUIDANCE, LEARNER, BRIDGE)
 }
 FOUR: tuple[str, ...] = ("recorder", "controller", "aircraft", "reference_model")
 ROLES = {
@@ -68,11 +92,14 @@ ROLES = {
 }
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 ROSOUT = Topic("/rosout", Log)
-TRUE_POSE = Topic("true_pose", POSE.type)  # of the aircraft in a guided flight: a gate relays it as `pose`
+TRUE_POSE = Topic(
+    "true_pose", POSE.type
+)  # of the aircraft in a guided flight: a gate relays it as `pose`
 TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
 
 
-# Linux gives a process in its own session its own share of a busy processor (man 7 sched, autogroup).
+# Linux gives a process in its own session its own share of a busy processor (man 7 sched,
+# autogroup).
 OWN_SESSION = tuple(command for command in (shutil.which("setsid"),) if command)
 
 PUBLISHED = {
@@ -88,15 +115,20 @@ MAX_AGE = 0.1  # s, of y and y_m, as in the default scenario
 RATE = 200.0  # Hz, of aircraft and reference model
 U_MAX_AGE = 0.2  # s, of u, the aircraft's default
 LEVEL = 0.01  # rad, of wings
-HOLD, RAMP = 0.2, 0.3  # s, of both failsafes: shorter than the defaults, so that a case sees all of them
+HOLD, RAMP = (
+    0.2,
+    0.3,
+)  # s, of both failsafes: shorter than the defaults, so that a case sees all of them
 
 TRACKING = 0.05
-"""rad/s, m/s. On an idle host the loop stays within 0.001 of trim, on one with five times its load within 0.04. A restarted
-node begins at 0.1."""
+"""rad/s, m/s. On an idle host the loop stays within 0.001 of trim, on one with five times its load
+within 0.04. A restarted node begins at 0.1."""
 
-# s. A sample that a subscriber's socket dropped is requested again after the publisher's next heartbeat, every 0.05 s
-# (flight_ros/loopback.xml). Fast DDS pauses 5 ms before the request and 5 ms before the response (heartbeatResponseDelay,
-# nackResponseDelay). What a killed publisher sent within this time is not retransmitted.
+# s. A sample that a subscriber's socket dropped is requested again after the publisher's next
+# heartbeat, every 0.05 s
+# (flight_ros/loopback.xml). Fast DDS pauses 5 ms before the request and 5 ms before the response
+# (heartbeatResponseDelay, nackResponseDelay). What a killed publisher sent within this time is not
+# retransmitted.
 NOT_RETRANSMITTED = 0.05 + 2 * 0.005
 HISTORY = 0.5  # s before the end of a killed node: well beyond NOT_RETRANSMITTED
 
@@ -116,7 +148,9 @@ class Received(NamedTuple):
 
 
 class Probe:
-    """Receives the flight's topics in a thread of its own; `until` waits for a condition on them."""
+    """Receives the flight's topics in a thread of its own; `until` waits for a condition on
+    them.
+    """
 
     def __init__(self) -> None:
         transport.prepare()
@@ -126,12 +160,20 @@ class Probe:
         self._target = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         qos = {DIAGNOSTICS: PROBE_LOG_QOS, ROSOUT: PROBE_LOG_QOS}
         self._subscriptions = {
-            topic.name: PolledSubscription(self._node, topic, qos.get(topic, PROBE_QOS), raw=topic not in qos)
+            topic.name: PolledSubscription(
+                self._node, topic, qos.get(topic, PROBE_QOS), raw=topic not in qos
+            )
             for topic in TOPICS
         }
-        self.received: dict[str, deque[Received]] = {topic.name: deque(maxlen=BUFFER_SIZE) for topic in TOPICS}
-        self.monitored: list[Process] = []  # their scheduling delays are sampled once they are ready
-        self.delays: deque[tuple[float, float]] = deque(maxlen=BUFFER_SIZE)  # when, and the longest since the sample before, s
+        self.received: dict[str, deque[Received]] = {
+            topic.name: deque(maxlen=BUFFER_SIZE) for topic in TOPICS
+        }
+        self.monitored: list[
+            Process
+        ] = []  # their scheduling delays are sampled once they are ready
+        self.delays: deque[tuple[float, float]] = deque(
+            maxlen=BUFFER_SIZE
+        )  # when, and the longest since the sample before, s
         self._waited_ns: dict[int, int] = {}
         self._changed = threading.Condition()
         self._closed = False
@@ -139,7 +181,9 @@ class Probe:
         self._thread.start()
 
     def _receive(self) -> None:
-        waiter = WaitSet([subscription.entity for subscription in self._subscriptions.values()], self._context)
+        waiter = WaitSet(
+            [subscription.entity for subscription in self._subscriptions.values()], self._context
+        )
         sample = 0.0
         while not self._closed:
             waiter.wait(NANOSECONDS // 20)
@@ -149,16 +193,22 @@ class Probe:
             with self._changed:
                 for name, subscription in self._subscriptions.items():
                     self.received[name].extend(
-                        Received(seconds(arrival.sent_ns), seconds(arrival.received_ns), arrival.message)
+                        Received(
+                            seconds(arrival.sent_ns), seconds(arrival.received_ns), arrival.message
+                        )
                         for arrival in subscription.take()
                     )
                 self._changed.notify_all()
 
     def _sample_delays(self) -> None:
         before = self._waited_ns
-        ready = [process.popen.pid for process in list(self.monitored) if "]: ready" in process.output]
+        ready = [
+            process.popen.pid for process in list(self.monitored) if "]: ready" in process.output
+        ]
         self._waited_ns = {process: _waited_ns(process) for process in (os.getpid(), *ready)}
-        longest = max(waited - before.get(process, waited) for process, waited in self._waited_ns.items())
+        longest = max(
+            waited - before.get(process, waited) for process, waited in self._waited_ns.items()
+        )
         self.delays.append((time.time(), longest / NANOSECONDS))
 
     def since(self, topic: str, begin: float, end: float = float("inf")) -> list[Received]:
@@ -183,7 +233,9 @@ class Probe:
 
     def target(self, **values: float) -> None:
         """Command guidance, by channel."""
-        self._target.publish(to_message(time.time_ns(), [*values], np.array([*values.values()]), "/probe"))
+        self._target.publish(
+            to_message(time.time_ns(), [*values], np.array([*values.values()]), "/probe")
+        )
 
     def close(self) -> None:
         """End the thread and the node."""
@@ -203,7 +255,9 @@ def _waited_ns(process: int) -> int:
 
 
 def _scheduled_ns(path: Path) -> tuple[int, int]:
-    """How long a thread ran, and how long it was ready and waited for a processor (proc_pid_schedstat)."""
+    """How long a thread ran, and how long it was ready and waited for a processor
+    (proc_pid_schedstat).
+    """
     run, waited, _ = map(int, path.read_text(encoding="ascii").split())
     return run, waited
 
@@ -221,7 +275,11 @@ class Ticks(NamedTuple):
     @property
     def modes(self) -> list[Mode]:
         """The modes in their order, without repetitions."""
-        return [Mode(int(mode)) for k, mode in enumerate(self.mode) if k == 0 or self.mode[k - 1] != mode]
+        return [
+            Mode(int(mode))
+            for k, mode in enumerate(self.mode)
+            if k == 0 or self.mode[k - 1] != mode
+        ]
 
 
 def _ticks(t: FloatArray, values: FloatArray) -> Ticks:
@@ -236,12 +294,15 @@ def tick_channels(inputs: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def steady_scenario(source: Path, folder: Path) -> Path:
-    """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a change of it shows.
+    """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a
+    change of it shows.
 
     Guidance, where the scenario has a section of it, commands this flight with level wings.
     """
     tree = yaml.safe_load(source.read_text(encoding="utf-8"))
-    sections = {key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()}
+    sections = {
+        key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()
+    }
     aircraft, reference = sections["aircraft"], sections["reference_model"]
     # Noise would hide a change of u, and a probe finds u in the positions of ideal actuators.
     for disturbance in ("gusts", "turbulence", "wind", "sensors", "actuators"):
@@ -255,7 +316,9 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     else:
         guidance.pop("route", None)
         level = {"phi": 0.0, "climb": 0.0, "V": reference["live"]["speed"] + 0.1}
-        guidance["program"] = {name: {"start": [0.0], "value": [value]} for name, value in level.items()}
+        guidance["program"] = {
+            name: {"start": [0.0], "value": [value]} for name, value in level.items()
+        }
     sections["controller"] |= {"max_age": MAX_AGE, "hold": HOLD, "ramp": RAMP}
     sections["aircraft"] |= {"max_age": U_MAX_AGE, "hold": HOLD, "ramp": RAMP}
     path = folder / "steady.yaml"
@@ -269,7 +332,9 @@ RELEASE_AFTER = 3.0  # s without a message: RC_OVERRIDE_TIME of ArduPilot
 
 
 def fast_map(folder: Path) -> Path:
-    """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a small delay needs them."""
+    """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a
+    small delay needs them.
+    """
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
     content["messages"]["joy"]["rate"] = 200.0
     path = folder / "map.yaml"
@@ -281,8 +346,12 @@ class ExpectedLog(NamedTuple):
     """What the log must hold of the time of a fault."""
 
     internals: set[bytes]  # of the flight's own controllers, except `last`
-    lines: set[tuple[str, str]]  # node and log line, except those right before the end of a killed node
-    last: list[list[bytes]]  # for each killed node its `internals` right before the end, in their order
+    lines: set[
+        tuple[str, str]
+    ]  # node and log line, except those right before the end of a killed node
+    last: list[
+        list[bytes]
+    ]  # for each killed node its `internals` right before the end, in their order
 
 
 class Killed(NamedTuple):
@@ -304,7 +373,10 @@ class Flight:
         self._step.write_bytes(bytes(8))
         self.scenario = steady_scenario(source, folder)
         inputs = load_scenario(self.scenario).controller.inputs
-        self._tick_channels, self._actuators = tick_channels(inputs), tuple(f"actuator.{name}" for name in inputs)
+        self._tick_channels, self._actuators = (
+            tick_channels(inputs),
+            tuple(f"actuator.{name}" for name in inputs),
+        )
         self.probe = Probe()
         self.until = self.probe.until
         self.processes: dict[str, Process] = {}
@@ -312,13 +384,18 @@ class Flight:
         self.begin = self.end = time.time()  # of the last fault
         self.measured: dict[str, Any] = {}  # what a case adds to its row
         self.expected_logs: dict[str, ExpectedLog] = {}  # by case
-        # A process ends with the thread that started it (man 2 PR_SET_PDEATHSIG): one thread starts all.
+        # A process ends with the thread that started it (man 2 PR_SET_PDEATHSIG): one thread starts
+        # all.
         self._starter = ThreadPoolExecutor(1)
         self._all: list[Process] = []
         self._killed: list[Killed] = []
         self._instances: set[str] = set()  # of the roles, including restarts
         words = ("tests.ros.flight_bringup.faults.foreign", "gate", TRUE_POSE.name, POSE.name)
-        self.gate = self._run(*words, cwd=REPOSITORY, stdin=subprocess.PIPE) if kind is Kind.GUIDED else None
+        self.gate = (
+            self._run(*words, cwd=REPOSITORY, stdin=subprocess.PIPE)
+            if kind is Kind.GUIDED
+            else None
+        )
         for role in ROLES[kind]:  # the recorder first, and no aircraft without its controller
             self.start(role)
             if role == "controller":
@@ -332,7 +409,9 @@ class Flight:
     def node(self, role: str, *parameters: str) -> Process:
         """Start a node as `python -m PACKAGE.main`."""
         if role == "autopilot":
-            return self._run("tests.ros.autopilot", str(self.scenario), str(RELEASE_AFTER), cwd=REPOSITORY)
+            return self._run(
+                "tests.ros.autopilot", str(self.scenario), str(RELEASE_AFTER), cwd=REPOSITORY
+            )
         if role == "bridge":
             parameters = (f"map:={fast_map(self.folder)}", "dry_run:=false")
         if role == "learner":
@@ -340,7 +419,11 @@ class Flight:
         words = [word for parameter in parameters for word in ("-p", parameter)]
         if role == "aircraft" and self.gate is not None:
             words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]
-        preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
+        preload = (
+            {}
+            if self._clock is None
+            else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
+        )
         with patch.dict(os.environ, preload):
             arguments = (MODULES[role], "--ros-args", "--params-file", str(self.scenario), *words)
             process = self._run(*arguments, cwd=self.folder)
@@ -349,7 +432,9 @@ class Flight:
 
     def _run(self, *words: str, cwd: Path, stdin: int | None = None) -> Process:
         """Start a process of the flight, which lasts until its end."""
-        process = self._starter.submit(Process, *words, cwd=cwd, within=OWN_SESSION, stdin=stdin).result()
+        process = self._starter.submit(
+            Process, *words, cwd=cwd, within=OWN_SESSION, stdin=stdin
+        ).result()
         self._all.append(process)
         return process
 
@@ -379,7 +464,9 @@ class Flight:
         return at
 
     def spent(self, role: str) -> tuple[float, float]:
-        """Of the main thread of a role's process: processor time, and the time that it was ready and waited for it, s."""
+        """Of the main thread of a role's process: processor time, and the time that it was ready
+        and waited for it, s.
+        """
         run, waited = _scheduled_ns(Path(f"/proc/{self.processes[role].popen.pid}/schedstat"))
         return seconds(run), seconds(waited)
 
@@ -409,11 +496,15 @@ class Flight:
         self.probe.close()
 
     def engage(self) -> None:
-        """Engage through the bridge, as soon as it permits. The end of the fault is the last request."""
+        """Engage through the bridge, as soon as it permits. The end of the fault is the last
+        request.
+        """
 
         def requested() -> bool:
             self.end_fault()
-            return bool(peer_node.call(SetBool, "bridge/engage", SetBool.Request(data=True)).success)
+            return bool(
+                peer_node.call(SetBool, "bridge/engage", SetBool.Request(data=True)).success
+            )
 
         with peer(topics=()) as peer_node:
             self.until(requested, 30.0, "engaged through the bridge")
@@ -436,13 +527,21 @@ class Flight:
         return _ticks(*self._values("internals", self._tick_channels, begin, end))
 
     def foreign_y(self, begin: float, end: float) -> list[StampedVector]:
-        """The engaged ticks with the y of another publisher: their stamp, that of y, is none of the aircraft's instants."""
+        """The engaged ticks with the y of another publisher: their stamp, that of y, is none of the
+        aircraft's instants.
+        """
         (instant, *_) = (sample.stamp_ns for _, sample in self._samples("truth", (), begin, end))
-        ticks = [tick for _, tick in self._samples("internals", ("mode",), begin, end) if tick.value[0] == Mode.ENGAGED]
+        ticks = [
+            tick
+            for _, tick in self._samples("internals", ("mode",), begin, end)
+            if tick.value[0] == Mode.ENGAGED
+        ]
         return [tick for tick in ticks if (tick.stamp_ns - instant) % period_ns(RATE, "rate")]
 
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
-        """The engaged ticks with samples from `begin` on, from the log, which is complete; None before it reaches `until`."""
+        """The engaged ticks with samples from `begin` on, from the log, which is complete; None
+        before it reaches `until`.
+        """
         decoder, found = Decoder(self._tick_channels), []
         for topic, record in logged(self.runs[-1]):
             sample = self._decode(decoder, record.data) if topic == "/internals" else None
@@ -450,10 +549,15 @@ class Flight:
                 found.append(sample)
         if not found or seconds(found[-1].stamp_ns) < until:
             return None
-        ticks = _ticks(np.array([seconds(sample.stamp_ns) for sample in found]), np.array([sample.value for sample in found]))
+        ticks = _ticks(
+            np.array([seconds(sample.stamp_ns) for sample in found]),
+            np.array([sample.value for sample in found]),
+        )
         return Ticks(*(column[ticks.mode == Mode.ENGAGED] for column in ticks))
 
-    def actuator_positions(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
+    def actuator_positions(
+        self, begin: float, end: float = float("inf")
+    ) -> tuple[FloatArray, FloatArray]:
         """The applied inputs of the aircraft: when (N,), and their deviations from trim (N, m)."""
         return self._values("truth", self._actuators, begin, end)
 
@@ -462,11 +566,17 @@ class Flight:
         t, phi = self._values(TRUE_POSE.name, ("phi",), begin, end)
         return t, phi[:, 0]
 
-    def _values(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> tuple[FloatArray, FloatArray]:
+    def _values(
+        self, topic: str, names: tuple[str, ...], begin: float, end: float
+    ) -> tuple[FloatArray, FloatArray]:
         found = [(at, sample.value) for at, sample in self._samples(topic, names, begin, end)]
-        return np.array([at for at, _ in found]), np.array([value for _, value in found]).reshape(-1, len(names))
+        return np.array([at for at, _ in found]), np.array([value for _, value in found]).reshape(
+            -1, len(names)
+        )
 
-    def _samples(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> Iterator[tuple[float, StampedVector]]:
+    def _samples(
+        self, topic: str, names: tuple[str, ...], begin: float, end: float
+    ) -> Iterator[tuple[float, StampedVector]]:
         """The samples of the flight's own nodes, and when they were received."""
         decoder = Decoder(names)
         for arrival in self.probe.since(topic, begin, end):
@@ -484,24 +594,36 @@ class Flight:
         return float(np.diff(times).max())
 
     def host_delay(self, begin: float, end: float) -> float:
-        """The longest host scheduling delay of a process between two instants, s: it was ready, and waited for a processor.
+        """The longest host scheduling delay of a process between two instants, s: it was ready, and
+        waited for a processor.
 
-        As Linux counts it (proc_pid_schedstat), for all threads of a process together. It is at least the time without a
-        sample of it, in which the probe itself waited. It is also at least the time without a message of any node. The nodes
-        are processes of their own: all pause at once where the host of a virtual machine withholds its processors, which Linux
-        in that machine does not count, or where the middleware of the probe waits.
+        As Linux counts it (proc_pid_schedstat), for all threads of a process together. It is at
+        least the time without a sample of it, in which the probe itself waited. It is also at least
+        the time without a message of any node. The nodes are processes of their own: all pause at
+        once where the host of a virtual machine withholds its processors, which Linux in that
+        machine does not count, or where the middleware of the probe waits.
         """
         end += 2.0 * DELAY_PERIOD
-        samples = [(at, delay) for at, delay in list(self.probe.delays) if begin - 2.0 * DELAY_PERIOD <= at <= end]
+        samples = [
+            (at, delay)
+            for at, delay in list(self.probe.delays)
+            if begin - 2.0 * DELAY_PERIOD <= at <= end
+        ]
         gaps = np.diff([at for at, _ in samples]) - 2.0 * DELAY_PERIOD
         topics = {topic for published in PUBLISHED.values() for topic in published}
-        arrivals = (arrival.at for topic in topics for arrival in self.probe.since(topic, begin, end))
+        arrivals = (
+            arrival.at for topic in topics for arrival in self.probe.since(topic, begin, end)
+        )
         silences = np.diff(sorted([begin, *arrivals])) - 2.0 * TICK
         return float(max([0.0, *gaps, *silences, *(delay for at, delay in samples if at >= begin)]))
 
     def waited(self, begin: float, end: float) -> float:
-        """At most so long did a process wait for a processor between two instants, all its delays together, s."""
-        return sum(delay for at, delay in list(self.probe.delays) if begin <= at <= end + DELAY_PERIOD)
+        """At most so long did a process wait for a processor between two instants, all its delays
+        together, s.
+        """
+        return sum(
+            delay for at, delay in list(self.probe.delays) if begin <= at <= end + DELAY_PERIOD
+        )
 
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
         """When a node first logged a line that matches the pattern."""
@@ -511,27 +633,58 @@ class Flight:
         return None
 
     def expect_in_log(self, case: str) -> None:
-        """Keep what was received since the fault's begin, and from HISTORY before the end of a killed node on."""
+        """Keep what was received since the fault's begin, and from HISTORY before the end of a
+        killed node on.
+        """
         decoder = Decoder(())
-        killed_nodes = [node for node in self._killed if node.dead >= self.begin and node.role in PUBLISHED]
+        killed_nodes = [
+            node for node in self._killed if node.dead >= self.begin and node.role in PUBLISHED
+        ]
         begin = min([self.begin, *(node.alive - HISTORY for node in killed_nodes)])
         received = [
             (arrival, sample.sender)
             for arrival in self.probe.since("internals", begin)
             if (sample := self._decode(decoder, arrival.message)) is not None
         ]
-        lines = [line for line in self.probe.since("/rosout", begin) if line.message.name in PUBLISHED]
+        lines = [
+            line for line in self.probe.since("/rosout", begin) if line.message.name in PUBLISHED
+        ]
         last = []
         for killed in killed_nodes:
             # the delays of two processes add up: of the node and of the recorder
-            since = killed.alive - NOT_RETRANSMITTED - 2.0 * self.host_delay(killed.alive - MAX_AGE, killed.dead)
-            last.append([arrival.message for arrival, sender in received if sender == killed.instance and arrival.sent > since])
-            lines = [line for line in lines if line.message.name != killed.role or not since < line.sent <= killed.dead]
-        # A new recorder receives what the publishers still keep. On a busy host it may start later than that.
-        for killed in (node for node in self._killed if node.role == "recorder" and node.dead >= self.begin):
-            joined = min(seconds(record.log_time) for topic, record in logged(self.runs[-1]) if topic == "/internals")
+            since = (
+                killed.alive
+                - NOT_RETRANSMITTED
+                - 2.0 * self.host_delay(killed.alive - MAX_AGE, killed.dead)
+            )
+            last.append(
+                [
+                    arrival.message
+                    for arrival, sender in received
+                    if sender == killed.instance and arrival.sent > since
+                ]
+            )
+            lines = [
+                line
+                for line in lines
+                if line.message.name != killed.role or not since < line.sent <= killed.dead
+            ]
+        # A new recorder receives what the publishers still keep. On a busy host it may start later
+        # than that.
+        for killed in (
+            node for node in self._killed if node.role == "recorder" and node.dead >= self.begin
+        ):
+            joined = min(
+                seconds(record.log_time)
+                for topic, record in logged(self.runs[-1])
+                if topic == "/internals"
+            )
             kept = joined - seconds(HISTORY_NS) + self.host_delay(killed.alive, joined)
-            received = [(arrival, sender) for arrival, sender in received if not killed.alive - HISTORY < arrival.sent < kept]
+            received = [
+                (arrival, sender)
+                for arrival, sender in received
+                if not killed.alive - HISTORY < arrival.sent < kept
+            ]
         internals = {arrival.message for arrival, _ in received}
         logged_lines = {(line.message.name, line.message.msg) for line in lines}
         self.expected_logs[case] = ExpectedLog(internals.difference(*last), logged_lines, last)
@@ -539,22 +692,33 @@ class Flight:
     def diagnostics(self, role: str, begin: float) -> list[tuple[float, str, dict[str, str]]]:
         """The 1 Hz diagnostics of a node: when received, the instance, and the values by key."""
         return [
-            (arrival.at, arrival.message.header.frame_id, {value.key: value.value for value in status.values})
+            (
+                arrival.at,
+                arrival.message.header.frame_id,
+                {value.key: value.value for value in status.values},
+            )
             for arrival in self.probe.since("/diagnostics", begin)
             for status in arrival.message.status
             if status.name == f"/{role}"
         ]
 
     def count(self, role: str, key: str) -> float:
-        """The last value of a counter in the diagnostics of a role's present process, 0 where it has none."""
+        """The last value of a counter in the diagnostics of a role's present process, 0 where it
+        has none.
+        """
         instance = self.instance(role)
-        reports = [values for _, sender, values in self.diagnostics(role, 0.0) if sender == instance]
+        reports = [
+            values for _, sender, values in self.diagnostics(role, 0.0) if sender == instance
+        ]
         return float(reports[-1].get(key, 0.0)) if reports else 0.0
 
     def first_message(self, topic: str, begin: float, instance: str = "") -> float | None:
         """When the first message of a topic was received, of any publisher or of one instance."""
         sender = f"{instance}\0".encode() if instance else b""
-        return next((arrival.at for arrival in self.probe.since(topic, begin) if sender in arrival.message), None)
+        return next(
+            (arrival.at for arrival in self.probe.since(topic, begin) if sender in arrival.message),
+            None,
+        )
 
     def engaged_since(self, begin: float) -> float | None:
         """Since when the law has been engaged without a break until now; None where it is not."""
@@ -567,15 +731,23 @@ class Flight:
         return float(ticks.t[breaks.max() + 1] if len(breaks) else ticks.t[0])
 
     def is_steady(self) -> bool:
-        """Whether the law has been engaged and has tracked for 0.4 s, and the aircraft applies its u."""
+        """Whether the law has been engaged and has tracked for 0.4 s, and the aircraft applies its
+        u.
+        """
         now = time.time()
         ticks, (_, inputs) = self.ticks(now - 0.4), self.actuator_positions(now - 0.1)
-        tracks = len(ticks.t) >= 10 and (ticks.mode == Mode.ENGAGED).all() and (np.abs(ticks.e) <= TRACKING).all()
+        tracks = (
+            len(ticks.t) >= 10
+            and (ticks.mode == Mode.ENGAGED).all()
+            and (np.abs(ticks.e) <= TRACKING).all()
+        )
         if self.kind is Kind.BRIDGED:  # its aircraft publishes no truth
             return bool(tracks)
         if self.kind is Kind.GUIDED and not self.probe.since("u_m", now - 0.2):
             return False
-        return bool(tracks and len(inputs) and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any())
+        return bool(
+            tracks and len(inputs) and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any()
+        )
 
     def is_level(self) -> bool:
         """Whether a guided flight has had level wings for half a second."""
@@ -590,7 +762,9 @@ class Flight:
     def is_near_trim(self) -> bool:
         """Whether no input has been far from trim in the last half second."""
         begin = time.time() - 0.5
-        inputs = self.ticks(begin).u if self.kind is Kind.BRIDGED else self.actuator_positions(begin)[1]
+        inputs = (
+            self.ticks(begin).u if self.kind is Kind.BRIDGED else self.actuator_positions(begin)[1]
+        )
         return bool(len(inputs) and np.abs(inputs).max() <= 0.2)
 
     def until_steady(self, timeout: float = 60.0) -> None:
@@ -602,8 +776,11 @@ class Flight:
             ticks, delay = self.ticks(time.time() - 2.0), self.host_delay(begin, time.time())
             e = np.abs(ticks.e).max(axis=0, initial=0.0)
             ended = [
-                f"\n{role}: {process.output}" for role, process in self.processes.items() if process.popen.poll() is not None
+                f"\n{role}: {process.output}"
+                for role, process in self.processes.items()
+                if process.popen.poll() is not None
             ]
             raise AssertionError(
-                f"{error}: {ticks.modes}, e {e}, host scheduling delay up to {delay:.2f} s{''.join(ended)}"
+                f"{error}: {ticks.modes}, e {e}, host scheduling delay up to {delay:.2f} "
+                f"s{''.join(ended)}"
             ) from None

@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What disturbs a flight, as a process of its own: an unexpected publisher, a faulty relay, clients of a live page.
+"""What disturbs a flight, as a process of its own: an unexpected publisher, a faulty relay, clients
+of a live page.
 
-python -m tests.ros.flight_bringup.faults.foreign storm TOPIC RATE SECONDS SEED    # valid vectors of random values
-python -m tests.ros.flight_bringup.faults.foreign relay TOPIC  # the messages on standard input, one a line, in hex
-python -m tests.ros.flight_bringup.faults.foreign gate SOURCE TOPIC  # relays, with the fault that standard input names: FAULTS
+python -m tests.ros.flight_bringup.faults.foreign storm TOPIC RATE SECONDS SEED
+    # valid vectors of random values
+python -m tests.ros.flight_bringup.faults.foreign relay TOPIC
+    # the messages on standard input, one a line, in hex
+python -m tests.ros.flight_bringup.faults.foreign gate SOURCE TOPIC
+    # relays, with the fault that standard input names: FAULTS
 python -m tests.ros.flight_bringup.faults.foreign clients ADDRESS COUNT SECONDS
     # connections to a page, each asks for all samples
 """
@@ -32,11 +36,19 @@ from flight_ros.ticker import Ticker
 from flight_ros.topics import PROPOSAL, PUBLISH, TARGET, U_M, Y_M, Topic, U, Y
 
 OUTPUTS = ("q", "V", "p", "r")  # of `target` V alone is a channel: its storm is refused
-NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u_m": OUTPUTS, "target": OUTPUTS, "u": ("elevator", "aileron", "rudder", "thrust")}
+NAMES = {
+    "y": OUTPUTS,
+    "y_m": OUTPUTS,
+    "u_m": OUTPUTS,
+    "target": OUTPUTS,
+    "u": ("elevator", "aileron", "rudder", "thrust"),
+}
 NAMES["proposal"] = OUTPUTS  # no proposal but for its header, by which it is refused
 SUBSCRIBERS = dict.fromkeys(NAMES, 3) | {"target": 2, "proposal": 1}
-"""The node that uses the topic, the recorder, the probe. The probe publishes `target`; only the controller takes `proposal`."""
-BURST_NS = 1_000_000  # a thousand bursts a second: the sleep of Python cannot time single messages at 10 kHz
+"""The node that uses the topic, the recorder, the probe. The probe publishes `target`; only the
+controller takes `proposal`."""
+# a thousand bursts a second: the sleep of Python cannot time single messages at 10 kHz
+BURST_NS = 1_000_000
 REPORT_PERIOD = 10.0  # s, of the lines that report missing subscribers
 
 
@@ -55,8 +67,15 @@ def matched_publisher(topic: str) -> Iterator[Publisher]:
         time.sleep(0.005)
         if time.monotonic() > report:
             report += REPORT_PERIOD
-            known = sorted(subscription.node_name for subscription in node.get_subscriptions_info_by_topic(topic))
-            print(f"{publisher.get_subscription_count()} of {subscribers} subscribers matched, known: {known}", flush=True)
+            known = sorted(
+                subscription.node_name
+                for subscription in node.get_subscriptions_info_by_topic(topic)
+            )
+            print(
+                f"{publisher.get_subscription_count()} of {subscribers} subscribers matched, "
+                f"known: {known}",
+                flush=True,
+            )
     print(f"begins at {time.time():.6f}", flush=True)
     yield publisher
     node.destroy_node()
@@ -119,27 +138,36 @@ def gate(source: str, target: str) -> None:
                 if word == "freeze":
                     stamp_ns = decoder.decode(received.message).stamp_ns
                 else:
-                    channels = {name: value + JUMP.get(name, 0.0) for name, value in channels.items()}
-                publisher.publish(Encoder([*channels], sender).encode(stamp_ns, np.array([*channels.values()])))
+                    channels = {
+                        name: value + JUMP.get(name, 0.0) for name, value in channels.items()
+                    }
+                publisher.publish(
+                    Encoder([*channels], sender).encode(stamp_ns, np.array([*channels.values()]))
+                )
             elif word != "hold":
                 publisher.publish(last)
 
 
 def clients(address: str, count: int, duration: float) -> None:
-    """So many connections to a page, within `duration` s or longer, of which the server closes all beyond its limit.
+    """So many connections to a page, within `duration` s or longer, of which the server closes all
+    beyond its limit.
 
     Each sends its requests for all samples as fast as the server reads them, and reads no answer.
     """
     parts = urlsplit(address)
     token = parts.fragment.removeprefix("token=")
-    request = f"GET /data/0 HTTP/1.1\r\nHost: {parts.netloc}\r\nX-Page-Token: {token}\r\n\r\n".encode()
+    request = (
+        f"GET /data/0 HTTP/1.1\r\nHost: {parts.netloc}\r\nX-Page-Token: {token}\r\n\r\n".encode()
+    )
     print(f"begins at {time.time():.6f}", flush=True)
     until, sent, opened = time.monotonic() + duration, 0, 0
     connections: list[socket.socket] = []
     while opened < count or time.monotonic() < until:
         if opened < count:
             with suppress(OSError):  # the server accepts no more for the moment
-                connections.append(socket.create_connection((parts.hostname or "", parts.port or 0), timeout=0.1))
+                connections.append(
+                    socket.create_connection((parts.hostname or "", parts.port or 0), timeout=0.1)
+                )
                 connections[-1].setblocking(False)
                 opened += 1
         for place in reversed(range(len(connections))):

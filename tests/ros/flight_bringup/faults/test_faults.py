@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each fault is detected in time, has no other effect on u than the failsafe, and leaves no effect after recovery."""
+"""Each fault is detected in time, has no other effect on u than the failsafe, and leaves no effect
+after recovery.
+"""
 
 import math
 import time
@@ -26,19 +28,26 @@ from flight_core.modes import Mode
 pytestmark = pytest.mark.alone
 
 MOVES = 0.15
-"""rad, 1: how far the law moves u in a steady flight with late ticks, and while u settles. One sample of a conflicting
-publisher would move it twice as far: K e scale = 18 rad/s * 1 rad/s * 0.0178 rad s^2/rad = 0.3 rad."""
+"""rad, 1: how far the law moves u in a steady flight with late ticks, and while u settles. One
+sample of a conflicting publisher would move it twice as far: K e scale = 18 rad/s * 1 rad/s *
+0.0178 rad s^2/rad = 0.3 rad."""
 
 USUAL = 0.5
-"""rad/s, m/s. Outputs of the steady flight are below it. The samples of conflicting publishers spread over -1 to 1 in four
-channels."""
+"""rad/s, m/s. Outputs of the steady flight are below it. The samples of conflicting publishers
+spread over -1 to 1 in four channels."""
 
 QUIET = 0.02
-"""s. A longer host scheduling delay disturbs the flight also without a fault. Then only the checks are made that hold under any
-delay, and the delay is added to the time limits."""
+"""s. A longer host scheduling delay disturbs the flight also without a fault. Then only the checks
+are made that hold under any delay, and the delay is added to the time limits."""
 
 EXACT = 1e-12  # of values that are copied, or multiplied once
-CONTINUING = ("y", "y_m", "u", "truth", "internals")  # topics through a fault that does not concern u
+CONTINUING = (
+    "y",
+    "y_m",
+    "u",
+    "truth",
+    "internals",
+)  # topics through a fault that does not concern u
 SETTLING = 0.2  # s, until the effect of a fault on u shows
 
 
@@ -65,7 +74,9 @@ def test_fault_is_detected_contained_and_recovered_from(
 def test_random_faults_detected_contained_and_recovered_from(
     flights: Flights, draws: Sequence[Draw], record: Callable[[Row], None]
 ) -> None:
-    """Of two at a time: each is detected by the node that should, no process ends, and the flight is steady again."""
+    """Of two at a time: each is detected by the node that should, no process ends, and the flight
+    is steady again.
+    """
     failed = []
     for draw in draws:
         row: Row = {"case": draw.name, "seed": draw.seed}
@@ -91,7 +102,11 @@ def check_two(draw: Draw, views: Sequence[Flight]) -> None:
     """Check what holds of a fault whatever the other one does."""
     for case, view in zip(draw.cases, views, strict=True):
         if case.detection is not None:
-            view.until(lambda case=case, view=view: case.detection(view), case.within + 3.0, f"{case.name}: detected")  # type: ignore[misc]
+            view.until(
+                lambda case=case, view=view: case.detection(view),  # type: ignore[misc]
+                case.within + 3.0,
+                f"{case.name}: detected",
+            )
     flight = views[0]
     flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
     check_processes(flight)
@@ -99,10 +114,11 @@ def check_two(draw: Draw, views: Sequence[Flight]) -> None:
 
 
 def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> None:
-    """To the byte, also of a time without a recorder: publishers keep their last samples for the next one.
+    """To the byte, also of a time without a recorder: publishers keep their last samples for the
+    next one.
 
-    Of a killed node, the last messages within NOT_RETRANSMITTED may be missing from the log, because no process is left to
-    retransmit them. Those that are in the log are without a gap.
+    Of a killed node, the last messages within NOT_RETRANSMITTED may be missing from the log,
+    because no process is left to retransmit them. Those that are in the log are without a gap.
     """
     flights.close()
     for flight in flights.all:
@@ -128,7 +144,9 @@ def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
 
 
 class Window(NamedTuple):
-    """Instant of the re-engagement after a fault, host scheduling delay, and the time allowed for it, s."""
+    """Instant of the re-engagement after a fault, host scheduling delay, and the time allowed for
+    it, s.
+    """
 
     engaged: float
     host_delay: float
@@ -136,25 +154,37 @@ class Window(NamedTuple):
 
 
 def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
-    """Check all that the case states; time of the detection, of the recovery, and host scheduling delay, s."""
+    """Check all that the case states; time of the detection, of the recovery, and host scheduling
+    delay, s.
+    """
     reaction = None
     if case.detection is not None:
         detected = flight.until(lambda: case.detection(flight), case.within + 3.0, "detected")  # type: ignore[misc]
-        reaction = max(detected - flight.begin, 0.0)  # the message of the detection may overtake that of the fault
+        reaction = max(
+            detected - flight.begin, 0.0
+        )  # the message of the detection may overtake that of the fault
     engaged = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
     host_delay = flight.host_delay(flight.begin - 0.1, engaged + SETTLING)
-    slack = SLACK + case.host_delays * host_delay * (case.response is not Response.LATE)  # there the delay is the fault
+    slack = SLACK + case.host_delays * host_delay * (
+        case.response is not Response.LATE
+    )  # there the delay is the fault
     recovery = max(engaged - flight.end, 0.0)
     if reaction is not None:
         allowed = case.within + slack
         assert reaction <= allowed, f"detected after {reaction:.3f} s, allowed {allowed:.3f} s"
     # A node starts again, and catches up, in many shares of a busy processor: their delays add up.
     allowed = case.recovery + max(slack, SLACK + flight.waited(flight.end, engaged))
-    disturbed = case.response is Response.UNCHANGED and host_delay > QUIET  # by the host, during the fault or later
-    assert recovery <= allowed or disturbed, f"engaged {recovery:.3f} s after the fault, allowed {allowed:.3f} s"
+    disturbed = (
+        case.response is Response.UNCHANGED and host_delay > QUIET
+    )  # by the host, during the fault or later
+    assert recovery <= allowed or disturbed, (
+        f"engaged {recovery:.3f} s after the fault, allowed {allowed:.3f} s"
+    )
     for key in ("ready_to_traffic", "ready_to_caught_up"):
         duration = flight.measured.get(key, 0.0)
-        assert duration <= RESTART + slack, f"{key} {duration:.3f} s, allowed {RESTART + slack:.3f} s"
+        assert duration <= RESTART + slack, (
+            f"{key} {duration:.3f} s, allowed {RESTART + slack:.3f} s"
+        )
     CHECKS[case.response](case, flight, Window(engaged, host_delay, slack))
     check_processes(flight)
     flight.until_steady()
@@ -175,23 +205,33 @@ def engaged_for(duration: float, flight: Flight) -> float | None:
 
 
 def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
-    """The law and the aircraft used samples of the flight's own nodes only; no topic paused beyond its age limit."""
+    """The law and the aircraft used samples of the flight's own nodes only; no topic paused beyond
+    its age limit.
+    """
     until = flight.end + SETTLING
-    ticks, (_, applied) = flight.ticks(flight.begin, until), flight.actuator_positions(flight.begin, until)
+    ticks, (_, applied) = (
+        flight.ticks(flight.begin, until),
+        flight.actuator_positions(flight.begin, until),
+    )
     before = flight.ticks(flight.begin - 0.5, until)
     if Mode.TRIM not in ticks.modes:  # else the failsafe was over, and the publisher lock free
         assert not flight.foreign_y(flight.begin, until)
         assert np.abs(ticks.y_m).max() <= USUAL
-    starved = window.host_delay > MAX_AGE  # by a storm that uses up the processors: the failsafe may act
+    starved = (
+        window.host_delay > MAX_AGE
+    )  # by a storm that uses up the processors: the failsafe may act
     assert starved or np.abs(ticks.y).max() <= USUAL
-    if flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None:  # else the publisher lock of u was free
+    if (
+        flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None
+    ):  # else the publisher lock of u was free
         assert np.abs(applied).max() <= max(USUAL, np.abs(ticks.u).max())
     quiet = window.host_delay <= QUIET
     if quiet:  # else the failsafe of the aircraft may have moved u
         low, high = before.u.min(axis=0), before.u.max(axis=0)
         assert (applied >= low - MOVES / 10).all()
         assert (applied <= high + MOVES / 10).all()
-    # The probe subscribes with best effort: in a storm its socket drops samples that the flight's nodes receive again.
+    # The probe subscribes with best effort: in a storm its socket drops samples that the flight's
+    # nodes receive again.
     flooded = case.name.removeprefix("storm on ")
     topics = tuple(topic for topic in CONTINUING if topic != flooded)
     pauses = check_pauses(flight, topics, until, window, limited=not starved)
@@ -206,22 +246,35 @@ def check_pauses(
 ) -> dict[str, float]:
     """No topic paused for longer than its age limit, where it is `limited`; the pauses, s."""
     pauses = {topic: flight.pause(topic, flight.begin, end) for topic in topics}
-    limits = {topic: (U_MAX_AGE if topic == "u" else MAX_AGE) + 2.0 * window.host_delay for topic in topics}
-    assert not limited or all(pause <= limits[topic] for topic, pause in pauses.items()), (pauses, window)
+    limits = {
+        topic: (U_MAX_AGE if topic == "u" else MAX_AGE) + 2.0 * window.host_delay
+        for topic in topics
+    }
+    assert not limited or all(pause <= limits[topic] for topic, pause in pauses.items()), (
+        pauses,
+        window,
+    )
     flight.measured["longest_pause"] = max(pauses.values())
     return pauses
 
 
 def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0; then a bumpless re-engagement."""
+    """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0; then a bumpless
+    re-engagement.
+    """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
-    # the controller does not publish a new tick until y or y_m is stale: well within the aircraft's age limit of u
+    # the controller does not publish a new tick until y or y_m is stale: well within the aircraft's
+    # age limit of u
     topics = ("u", "y_m") if "aircraft" in case.name else ("u", "y", "truth")
     check_pauses(flight, topics, window.engaged, window)
     if window.host_delay > QUIET:
         assert {Mode.TRIM} <= set(ticks.modes) <= set(Mode) - {Mode.WAITING, Mode.INACTIVE}
         return
-    assert [mode for mode in ticks.modes if mode is not Mode.ENGAGED] == [Mode.HOLD, Mode.RAMP, Mode.TRIM], ticks.modes
+    assert [mode for mode in ticks.modes if mode is not Mode.ENGAGED] == [
+        Mode.HOLD,
+        Mode.RAMP,
+        Mode.TRIM,
+    ], ticks.modes
     mode, u = ticks.mode, ticks.u
     held, ramp = u[mode == Mode.HOLD], u[mode == Mode.RAMP]
     assert (held == held[0]).all()
@@ -238,7 +291,9 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
 
 
 def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim; the next u is applied bumpless."""
+    """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim; the next
+    u is applied bumpless.
+    """
     t, applied = flight.actuator_positions(flight.begin, window.engaged + SETTLING)
     before = flight.actuator_positions(flight.begin - 0.5, flight.begin + 0.05)[1][-1]
     assert np.abs(before).max() > 1e-4  # u = 0 would prove nothing
@@ -247,24 +302,41 @@ def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
         assert (applied == 0.0).all(axis=1).any()
         return
     scale, after = applied @ before / (before @ before), t - flight.begin
-    assert np.abs(scale[(after > 0.05) & (after < U_MAX_AGE + HOLD - 0.02)] - 1.0).max(initial=0.0) <= EXACT
+    assert (
+        np.abs(scale[(after > 0.05) & (after < U_MAX_AGE + HOLD - 0.02)] - 1.0).max(initial=0.0)
+        <= EXACT
+    )
     ramp = (after > U_MAX_AGE + HOLD) & (after < U_MAX_AGE + HOLD + RAMP)
-    assert np.abs(scale[ramp] - 1.0 + (after[ramp] - U_MAX_AGE - HOLD) / RAMP).max(initial=0.0) <= window.slack / RAMP
-    trim = (after > U_MAX_AGE + HOLD + RAMP + window.slack) & (t < min(flight.end, window.engaged) - 0.01)
+    assert (
+        np.abs(scale[ramp] - 1.0 + (after[ramp] - U_MAX_AGE - HOLD) / RAMP).max(initial=0.0)
+        <= window.slack / RAMP
+    )
+    trim = (after > U_MAX_AGE + HOLD + RAMP + window.slack) & (
+        t < min(flight.end, window.engaged) - 0.01
+    )
     assert trim.any()
     assert (applied[trim] == 0.0).all()
-    # Bumpless: the first u of the controller is that of the aircraft, and the aircraft applies u from the first ticks on. The
-    # ticks are those of the log, because the probe may discover a new controller later than the aircraft does.
-    ticks = flight.until(lambda: flight.engaged_ticks(flight.end, window.engaged + SETTLING), 5.0, "the new ticks in the log")
+    # Bumpless: the first u of the controller is that of the aircraft, and the aircraft applies u
+    # from the first ticks on. The ticks are those of the log, because the probe may discover a new
+    # controller later than the aircraft does.
+    ticks = flight.until(
+        lambda: flight.engaged_ticks(flight.end, window.engaged + SETTLING),
+        5.0,
+        "the new ticks in the log",
+    )
     assert (ticks.u[0] == 0.0).all()
     first = np.flatnonzero((t > flight.end) & (applied != 0.0).any(axis=1))[0]
     early = ticks.u[: math.ceil(3 + window.slack / TICK)]
     assert t[first] - ticks.t[0] <= 3 * TICK + window.slack
-    assert (np.abs(applied[first]) <= np.abs(early).max(axis=0) + EXACT).all(), "the applied u jumps"
+    assert (np.abs(applied[first]) <= np.abs(early).max(axis=0) + EXACT).all(), (
+        "the applied u jumps"
+    )
 
 
 def check_late(case: Case, flight: Flight, window: Window) -> None:
-    """The law is engaged, or u is held where samples came too late; u does not move more than in a steady flight."""
+    """The law is engaged, or u is held where samples came too late; u does not move more than in a
+    steady flight.
+    """
     ticks = flight.ticks(flight.begin, flight.end + SETTLING)
     assert set(ticks.modes) <= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
     assert np.abs(ticks.y).max() <= USUAL
@@ -272,7 +344,9 @@ def check_late(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_released(case: Case, flight: Flight, window: Window) -> None:
-    """While disengaged the controller is at trim and computes nothing; it begins at trim. y_m continues."""
+    """While disengaged the controller is at trim and computes nothing; it begins at trim. y_m
+    continues.
+    """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     disengaged = (ticks.t > flight.begin + case.within + window.slack) & (ticks.t < flight.end)
     assert not (ticks.mode[disengaged] == Mode.ENGAGED).any()
@@ -280,23 +354,31 @@ def check_released(case: Case, flight: Flight, window: Window) -> None:
     check_pauses(flight, ("y_m",), window.engaged, window)
 
 
-MAX_BANK, MAX_LEVEL_BANK = np.radians(45.0), np.radians(5.0)  # of the ending of u_m, at any time and after LEVEL
+MAX_BANK, MAX_LEVEL_BANK = (
+    np.radians(45.0),
+    np.radians(5.0),
+)  # of the ending of u_m, at any time and after LEVEL
 
 
 def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
     """The law flies on; the bank stays bounded, and the wings are level when they have to be.
 
-    The ending knows no bank but that by dead reckoning with y_m. While the host delays the controller or the aircraft, the
-    roll rate is not that of y_m; they differ by at most that of a roll-in to one side from that to the other.
+    The ending knows no bank but that by dead reckoning with y_m. While the host delays the
+    controller or the aircraft, the roll rate is not that of y_m; they differ by at most that of a
+    roll-in to one side from that to the other.
     """
     host_delay = flight.host_delay(flight.begin - 0.1, flight.begin + LEVEL)
     roll_rate = load_scenario(flight.scenario).reference_model.live.roll_rate
-    untracked = 2.0 * roll_rate * host_delay if host_delay > MAX_AGE else 0.0  # below it the law stays engaged
+    untracked = (
+        2.0 * roll_rate * host_delay if host_delay > MAX_AGE else 0.0
+    )  # below it the law stays engaged
     t, phi = flight.bank(flight.begin, flight.begin + LEVEL)
     flight.measured["bank_deg"] = float(np.degrees(np.abs(phi).max()))
     flight.measured["last_bank_deg"] = float(np.degrees(np.abs(phi[-1])))
     assert np.abs(phi).max() <= MAX_BANK
-    assert np.abs(phi[t >= flight.begin + LEVEL - 0.1]).max() <= MAX_LEVEL_BANK + untracked, f"host delay {host_delay:.3f} s"
+    assert np.abs(phi[t >= flight.begin + LEVEL - 0.1]).max() <= MAX_LEVEL_BANK + untracked, (
+        f"host delay {host_delay:.3f} s"
+    )
     check_flies_on(flight, window)
 
 

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults of lockstep flights: a killed node is named as the cause, and a stopped one changes no byte of the log.
+"""Random faults of lockstep flights: a killed node is named as the cause, and a stopped one changes
+no byte of the log.
 
 benchmarks/random_faults.py injects them; the tests of lockstep cover single cases.
 """
@@ -33,7 +34,9 @@ MODULES = {
 }
 DURATION = 10.0  # s of flight time
 FASTEST = 0.8  # s, in which no lockstep flight of this duration ends
-LONGEST_STOP = 0.4  # s; liveliness is never lost in a stop of 0.6 s, a third of its lease, and the rest is for a busy host
+# s; liveliness is never lost in a stop of 0.6 s, a third of its lease, and the rest is for a busy
+# host
+LONGEST_STOP = 0.4
 
 
 def test_random_faults_of_lockstep_flights(
@@ -44,12 +47,21 @@ def test_random_faults_of_lockstep_flights(
     failed = []
     for seed in lockstep_seeds:
         random = np.random.default_rng(seed)
-        role, kills, busy = random.choice(list(MODULES)), random.random() < 0.5, random.random() < 0.5
-        name = f"{role} {'killed' if kills else 'stopped'} in lockstep{' on a busy host' if busy else ''}"
+        role, kills, busy = (
+            random.choice(list(MODULES)),
+            random.random() < 0.5,
+            random.random() < 0.5,
+        )
+        name = (
+            f"{role} {'killed' if kills else 'stopped'} in "
+            f"lockstep{' on a busy host' if busy else ''}"
+        )
         row: Row = {"case": name, "seed": seed}
         try:
             with both_cores_busy() if busy else nullcontext():
-                fly_with_a_fault(start, scenario, f"runs{seed}", str(role), random, expected, kills=kills)
+                fly_with_a_fault(
+                    start, scenario, f"runs{seed}", str(role), random, expected, kills=kills
+                )
         except (AssertionError, pytest.fail.Exception) as error:
             failed.append(f"{name}, seed {seed}: {error}")
             record(row | {"passed": False, "error": described(error)})
@@ -59,12 +71,21 @@ def test_random_faults_of_lockstep_flights(
 
 
 def fly_with_a_fault(
-    start: Start, scenario: Path, runs: str, role: str, random: np.random.Generator, expected: Tape, *, kills: bool
+    start: Start,
+    scenario: Path,
+    runs: str,
+    role: str,
+    random: np.random.Generator,
+    expected: Tape,
+    *,
+    kills: bool,
 ) -> None:
     """A lockstep flight with a fault at a random instant."""
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}")
     folder = scenario.parent / runs
-    command.wait_for_log(folder, 200_000)  # bytes: the flight has begun, and a chunk of the log is complete
+    command.wait_for_log(
+        folder, 200_000
+    )  # bytes: the flight has begun, and a chunk of the log is complete
     time.sleep(random.uniform(0.0, FASTEST))  # the instant of the fault is anywhere in the flight
     victim = command.child(MODULES[role])
     if kills:
@@ -91,4 +112,6 @@ def stop(victim: psutil.Process, duration: float) -> None:
 
 
 def outcome(folder: Path) -> str:
-    return str(json.loads((folder / "latest" / "summary.json").read_text(encoding="utf-8"))["outcome"])
+    return str(
+        json.loads((folder / "latest" / "summary.json").read_text(encoding="utf-8"))["outcome"]
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of guidance: every step computed again from the logged inputs and the state of the sample before."""
+"""Replay of guidance: every step computed again from the logged inputs and the state of the sample
+before.
+"""
 
 from contextlib import suppress
 from typing import NamedTuple
@@ -40,7 +42,9 @@ def _waypoints(rows: FloatArray) -> list[Waypoint]:
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """The route of the section and the routes of the topic `route`, by digest, as `guidance` logs them."""
+    """The route of the section and the routes of the topic `route`, by digest, as `guidance` logs
+    them.
+    """
     lists = [list(parameters.waypoints())]
     if "route" in tape:
         received = tape["route"]
@@ -56,9 +60,10 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
-    Steps on a route outside the log are not checked, nor steps with the channels of a different version; a log may lack
-    `guidance.ADDED`; without `guidance.HEADING` the steps that hold a heading are not checked. Raises ParameterError for a log
-    without the scenario's section of guidance.
+    Steps on a route outside the log are not checked, nor steps with the channels of a different
+    version; a log may lack `guidance.ADDED`; without `guidance.HEADING` the steps that hold a
+    heading are not checked. Raises ParameterError for a log without the scenario's section of
+    guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -66,11 +71,22 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     t = tape.time("guidance")
     outputs = parameters.outputs
     names = signal.names
-    if tuple(name for name in guidance.names(outputs) if name in names or name not in guidance.ADDED) != names:
+    if (
+        tuple(
+            name for name in guidance.names(outputs) if name in names or name not in guidance.ADDED
+        )
+        != names
+    ):
         why = "a different version recorded their channels"
-        return GuidanceReplay(len(t), 0, 0, None, (f"{len(t)} steps of guidance not checked: {why}",))
+        return GuidanceReplay(
+            len(t), 0, 0, None, (f"{len(t)} steps of guidance not checked: {why}",)
+        )
     legs = {guidance.digest(None): None} | known_routes(tape, parameters)
-    published = {} if "u_m" not in tape else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
+    published = (
+        {}
+        if "u_m" not in tape
+        else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
+    )
     recorded_of = [name in names for name in guidance.names(outputs)]
     params = parameters.params()
     checked = 0
@@ -78,23 +94,34 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     first: Difference | None = None
     previous: GuidanceState | None = None
     for k, (stamp_ns, row) in enumerate(zip(signal.stamp_ns.tolist(), signal.values, strict=True)):
-        inputs, recorded = guidance.restored(stamp_ns, dict(zip(names, row.tolist(), strict=True)), outputs)
+        inputs, recorded = guidance.restored(
+            stamp_ns, dict(zip(names, row.tolist(), strict=True)), outputs
+        )
         flown = int(row[names.index("route")])
         without_heading = recorded.lateral is Lateral.HEADING and guidance.HEADING not in names
-        if flown in legs and not without_heading and (previous is not None or inputs.begin is Begin.HOLD):
+        if (
+            flown in legs
+            and not without_heading
+            and (previous is not None or inputs.begin is Begin.HOLD)
+        ):
             checked += 1
             link_age = row[names.index(LINK_AGE)] if LINK_AGE in names else 0.0
             state, commands = modes.step(previous, inputs, legs[flown], params)
             both = (
                 np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
-                np.append(guidance.row(inputs, state, commands, flown, link_age)[recorded_of], guidance.u_m(state)),
+                np.append(
+                    guidance.row(inputs, state, commands, flown, link_age)[recorded_of],
+                    guidance.u_m(state),
+                ),
             )
             columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
             if len(columns):
                 differing += 1
                 column = int(columns[0])
                 channel = (*names, *(f"published.{name}" for name in (*outputs, *ATTITUDE)))[column]
-                first = first or Difference(k + 1, float(t[k]), channel, float(both[0][column]), float(both[1][column]))
+                first = first or Difference(
+                    k + 1, float(t[k]), channel, float(both[0][column]), float(both[1][column])
+                )
         previous = recorded
     missing = len(t) - checked
     why = "the log does not hold their route, or the state before them"

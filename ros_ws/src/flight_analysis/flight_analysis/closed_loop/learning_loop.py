@@ -11,12 +11,21 @@ from flight_analysis.closed_loop.stations import ControllerStation, Topics
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.proposals import AUTHORITY_TICKS, Learning, Proposal, authority_names, designed, outputs_without
+from rise_di_controller.proposals import (
+    AUTHORITY_TICKS,
+    Learning,
+    Proposal,
+    authority_names,
+    designed,
+    outputs_without,
+)
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class LearnerResult(NamedTuple):
-    """Result of an identification in flight: parameters to fly with, or the reason why there are none."""
+    """Result of an identification in flight: parameters to fly with, or the reason why there are
+    none.
+    """
 
     controller: RiseDiConfig | None
     sentence: str
@@ -26,13 +35,15 @@ class Learner(Protocol):
     """What learns from a flight. Channels in the law's order."""
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its parameters."""
+        """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its
+        parameters.
+        """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """Parameters from the record so far.
 
-        `flown` is the digest of the parameters at its end, `given_up` the outputs that have no model to the end of the
-        engagement.
+        `flown` is the digest of the parameters at its end, `given_up` the outputs that have no
+        model to the end of the engagement.
         """
 
 
@@ -40,7 +51,8 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(NamedTuple):
-    """An entry of A or B: its nominal value in SI, its relative error, and the standard deviation of that after the flight.
+    """An entry of A or B: its nominal value in SI, its relative error, and the standard deviation
+    of that after the flight.
 
     Where the nominal value is 0 both are in parts of another `unit`.
     """
@@ -65,7 +77,9 @@ class Entry(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Channels of the topic `learned`: `proposed`, and value and deviation of entries of A and B in the rows of the outputs."""
+    """Channels of the topic `learned`: `proposed`, and value and deviation of entries of A and B in
+    the rows of the outputs.
+    """
 
     names: tuple[str, ...]
     values: FloatArray
@@ -75,7 +89,9 @@ def learned(entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: boo
     """What an identification found, and whether it became a proposal."""
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {f"value.{entry.name}": entry.value for entry in output_entries}
-    channels |= {f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in output_entries}
+    channels |= {
+        f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in output_entries
+    }
     return Learned(("proposed", *channels), np.array([float(proposed), *channels.values()]))
 
 
@@ -95,12 +111,20 @@ class Identifications:
             return None
         self._last = identification
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
-        self._names = self._names or tuple(entries)  # a topic keeps its channels: those of the rough airframe
-        return learned((entries[name] for name in self._names), self._outputs, proposed=proposal.controller is not None)
+        self._names = self._names or tuple(
+            entries
+        )  # a topic keeps its channels: those of the rough airframe
+        return learned(
+            (entries[name] for name in self._names),
+            self._outputs,
+            proposed=proposal.controller is not None,
+        )
 
 
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
-    """A proposal as the controller receives it: with the end of its window, and the digest of what flew then."""
+    """A proposal as the controller receives it: with the end of its window, and the digest of what
+    flew then.
+    """
     change = {} if proposal.controller is None else designed(start, proposal.controller)
     return Proposal(end_ns, start.digest(), flown, change, proposal.sentence)
 
@@ -119,13 +143,19 @@ class ProposalStation:
         """See Station."""
         self._learning.step(self._controller, t_ns)
         if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
-            self._topics.publish("authority", StampedVector(t_ns, self._learning.authority(self._controller)), t_ns)
+            self._topics.publish(
+                "authority", StampedVector(t_ns, self._learning.authority(self._controller)), t_ns
+            )
 
 
 class LearnerStation:
-    """The learner: records of the ticks of the controller, and a proposal where an identification is due."""
+    """The learner: records of the ticks of the controller, and a proposal where an identification
+    is due.
+    """
 
-    def __init__(self, station: ControllerStation, learning: Learning, learner: Learner, topics: Topics) -> None:
+    def __init__(
+        self, station: ControllerStation, learning: Learning, learner: Learner, topics: Topics
+    ) -> None:
         self._station = station
         self._learning = learning
         self._learner = learner
@@ -144,7 +174,9 @@ class LearnerStation:
         if not self._learning.ticked(controller, t_ns):
             return
         proposal = self._learner.propose(controller.digest, outputs_without(controller.parameters))
-        self._learning.receive(as_received(proposal, self._learning.start, t_ns, controller.digest), controller, t_ns)
+        self._learning.receive(
+            as_received(proposal, self._learning.start, t_ns, controller.digest), controller, t_ns
+        )
         if (identified := self._identifications.next(proposal)) is not None:
             self._topics.advertise("learned", identified.names)
             self._topics.publish("learned", StampedVector(t_ns, identified.values), t_ns)

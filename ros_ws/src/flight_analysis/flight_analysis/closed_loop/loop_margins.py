@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the linear loop of a scenario under the law of its controller, on the nominal and on uncertain aircraft."""
+"""Margins of the linear loop of a scenario under the law of its controller, on the nominal and on
+uncertain aircraft.
+"""
 
 from typing import Any, NamedTuple
 
@@ -51,27 +53,35 @@ class LoopMargins(NamedTuple):
     modes: SlowModes  # of the nominal aircraft
     delay: float  # s, delay margin of the nominal aircraft, u late in all inputs
     channel_delay: tuple[float, ...]  # s, u late in one input alone
-    worst: Margins | None = None  # of the uncertain aircraft, each figure by itself; None without any
+    worst: Margins | None = (
+        None  # of the uncertain aircraft, each figure by itself; None without any
+    )
     worst_delay: float | None = None  # s
     aircraft: int = 0  # number of uncertain aircraft
     stable: int = 0  # number of those that are stable
 
 
 def margins(
-    scenario: Scenario, aircraft: int = 0, uncertainty: float = 0.3, seed: int = 1, spread: Spread = UNIFORM
+    scenario: Scenario,
+    aircraft: int = 0,
+    uncertainty: float = 0.3,
+    seed: int = 1,
+    spread: Spread = UNIFORM,
 ) -> LoopMargins:
     """Margins of a scenario's loop: of the nominal aircraft, and the worst of uncertain aircraft.
 
-    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread` says, the rows of angles
-    excepted. The controller
-    gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError for the literal sign, and
-    for an aircraft of JSBSim under a controller without a model.
+    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread`
+    says, the rows of angles excepted. The controller
+    gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError
+    for the literal sign, and for an aircraft of JSBSim under a controller without a model.
     """
     flown = as_scenario(scenario)
     count = as_count(aircraft, "aircraft", 0)
     numbered = as_count(seed, "seed", 0)
     deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
-    return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
+    return loop_assessment(
+        scenario_loop(flown, flown.controller, count, deviation, numbered, spread)
+    )
 
 
 def loop_assessment(linear: LinearLoop) -> LoopMargins:
@@ -80,24 +90,39 @@ def loop_assessment(linear: LinearLoop) -> LoopMargins:
     nominal = Margins._make(value[0] for value in together)
     uncertain = Margins._make(value[1:] for value in together)
     delay = delay_margin(linear.nominal, linear.law, linear.loop)
-    each = tuple(delay_margin(linear.nominal, linear.law, linear.loop, channel) for channel in range(len(linear.inputs)))
-    result = LoopMargins(linear.inputs, nominal, slow_modes(linear.nominal, linear.law, linear.loop), delay, each)
+    each = tuple(
+        delay_margin(linear.nominal, linear.law, linear.loop, channel)
+        for channel in range(len(linear.inputs))
+    )
+    result = LoopMargins(
+        linear.inputs, nominal, slow_modes(linear.nominal, linear.law, linear.loop), delay, each
+    )
     count = len(linear.plant.A) - 1
     if not count:
         return result
     stable = int(uncertain.stable.sum())
-    return result._replace(worst=uncertain.worst(), worst_delay=_least_delay(linear, delay), aircraft=count, stable=stable)
+    return result._replace(
+        worst=uncertain.worst(),
+        worst_delay=_least_delay(linear, delay),
+        aircraft=count,
+        stable=stable,
+    )
 
 
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
     """The smallest delay margin of the uncertain aircraft, at most the nominal delay margin, s.
 
-    The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer nominal margin.
+    The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer
+    nominal margin.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
     uncertain = LinearPlant(linear.plant.A[1:], linear.plant.B[1:], linear.plant.C)
-    for delay in np.append(np.arange(0.0, longest, max(linear.loop.period / 2.0, longest / 12.0)), longest):
-        matrices = closed_loop(uncertain, linear.law, linear.loop, np.full(len(linear.inputs), delay))
+    for delay in np.append(
+        np.arange(0.0, longest, max(linear.loop.period / 2.0, longest / 12.0)), longest
+    ):
+        matrices = closed_loop(
+            uncertain, linear.law, linear.loop, np.full(len(linear.inputs), delay)
+        )
         radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
         unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
         if len(unstable):
@@ -114,34 +139,51 @@ def scenario_loop(
     seed: int = 1,
     spread: Spread = UNIFORM,
 ) -> LinearLoop:
-    """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as `margins`."""
+    """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as
+    `margins`.
+    """
     airframe = _model(scenario, controller)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
-    if controller.allocation is not None and not scenario.aircraft.is_jsbsim:  # B of each effector is drawn
+    if (
+        controller.allocation is not None and not scenario.aircraft.is_jsbsim
+    ):  # B of each effector is drawn
         B = B @ _distribution(airframe, controller.allocation)
         airframe = through_allocation(airframe, controller)
     return linear_loop(controller, airframe, A, B)
 
 
-def linear_loop(controller: ControllerConfig, airframe: Airframe, A: FloatArray, B: FloatArray) -> LinearLoop:
-    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m) with the states and channels of an airframe.
+def linear_loop(
+    controller: ControllerConfig, airframe: Airframe, A: FloatArray, B: FloatArray
+) -> LinearLoop:
+    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m) with the states and
+    channels of an airframe.
 
     Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller)
-    if not set(controller.vanes) <= set(airframe.states):  # y_dot = Omega u has no angles: the observer of y alone
+    if not set(controller.vanes) <= set(
+        airframe.states
+    ):  # y_dot = Omega u has no angles: the observer of y alone
         controller = controller.without_vanes()
     states = np.array(list(airframe.states))
     vane_rows = [(states == name).astype(np.float64) for name in controller.vanes]
     C = np.vstack([airframe.matrix_c()[rows], *vane_rows])
     plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
     model = f"model: {airframe.name}"
-    return LinearLoop(model, controller.inputs, plant, linear_law(controller.tuned_law(), len(rows), loop.period), loop)
+    return LinearLoop(
+        model,
+        controller.inputs,
+        plant,
+        linear_law(controller.tuned_law(), len(rows), loop.period),
+        loop,
+    )
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
-    """The airframe that the law of a controller sees: with its inputs v, u = T v; without an allocation as it is."""
+    """The airframe that the law of a controller sees: with its inputs v, u = T v; without an
+    allocation as it is.
+    """
     if (allocation := controller.allocation) is None:
         return airframe
     return airframe.through(_distribution(airframe, allocation), controller.inputs)
@@ -154,14 +196,19 @@ def _distribution(airframe: Airframe, allocation: AllocationConfig) -> FloatArra
 
 
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
-    """Delay margin of the nominal linear loop, s: u late in every channel, in a single channel by output; the least allowed.
+    """Delay margin of the nominal linear loop, s: u late in every channel, in a single channel by
+    output; the least allowed.
 
-    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable with its own lag.
+    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is
+    unstable with its own lag.
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
     loop = scenario_loop(scenario, controller)
-    each = {name: delay_margin(loop.nominal, loop.law, loop.loop, channel) for channel, name in enumerate(controller.outputs)}
+    each = {
+        name: delay_margin(loop.nominal, loop.law, loop.loop, channel)
+        for channel, name in enumerate(controller.outputs)
+    }
     return {
         "delay_margin": delay_margin(loop.nominal, loop.law, loop.loop),
         "channels": each,
@@ -186,14 +233,18 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 
 
 def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
-    """The airframe of a scenario, or y_dot = Omega u of the inputs of the law from the controller of an aircraft of JSBSim.
+    """The airframe of a scenario, or y_dot = Omega u of the inputs of the law from the controller
+    of an aircraft of JSBSim.
 
-    Omega comes from the feedforward, or from abs(Omega_ii) = omega / input_scale of RISE-DI, an upper bound.
+    Omega comes from the feedforward, or from abs(Omega_ii) = omega / input_scale of RISE-DI, an
+    upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
         return load_airframe(aircraft.airframe)
-    if controller.feedforward is not None and set(controller.feedforward.states) == set(controller.outputs):
+    if controller.feedforward is not None and set(controller.feedforward.states) == set(
+        controller.outputs
+    ):
         names = controller.feedforward.states
         A = np.reshape(controller.feedforward.A, (len(names), -1))
         B = np.reshape(controller.feedforward.B, (len(names), -1))
@@ -203,10 +254,15 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
         B = np.diag(np.array(controller.D) * controller.omega / controller.input_scale)
     else:
         expected = "a controller with a feedforward, or RISE-DI with its omega"
-        raise ParameterError(f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}")
+        raise ParameterError(
+            f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}"
+        )
     channels = aircraft.channels()
     inputs = {
-        name: {"unit": channels.inputs.get(name, "1"), "positive": channels.positive.get(name, f"more {name}")}
+        name: {
+            "unit": channels.inputs.get(name, "1"),
+            "positive": channels.positive.get(name, f"more {name}"),
+        }
         for name in controller.inputs
     }
     values = {
@@ -216,5 +272,10 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
         "inputs": inputs,
     }
     states = {name: channels.outputs[name] for name in names}
-    matrices = {"states": states, "outputs": list(controller.outputs), "A": A.tolist(), "B": B.tolist()}
+    matrices = {
+        "states": states,
+        "outputs": list(controller.outputs),
+        "A": A.tolist(),
+        "B": B.tolist(),
+    }
     return Airframe.validate_mapping(values | matrices, f"model of {aircraft.airframe}")

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a recorded flight: every tick of the controller computed again from the logged inputs and compared bit by bit."""
+"""Replay of a recorded flight: every tick of the controller computed again from the logged inputs
+and compared bit by bit.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -31,10 +33,15 @@ from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
 
-U_PREFIXES = ("u.", "published.")  # prefixes of the channels of u, from `internals` and from the topic `u`
+U_PREFIXES = (
+    "u.",
+    "published.",
+)  # prefixes of the channels of u, from `internals` and from the topic `u`
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
-Change = Mapping[str, Any]  # parameters of the controller by dotted name that were changed in flight at one instant
+Change = Mapping[
+    str, Any
+]  # parameters of the controller by dotted name that were changed in flight at one instant
 
 
 class Difference(NamedTuple):
@@ -55,7 +62,9 @@ class Difference(NamedTuple):
 
 
 class ReplayResult(NamedTuple):
-    """The N ticks of a log as recorded and as computed, in k channels: the channels of `internals`, then of the topic u."""
+    """The N ticks of a log as recorded and as computed, in k channels: the channels of `internals`,
+    then of the topic u.
+    """
 
     names: tuple[str, ...]
     number: NDArray[np.int64]  # (N,), the channel "number"
@@ -63,9 +72,13 @@ class ReplayResult(NamedTuple):
     recorded: FloatArray  # (N, k)
     computed: FloatArray  # (N, k), NaN where nothing was computed
     checked: NDArray[np.bool_]  # (N,), whether the state before the tick is known
-    other_parameters: NDArray[np.bool_]  # (N,), whether the recorded controller had other parameters
+    other_parameters: NDArray[
+        np.bool_
+    ]  # (N,), whether the recorded controller had other parameters
     notes: tuple[str, ...]
-    published: NDArray[np.bool_] | None = None  # (N,), whether y and u of the tick are on their topics
+    published: NDArray[np.bool_] | None = (
+        None  # (N,), whether y and u of the tick are on their topics
+    )
 
     @property
     def compared(self) -> NDArray[np.bool_]:
@@ -74,7 +87,9 @@ class ReplayResult(NamedTuple):
 
     def different(self) -> NDArray[np.bool_]:
         """Mask of the values with a different bit, shape (N, k)."""
-        different: NDArray[np.bool_] = self.checked[:, None] & (_bits(self.recorded) != _bits(self.computed))
+        different: NDArray[np.bool_] = self.checked[:, None] & (
+            _bits(self.recorded) != _bits(self.computed)
+        )
         return different
 
     def equal(self) -> bool:
@@ -82,30 +97,43 @@ class ReplayResult(NamedTuple):
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> Difference | None:
-        """The first difference in the first different tick, in a channel of u if possible; None without a difference."""
+        """The first difference in the first different tick, in a channel of u if possible; None
+        without a difference.
+        """
         different = self.different()
         rows = np.flatnonzero(different.any(axis=1))
         if len(rows) == 0:
             return None
         row = int(rows[0])
-        column = min(np.flatnonzero(different[row]).tolist(), key=lambda k: not self.names[k].startswith(U_PREFIXES))
+        column = min(
+            np.flatnonzero(different[row]).tolist(),
+            key=lambda k: not self.names[k].startswith(U_PREFIXES),
+        )
         recorded = float(self.recorded[row, column])
         computed = float(self.computed[row, column])
-        return Difference(int(self.number[row]), float(self.t[row]), self.names[column], recorded, computed)
+        return Difference(
+            int(self.number[row]), float(self.t[row]), self.names[column], recorded, computed
+        )
 
     def group(self, values: FloatArray, prefix: str) -> Signal:
         """The channels "prefix.name" of `recorded` or `computed`, with flight time as stamps."""
-        return Signal(np.round(self.t * NANOSECONDS).astype(np.int64), self.names, values).group(prefix)
+        return Signal(np.round(self.t * NANOSECONDS).astype(np.int64), self.names, values).group(
+            prefix
+        )
 
 
 def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
-    """The controller's section of the scenario in a log; further sections are not validated. Raises ParameterError."""
+    """The controller's section of the scenario in a log; further sections are not validated. Raises
+    ParameterError.
+    """
     sections = parse_scenario_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
-    """The scenario of a run, by the run as read, by its folder, or by its scenario as stored. Raises ParameterError."""
+    """The scenario of a run, by the run as read, by its folder, or by its scenario as stored.
+    Raises ParameterError.
+    """
     stored = run if isinstance(run, StoredFile) else _as_run(run).scenario_file()
     return parse_scenario(stored.content, Path(stored.name))
 
@@ -115,7 +143,9 @@ def _as_run(run: RecordedRun | FilePath) -> RecordedRun:
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Parameters with changes by dotted name, validated; None removes a parameter. Raises ParameterError."""
+    """Parameters with changes by dotted name, validated; None removes a parameter. Raises
+    ParameterError.
+    """
     return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
 
@@ -127,28 +157,36 @@ def replay(
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
 
-    `run` is the folder of a run, a run as read, or a tape. `parameters` are the parameters of the recorded controller, by
-    default from the log, or from the scenario of a simulated tape.
+    `run` is the folder of a run, a run as read, or a tape. `parameters` are the parameters of the
+    recorded controller, by default from the log, or from the scenario of a simulated tape.
 
-    A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the activity of the controller come
-    from `internals`. The results are dt, mode, e, the integrals, Pi and u.
+    A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the
+    activity of the controller come from `internals`. The results are dt, mode, e, the integrals, Pi
+    and u.
 
-    The state comes from the computation of the previous tick, after a different tick from the log, so a tick is judged alone.
-    After a gap the state is the logged state of the first engaged tick. The ticks up to the first engaged tick are not checked,
-    nor is u_ff until the next engagement.
+    The state comes from the computation of the previous tick, after a different tick from the log,
+    so a tick is judged alone. After a gap the state is the logged state of the first engaged tick.
+    The ticks up to the first engaged tick are not checked, nor is u_ff until the next engagement.
 
-    `others` computes an open loop: the same inputs with these parameters, and the computed state throughout. Where the log does
-    not begin with the flight, the law engages in the first tick, at the recorded u.
+    `others` computes an open loop: the same inputs with these parameters, and the computed state
+    throughout. Where the log does not begin with the flight, the law engages in the first tick, at
+    the recorded u.
 
-    `changes` are parameter changes in flight, in order, by default from the log, none beside `others`. A tick applies the
-    changes up to the parameters of the channel "parameters". Raises ParameterError for `internals` of different channels or
-    of a version with fewer channels, for invalid changes, and for a log whose provenance names another arithmetic.
+    `changes` are parameter changes in flight, in order, by default from the log, none beside
+    `others`. A tick applies the changes up to the parameters of the channel "parameters". Raises
+    ParameterError for `internals` of different channels or of a version with fewer channels, for
+    invalid changes, and for a log whose provenance names another arithmetic.
     """
     if isinstance(run, Tape):
         return _replay(run, parameters, others, changes)
     read = _as_run(run)
     recorded = recorded_arithmetic(read.metadata)
-    require(recorded == ARITHMETIC, "arithmetic", recorded, f"{ARITHMETIC}: a later version recorded the log")
+    require(
+        recorded == ARITHMETIC,
+        "arithmetic",
+        recorded,
+        f"{ARITHMETIC}: a later version recorded the log",
+    )
     return _replay(read, parameters, others, changes)
 
 
@@ -162,14 +200,26 @@ def _replay(
         others = as_controller(others, "others")
         changes = changes or ()
     elif changes is not None:
-        listed = isinstance(changes, Sequence) and all(isinstance(change, Mapping) for change in changes)
-        require(listed, "changes", short_repr(changes), "a list of changes, each a mapping of dotted names")
+        listed = isinstance(changes, Sequence) and all(
+            isinstance(change, Mapping) for change in changes
+        )
+        require(
+            listed,
+            "changes",
+            short_repr(changes),
+            "a list of changes, each a mapping of dotted names",
+        )
     tape, parameters, changes = _recorded(run, parameters, changes)
     ticks = _Ticks(tape, parameters)
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
         wanted = getattr(parameters, names)
         declared = getattr(others or parameters, names)
-        require(declared == wanted, f"controller.{key}", ", ".join(declared), f"{', '.join(wanted)}, as recorded")
+        require(
+            declared == wanted,
+            f"controller.{key}",
+            ", ".join(declared),
+            f"{', '.join(wanted)}, as recorded",
+        )
     in_force = _ParametersInForce(others or parameters, changes)
     computed = np.full_like(ticks.values, np.nan)
     checked = np.zeros(len(ticks.number), dtype=bool)
@@ -193,31 +243,64 @@ def _replay(
         checked[k] = True
         if others is None and computed[k].tobytes() != ticks.values[k].tobytes():
             state = ticks.state(k, in_force.limits, in_force.law, state)
-    notes = (() if others is None else (OPEN_LOOP,)) + tuple(in_force.notes) + tuple(_coverage_notes(ticks, checked))
-    # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the topic is not compared.
+    notes = (
+        (() if others is None else (OPEN_LOOP,))
+        + tuple(in_force.notes)
+        + tuple(_coverage_notes(ticks, checked))
+    )
+    # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the
+    # topic is not compared.
     missing = np.flatnonzero(~ticks.u_found)
     computed[missing, -ticks.p :] = ticks.values[missing, -ticks.p :]
     published = ticks.u_found & (ticks.y_found | ~ticks.flies)
-    return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes, published)
+    return ReplayResult(
+        ticks.names,
+        ticks.number,
+        ticks.t,
+        ticks.values,
+        computed,
+        checked,
+        other_parameters,
+        notes,
+        published,
+    )
 
 
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """The tape of a run, with the parameters and the changes of the run where none are given. Raises ParameterError."""
+    """The tape of a run, with the parameters and the changes of the run where none are given.
+    Raises ParameterError.
+    """
     if isinstance(run, Tape):
         scenario = run.scenario
-        controller = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
-        return run, as_controller(controller, "parameters"), run.changes if changes is None else changes
-    controller = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
+        controller = (
+            scenario.controller
+            if parameters is None and isinstance(scenario, Scenario)
+            else parameters
+        )
+        return (
+            run,
+            as_controller(controller, "parameters"),
+            run.changes if changes is None else changes,
+        )
+    controller = (
+        recorded_parameters(run.scenario_file())
+        if parameters is None
+        else as_controller(parameters, "parameters")
+    )
     return run.tape, controller, recorded_changes(run, controller) if changes is None else changes
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
-    """The changes in flight of the parameters of the recorded controller, in order; those of the tape without a log."""
+    """The changes in flight of the parameters of the recorded controller, in order; those of the
+    tape without a log.
+    """
     if run.path is None:
         return run.tape.changes
-    known = {name: field for name, field in type(parameters).model_fields.items() if name not in OF_NODE}
+    known = {
+        name: field for name, field in type(parameters).model_fields.items() if name not in OF_NODE
+    }
     return parameter_changes(run.path, f"{run.namespace}/controller", known)
 
 
@@ -241,8 +324,12 @@ class _ParametersInForce:
         self.law = parameters.tuned_law()
         self.limits = parameters.guard()
 
-    def change(self, digest: int, number: int, state: ControllerState | None) -> ControllerState | None:
-        """Apply the changes up to the parameters with a digest, if any. Returns the state afterwards."""
+    def change(
+        self, digest: int, number: int, state: ControllerState | None
+    ) -> ControllerState | None:
+        """Apply the changes up to the parameters with a digest, if any. Returns the state
+        afterwards.
+        """
         if digest == self.digest or digest in self._unmatched:
             return state
         steps = [self._parameters]
@@ -275,28 +362,46 @@ class _Ticks:
     """`internals` of a log in order of the controller's ticks, and the inputs of the ticks."""
 
     def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
-        require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
+        require(
+            "internals" in tape,
+            "the log",
+            "no sample of internals",
+            "a flight with a controller that engaged",
+        )
         signal = tape["internals"]
         groups = parameters.logged_groups()
         names = internals.names(groups)
         missing = [f"no {name}" for name in names if name not in signal.names]
-        differences = ", ".join(missing + [f"also {name}" for name in signal.names if name not in names])
+        differences = ", ".join(
+            missing + [f"also {name}" for name in signal.names if name not in names]
+        )
         require(
-            not differences, "internals", differences, "the channels of the scenario in the log, as this version records them"
+            not differences,
+            "internals",
+            differences,
+            "the channels of the scenario in the log, as this version records them",
         )
         values = np.column_stack([signal[name] for name in names])
         valid = np.isfinite(values).all() and np.isin(signal["mode"], list(Mode)).all()
-        require(bool(valid), "internals", "a value that is not finite, or an unknown mode", "what a controller publishes")
+        require(
+            bool(valid),
+            "internals",
+            "a value that is not finite, or an unknown mode",
+            "what a controller publishes",
+        )
         self.m = len(parameters.inputs)
         self.p = len(parameters.effectors)
         self._allocation = parameters.guard().allocation
-        # Sort by the instants of the ticks. Stamps may decrease: a late y is older than a failsafe tick before it.
+        # Sort by the instants of the ticks. Stamps may decrease: a late y is older than a failsafe
+        # tick before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order = np.argsort(now_ns, kind="stable")
         number = signal["number"]
         self.starts = controller_starts(number[order])
         # Ticks of one controller are in the order of their numbers, whichever was stored first.
-        order = np.concatenate([part[np.argsort(number[part], kind="stable")] for part in np.split(order, self.starts)])
+        order = np.concatenate(
+            [part[np.argsort(number[part], kind="stable")] for part in np.split(order, self.starts)]
+        )
         self.stamp_ns = signal.stamp_ns[order]
         self.now_ns = now_ns[order]
         self.t = tape.time("internals")[order]
@@ -327,8 +432,12 @@ class _Ticks:
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
-    def state(self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None) -> ControllerState:
-        """The recorded state after a tick. Values outside the log come from the computed state, if any."""
+    def state(
+        self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None
+    ) -> ControllerState:
+        """The recorded state after a tick. Values outside the log come from the computed state, if
+        any.
+        """
         row = {name: values[k] for name, values in self._groups.items()}
         law_state = restored(law.control_law, row)
         mode = Mode(int(self._signal["mode"][k]))
@@ -336,17 +445,35 @@ class _Ticks:
         y_m = row["y_m"]
         effectors = row.get(internals.EFFECTOR)
         if computed is not None and not self.flies[k]:
-            return computed._replace(mode=mode, law=law_state, u=u, u_free=row["u_free"], effectors=effectors)
+            return computed._replace(
+                mode=mode, law=law_state, u=u, u_free=row["u_free"], effectors=effectors
+            )
         feedforward_state = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
-        logged = ControllerState(mode, law_state, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
+        logged = ControllerState(
+            mode,
+            law_state,
+            y,
+            y_m,
+            u,
+            row["u_free"],
+            row["u_trim"],
+            0,
+            u,
+            row["u_ff"],
+            feedforward_state,
+        )
         vanes = Vanes(row["vane"], row["vane_m"]) if limits.vanes else None
         return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)
 
-    def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
-        """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without output."""
+    def tick(
+        self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
+    ) -> tuple[ControllerState, FloatArray]:
+        """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without
+        output.
+        """
         stamp_ns = int(self.stamp_ns[k])
         y = None
         y_m = []
@@ -357,16 +484,25 @@ class _Ticks:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
             state = self.begin(state)  # the controller was configured again before this tick
-        # After a gap the log has the feedforward's output but not its state: only the law is computed.
-        only_law = limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
+        # After a gap the log has the feedforward's output but not its state: only the law is
+        # computed.
+        only_law = (
+            limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
+        )
         u_ff = self._groups["u_ff"][k] if only_law else None
         vane_m = self._groups["vane_m"][k] if only_law and limits.vanes else None
-        after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff, vane_m)
+        after, used = guard.tick(
+            state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff, vane_m
+        )
         if used is None:
             return after, np.full(len(self.names), np.nan)
         late = float(self._signal["late"][k])
         age = float(self._signal["age"][k])
-        given_up = self._groups[internals.GIVEN_UP][k] if internals.GIVEN_UP in self._groups else np.zeros(0)
+        given_up = (
+            self._groups[internals.GIVEN_UP][k]
+            if internals.GIVEN_UP in self._groups
+            else np.zeros(0)
+        )
         row = internals.values(after, used, limits, late, age, 0, 0, given_up)
         row[self._copied] = self.values[k, self._copied]
         return after, np.concatenate([row, after.command])
@@ -375,7 +511,9 @@ class _Ticks:
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Samples of a topic at these stamps, shape (N, m), else the values `otherwise`; and the mask of stamps with a sample."""
+    """Samples of a topic at these stamps, shape (N, m), else the values `otherwise`; and the mask
+    of stamps with a sample.
+    """
     matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):
         return otherwise, matched
@@ -385,9 +523,13 @@ def _as_published(
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)
     for k, stamp in enumerate(stamp_ns.tolist()):
-        candidates = rows.get(stamp, [])  # two if a failsafe u has the stamp of a y that arrived later
+        candidates = rows.get(
+            stamp, []
+        )  # two if a failsafe u has the stamp of a y that arrived later
         matched[k] = bool(candidates)
-        if candidates and not any(published[row].tobytes() == values[k].tobytes() for row in candidates):
+        if candidates and not any(
+            published[row].tobytes() == values[k].tobytes() for row in candidates
+        ):
             values[k] = published[candidates[0]]
     return values, matched
 
@@ -404,7 +546,10 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
     if len(gaps):
         more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
         missing = (steps[gaps] - 1).sum()
-        yield f"{missing} samples of internals are missing: a gap before t = {ticks.t[gaps[0] + 1]:.2f} s{more}"
+        yield (
+            f"{missing} samples of internals are missing: a gap before t = "
+            f"{ticks.t[gaps[0] + 1]:.2f} s{more}"
+        )
     if unchecked := int((~checked).sum()):
         yield f"{unchecked} ticks not checked: the log does not hold the state before them"
     if unmatched := int((ticks.flies & ~ticks.y_found).sum()):
@@ -414,7 +559,9 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """The name of the last controller to begin before an instant, after a comma; empty where the log has no name."""
+    """The name of the last controller to begin before an instant, after a comma; empty where the
+    log has no name.
+    """
     known = [
         (process.first_ns, name)
         for name, process in processes.items()

@@ -25,7 +25,9 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-RECORDER_RATE = 100.0  # Hz, of a scenario without the section `recorder`: that of the shipped scenarios
+RECORDER_RATE = (
+    100.0  # Hz, of a scenario without the section `recorder`: that of the shipped scenarios
+)
 STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
@@ -36,7 +38,10 @@ class FlightConfig(Config):
     """How to run the scenario."""
 
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
-    lockstep: bool = Field(default=False, description="fly as fast as the machine allows, in lockstep, instead of real time")
+    lockstep: bool = Field(
+        default=False,
+        description="fly as fast as the machine allows, in lockstep, instead of real time",
+    )
 
 
 @dataclass(frozen=True)
@@ -54,28 +59,40 @@ class Scenario:
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
-        """A scenario without a file: flight, aircraft, reference_model, controller and, if any, recorder and guidance.
+        """A scenario without a file: flight, aircraft, reference_model, controller and, if any,
+        recorder and guidance.
 
-        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays. Without `recorder` the
-        recorder writes at RECORDER_RATE. Raises ParameterError.
+        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays.
+        Without `recorder` the recorder writes at RECORDER_RATE. Raises ParameterError.
         """
         needed = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
         missing = [key for key in needed if key not in sections]
         unknown = [key for key in sections if key not in SCHEMAS]
-        expected = f"the sections {', '.join(needed)}, and {' or '.join(key for key in SCHEMAS if key not in needed)}"
+        expected = (
+            f"the sections {', '.join(needed)}, and "
+            f"{' or '.join(key for key in SCHEMAS if key not in needed)}"
+        )
         require(not missing, name, f"no section {', '.join(missing)}", expected)
         require(not unknown, name, f"a section {', '.join(unknown)}", expected)
-        values = {key: part.model_dump() if isinstance(part, Config) else part for key, part in sections.items()}
-        return scenario_of(name, Path(f"{name}.yaml"), {"recorder": {"rate": RECORDER_RATE}} | values)
+        values = {
+            key: part.model_dump() if isinstance(part, Config) else part
+            for key, part in sections.items()
+        }
+        return scenario_of(
+            name, Path(f"{name}.yaml"), {"recorder": {"rate": RECORDER_RATE}} | values
+        )
 
     def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        The value of a section is a mapping of new parameters, or a whole parameter set such as the `controller` of a second
-        scenario. Lists may be arrays. A different `law` starts without the gains of the former law. The copy is validated. A
-        missing section of guidance begins with the numbers by rule. Raises ParameterError.
+        The value of a section is a mapping of new parameters, or a whole parameter set such as the
+        `controller` of a second scenario. Lists may be arrays. A different `law` starts without the
+        gains of the former law. The copy is validated. A missing section of guidance begins with
+        the numbers by rule. Raises ParameterError.
         """
-        varied = replace(self, **{name: self._varied(name, changes) for name, changes in sections.items()})
+        varied = replace(
+            self, **{name: self._varied(name, changes) for name, changes in sections.items()}
+        )
         check_together(varied)
         return varied
 
@@ -83,13 +100,21 @@ class Scenario:
         """A section with changes, validated."""
         schema = SCHEMAS.get(name)
         if schema is None:
-            owners = [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
-            expected = f"it in a section: vary({owners[0]}={{{name!r}: ...}})" if owners else one_of(tuple(SCHEMAS), name)
+            owners = [
+                key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())
+            ]
+            expected = (
+                f"it in a section: vary({owners[0]}={{{name!r}: ...}})"
+                if owners
+                else one_of(tuple(SCHEMAS), name)
+            )
             raise ParameterError(f"{name}: found no such section, expected {expected}")
         if isinstance(changes, ControllerConfig if schema is AnyLaw else schema):
             return schema.validate_mapping(changes.model_dump(), name)
         if not isinstance(changes, Mapping):
-            raise ParameterError(f"{name}: found {short_repr(changes)}, expected a mapping of its parameters")
+            raise ParameterError(
+                f"{name}: found {short_repr(changes)}, expected a mapping of its parameters"
+            )
         return schema.validate_mapping({**self._values(name, changes), **changes}, name)
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,10 +128,14 @@ class Scenario:
         return values
 
     def rise_di(self) -> RiseDiConfig:
-        """The parameters of a controller with RISE-DI. Raises ParameterError for a different law."""
+        """The parameters of a controller with RISE-DI. Raises ParameterError for a different
+        law.
+        """
         if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
-            raise ParameterError(f"{self.name}: found the law {self.controller.law}, expected {expected}")
+            raise ParameterError(
+                f"{self.name}: found the law {self.controller.law}, expected {expected}"
+            )
         return self.controller
 
     def learns(self) -> bool:
@@ -116,12 +145,17 @@ class Scenario:
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """Start and stop of the gusts, s: entry and entry + 2 H / V0."""
         speed = self.aircraft.channels().speed
-        return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
+        return {
+            name: (gust.start, gust.start + 2.0 * gust.length / speed)
+            for name, gust in self.aircraft.gusts.items()
+        }
 
 
 def as_scenario(value: object) -> Scenario:
     """The value, a Scenario. Raises ParameterError for another value."""
-    return as_instance(value, Scenario, "scenario", "a Scenario, as find_scenario and recorded_scenario return one")
+    return as_instance(
+        value, Scenario, "scenario", "a Scenario, as find_scenario and recorded_scenario return one"
+    )
 
 
 SCHEMAS: dict[str, type[Config]] = {
@@ -138,15 +172,22 @@ OPTIONAL = ("guidance",)
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
     """Read and validate a scenario file. Raises ParameterError with a sentence.
 
-    Without `with_route` the route and the program of guidance are left out before the check, for a flight of another route.
+    Without `with_route` the route and the program of guidance are left out before the check, for a
+    flight of another route.
     """
     path = as_path(path, "scenario", A_SCENARIO)
     content = read_file(path, str(path), A_SCENARIO)
     if with_route:
         return parse_scenario(content, path)
     sections = parse_scenario_sections(content, path)
-    remaining = {key: value for key, value in sections.get("guidance", {}).items() if key not in {"route", "program"}}
-    return scenario_of(path.stem, path, {**sections, **({"guidance": remaining} if "guidance" in sections else {})})
+    remaining = {
+        key: value
+        for key, value in sections.get("guidance", {}).items()
+        if key not in {"route", "program"}
+    }
+    return scenario_of(
+        path.stem, path, {**sections, **({"guidance": remaining} if "guidance" in sections else {})}
+    )
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
@@ -157,7 +198,9 @@ def parse_scenario(content: bytes, path: Path) -> Scenario:
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
     """The scenario of these sections, validated. Raises ParameterError."""
     checked: dict[str, Any] = {
-        key: schema.validate_mapping(sections[key], key) for key, schema in SCHEMAS.items() if key not in OPTIONAL
+        key: schema.validate_mapping(sections[key], key)
+        for key, schema in SCHEMAS.items()
+        if key not in OPTIONAL
     }
     scenario = Scenario(name=name, path=path, **checked)
     check_together(scenario)
@@ -166,22 +209,33 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 
 def parse_scenario_sections(content: bytes, path: Path) -> Sections:
     """The sections in the content of a scenario file, not validated yet. Raises ParameterError."""
-    return parse_sections(content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
+    return parse_sections(
+        content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL
+    )
 
 
-def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig) -> dict[str, Any]:
+def guidance_by_rule(
+    aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig
+) -> dict[str, Any]:
     """Parameters of guidance that follow from the further sections.
 
-    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of
-    u from trim; none for a controller without these numbers. Raises ParameterError for a model or an aircraft beyond
-    guidance.
+    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega /
+    input_scale, with the limits of u from trim; none for a controller without these numbers. Raises
+    ParameterError for a model or an aircraft beyond guidance.
     """
     key = "reference_model.second_order"
     channels = aircraft.channels()
     if reference.second_order is None:
-        raise ParameterError(f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot")
+        raise ParameterError(
+            f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot"
+        )
     missing = [name for name in RATES_AND_SPEED if name not in reference.outputs]
-    require(not missing, "guidance", f"an aircraft without {', '.join(missing)}", f"one with {', '.join(RATES_AND_SPEED)}")
+    require(
+        not missing,
+        "guidance",
+        f"an aircraft without {', '.join(missing)}",
+        f"one with {', '.join(RATES_AND_SPEED)}",
+    )
     values = {
         "outputs": reference.outputs,
         "natural_frequency": reference.second_order.natural_frequency,
@@ -193,16 +247,24 @@ def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, 
             return controller.omega[i] / controller.input_scale[i]
 
         at_p, at_v = (controller.outputs.index(name) for name in ("p", "V"))
-        down, up = (abs(limits[at_v]) * effect(at_v) for limits in (controller.lower, controller.upper))
+        down, up = (
+            abs(limits[at_v]) * effect(at_v) for limits in (controller.lower, controller.upper)
+        )
         values["throttle_authority"] = (down, up)
-        values["roll_authority"] = min(-controller.lower[at_p], controller.upper[at_p]) * effect(at_p)
+        values["roll_authority"] = min(-controller.lower[at_p], controller.upper[at_p]) * effect(
+            at_p
+        )
     return values
 
 
-def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """The text of a scenario file with every parameter, defaults included. `overrides` replace parameters by section.
+def scenario_yaml(
+    scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None
+) -> str:
+    """The text of a scenario file with every parameter, defaults included. `overrides` replace
+    parameters by section.
 
-    A parameter with the value None or empty, the default, is left out. Raises ParameterError for what is no scenario.
+    A parameter with the value None or empty, the default, is left out. Raises ParameterError for
+    what is no scenario.
     """
     as_scenario(scenario)
     sections = {}
@@ -210,9 +272,13 @@ def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]]
         section: Config | None = getattr(scenario, name)
         if section is None:
             continue
-        merged = schema.validate_mapping(section.model_dump() | dict((overrides or {}).get(name, {})), name)
+        merged = schema.validate_mapping(
+            section.model_dump() | dict((overrides or {}).get(name, {})), name
+        )
         # The start time is known only once all nodes run; `truth` holds it.
-        sections[f"/**/{name}"] = {"ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))}
+        sections[f"/**/{name}"] = {
+            "ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))
+        }
     return dump_yaml(sections)
 
 
@@ -230,40 +296,80 @@ def check_together(scenario: Scenario) -> None:
     controller = scenario.controller
     reference = scenario.reference_model
     airframe = f"the airframe {scenario.aircraft.airframe}"
-    effectors = "controller.inputs" if controller.allocation is None else "controller.allocation.effectors"
-    require_channels(effectors, controller.effectors, tuple(channels.inputs), f"the channels of {airframe}")
+    effectors = (
+        "controller.inputs" if controller.allocation is None else "controller.allocation.effectors"
+    )
+    require_channels(
+        effectors, controller.effectors, tuple(channels.inputs), f"the channels of {airframe}"
+    )
     unknown = [name for name in controller.outputs if name not in channels.outputs]
     measured = f"some of the outputs of {airframe}: {', '.join(channels.outputs)}"
     require(not unknown, "controller.outputs", ", ".join(controller.outputs), measured)
     missing = [name for name in controller.vanes if name not in channels.outputs]
-    require(not missing, "controller.observer.vanes.channels", ", ".join(controller.vanes), "those of aircraft.vanes.channels")
-    require_channels("reference_model.outputs", reference.outputs, controller.outputs, "those of controller.outputs")
+    require(
+        not missing,
+        "controller.observer.vanes.channels",
+        ", ".join(controller.vanes),
+        "those of aircraft.vanes.channels",
+    )
+    require_channels(
+        "reference_model.outputs",
+        reference.outputs,
+        controller.outputs,
+        "those of controller.outputs",
+    )
     control_ns = period_ns(controller.rate, "controller.rate")
-    for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):
+    for key, rate in (
+        ("aircraft.rate", scenario.aircraft.rate),
+        ("reference_model.rate", reference.rate),
+    ):
         divides = control_ns % period_ns(rate, key) == 0
-        require(divides, key, f"{rate:g} Hz", f"a whole multiple of controller.rate ({controller.rate:g} Hz)")
+        require(
+            divides,
+            key,
+            f"{rate:g} Hz",
+            f"a whole multiple of controller.rate ({controller.rate:g} Hz)",
+        )
     if scenario.guidance is not None:
         _check_guidance(scenario, scenario.guidance)
 
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
-    """A sentence for each limit of the controller outside the end stops of the actuators: the anti-windup starts too late."""
+    """A sentence for each limit of the controller outside the end stops of the actuators: the
+    anti-windup starts too late.
+    """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
     section = "controller" if controller.allocation is None else "controller.allocation"
     sentences = []
     for key, sign in (("lower", -1.0), ("upper", 1.0)):
-        stops = dict(zip(scenario.aircraft.channels().inputs, getattr(actuators, key), strict=bool(getattr(actuators, key))))
-        limits = dict(zip(controller.effectors, getattr(controller.effector_limits(), key).tolist(), strict=True))
+        stops = dict(
+            zip(
+                scenario.aircraft.channels().inputs,
+                getattr(actuators, key),
+                strict=bool(getattr(actuators, key)),
+            )
+        )
+        limits = dict(
+            zip(
+                controller.effectors,
+                getattr(controller.effector_limits(), key).tolist(),
+                strict=True,
+            )
+        )
         for name, stop in stops.items():
             limit = limits.get(name, sign * math.inf)
             if sign * limit > sign * stop + STOP_TOLERANCE * abs(stop):
-                sentences.append(f"{section}.{key} of {name}: found {limit:g}, expected the end stop {stop:g} or less far out")
+                sentences.append(
+                    f"{section}.{key} of {name}: found {limit:g}, expected the end stop "
+                    f"{stop:g} or less far out"
+                )
     return tuple(sentences)
 
 
 def require_guidable(scenario: Scenario) -> None:
-    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn, or from outside of a fence.
+    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn,
+    or from outside of a fence.
 
     Behind a bridge the airframe of the scenario does not fly.
     """
@@ -272,7 +378,12 @@ def require_guidable(scenario: Scenario) -> None:
     if guidance is None:
         return
     turns = aircraft.is_jsbsim or aircraft.kinematics == "euler"
-    require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
+    require(
+        turns,
+        "aircraft.kinematics",
+        f"{aircraft.kinematics!r} beside guidance",
+        "euler: a bank turns the aircraft",
+    )
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)
     position = f"the start {described(inside)}, at north {start.north:g} m, east {start.east:g} m"
@@ -285,13 +396,37 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
     for key in ("speed", "outputs", "natural_frequency"):
         value = getattr(guidance, key)
-        require(value == rule[key], f"guidance.{key}", value, f"{rule[key]}, as the other sections have it")
-    levels = f"the trim speed {guidance.speed:g} m/s, by which the wings are levelled when guidance is lost"
-    require(reference.live.speed is not None, "reference_model.live.speed", "none beside guidance", levels)
+        require(
+            value == rule[key],
+            f"guidance.{key}",
+            value,
+            f"{rule[key]}, as the other sections have it",
+        )
+    levels = (
+        f"the trim speed {guidance.speed:g} m/s, by which the wings are levelled when "
+        "guidance is lost"
+    )
+    require(
+        reference.live.speed is not None,
+        "reference_model.live.speed",
+        "none beside guidance",
+        levels,
+    )
     pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")
     period = period_ns(guidance.rate, "guidance.rate")
-    slowest = f"more than {1.0 / reference.live.max_age:g} Hz: the reference model ends a u_m older than live.max_age"
-    require(period < nanoseconds(reference.live.max_age), "guidance.rate", f"{guidance.rate:g} Hz", slowest)
-    for what, part_ns in (("pose", pose_ns), ("y_m", period_ns(reference.rate, "reference_model.rate"))):
+    slowest = (
+        f"more than {1.0 / reference.live.max_age:g} Hz: the reference model ends a u_m "
+        "older than live.max_age"
+    )
+    require(
+        period < nanoseconds(reference.live.max_age),
+        "guidance.rate",
+        f"{guidance.rate:g} Hz",
+        slowest,
+    )
+    for what, part_ns in (
+        ("pose", pose_ns),
+        ("y_m", period_ns(reference.rate, "reference_model.rate")),
+    ):
         rate = f"a whole fraction of the rate of {what} ({NANOSECONDS / part_ns:g} Hz)"
         require(period % part_ns == 0, "guidance.rate", f"{guidance.rate:g} Hz", rate)

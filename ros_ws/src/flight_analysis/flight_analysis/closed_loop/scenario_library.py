@@ -23,8 +23,11 @@ def scenarios() -> list[str]:
     return names_in(LIBRARY)
 
 
-def find_scenario(name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True) -> Scenario:
-    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError.
+def find_scenario(
+    name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True
+) -> Scenario:
+    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s.
+    Raises ParameterError.
 
     A Scenario is returned as it is, or with the duration. `with_route` as of `load_scenario`.
     """
@@ -36,8 +39,13 @@ def find_scenario(name: FilePath | Scenario, duration: float | None = None, *, w
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
 
 
-def with_route(scenario: Scenario, waypoints: Sequence[Waypoint], fence: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
-    """The scenario with a route that guidance flies from the start, in place of its route and its program of targets.
+def with_route(
+    scenario: Scenario,
+    waypoints: Sequence[Waypoint],
+    fence: Mapping[str, Any] = MappingProxyType({}),
+) -> Scenario:
+    """The scenario with a route that guidance flies from the start, in place of its route and its
+    program of targets.
 
     `fence`: further sections of guidance, as of `read_fence_file`.
 
@@ -53,14 +61,18 @@ def with_route(scenario: Scenario, waypoints: Sequence[Waypoint], fence: Mapping
         "wait": [waypoint.wait for waypoint in waypoints],
         "leave": [waypoint.departure for waypoint in waypoints],
     }
-    route = {key: values for key, values in route.items() if key not in {"turns", "wait"} or any(values)}
+    route = {
+        key: values for key, values in route.items() if key not in {"turns", "wait"} or any(values)
+    }
     if route["leave"] == route["altitude"]:
         del route["leave"]
     return scenario.vary(guidance={"route": route, "program": {}, **fence})
 
 
 def written(scenario: Scenario, path: Path) -> Scenario:
-    """A scenario that differs from its file, as a file of its own. Raises ParameterError where it cannot be written."""
+    """A scenario that differs from its file, as a file of its own. Raises ParameterError where it
+    cannot be written.
+    """
     with writing("", path, "a folder that can"):
         write_file(path, scenario_yaml(scenario))
     return load_scenario(path)

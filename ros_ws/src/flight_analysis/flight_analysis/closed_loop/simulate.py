@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process, without ROS: the code of the nodes, called in the order of the data flow."""
+"""The closed loop in one process, without ROS: the code of the nodes, called in the order of the
+data flow.
+"""
 
 from collections.abc import Callable, Mapping
 
@@ -38,7 +40,9 @@ class _Recorder:
 
     period_ns = NANOSECONDS
 
-    def __init__(self, topics: Topics, record: Record, progress: Callable[[float], None] | None) -> None:
+    def __init__(
+        self, topics: Topics, record: Record, progress: Callable[[float], None] | None
+    ) -> None:
         self._topics = topics
         self._record = record
         self._progress = progress
@@ -58,12 +62,16 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says.
+    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The
+    rest is as `fly` says.
 
     Raises ParameterError for what is no scenario.
     """
     as_scenario(scenario)
-    change = 'a function of the flight time; scenario.vary(flight={"duration": ...}) changes the duration'
+    change = (
+        'a function of the flight time; scenario.vary(flight={"duration": ...}) changes '
+        "the duration"
+    )
     require(progress is None or callable(progress), "progress", progress, change)
     parts: list[Mapping[str, Signal]] = []
     events: list[Event] = []
@@ -77,7 +85,9 @@ def simulate(
     for topic, last in parts[-1].items():
         samples = [part[topic] for part in parts if topic in part]
         stamp_ns = np.concatenate([signal.stamp_ns for signal in samples])
-        signals[topic] = Signal(stamp_ns, last.names, np.concatenate([signal.values for signal in samples]))
+        signals[topic] = Signal(
+            stamp_ns, last.names, np.concatenate([signal.values for signal in samples])
+        )
     changes = tuple(event.change for event in events if event.change)
     return Tape(signals, outcome=outcome, scenario=scenario, changes=changes)
 
@@ -91,14 +101,17 @@ def fly(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> str:
-    """Fly a scenario and return the outcome. `record` takes the samples once per simulated second and at the end.
+    """Fly a scenario and return the outcome. `record` takes the samples once per simulated second
+    and at the end.
 
-    `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario with guidance;
-    the default receives the true pose. `control` makes the controller. `learn` makes the learner of a scenario that learns, and
-    `announce` takes the events of the learning. Raises ParameterError for such a scenario without `learn`.
+    `progress` is called with the flight time after `record`. `guide` makes the guidance of a
+    scenario with guidance; the default receives the true pose. `control` makes the controller.
+    `learn` makes the learner of a scenario that learns, and `announce` takes the events of the
+    learning. Raises ParameterError for such a scenario without `learn`.
 
-    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, proposals of the learner, u of the
-    controller. A flight that diverges or is interrupted (Ctrl-C) ends early.
+    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, proposals
+    of the learner, u of the controller. A flight that diverges or is interrupted (Ctrl-C) ends
+    early.
     """
     require_guidable(scenario)
     topics = Topics()
@@ -112,7 +125,12 @@ def fly(
     control_station = ControllerStation(controller, topics)
     parameters = scenario.controller
     if isinstance(parameters, RiseDiConfig) and parameters.learn is not None:
-        require(learn is not None, "controller.learn", "a flight without a learner", "one: learn=rise_di.learner(scenario)")
+        require(
+            learn is not None,
+            "controller.learn",
+            "a flight without a learner",
+            "one: learn=rise_di.learner(scenario)",
+        )
         assert learn is not None  # noqa: S101 - for the type checker
         learning = Learning(parameters, announce, simulated=True)
         learner = LearnerStation(control_station, learning, learn(parameters), topics)

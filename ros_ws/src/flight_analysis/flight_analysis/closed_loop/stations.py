@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of a flight in one process: stations with the code of the nodes step in the order of the data flow."""
+"""The loop of a flight in one process: stations with the code of the nodes step in the order of the
+data flow.
+"""
 
 import math
 from collections import defaultdict
@@ -49,7 +51,9 @@ class Loop:
         self.t_ns = -self._base_ns
 
     def run(self, end_ns: int) -> None:
-        """Step up to and including the instant `end_ns`. `t_ns` is the present instant, also after an error."""
+        """Step up to and including the instant `end_ns`. `t_ns` is the present instant, also after
+        an error.
+        """
         for t_ns in range(self.t_ns + self._base_ns, end_ns + 1, self._base_ns):
             self.t_ns = t_ns
             for station in self._stations:
@@ -58,7 +62,9 @@ class Loop:
 
 
 class Topics:
-    """The samples of the topics: kept for the tape, if `recorded`, and handed to the subscribers."""
+    """The samples of the topics: kept for the tape, if `recorded`, and handed to the
+    subscribers.
+    """
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -72,7 +78,9 @@ class Topics:
         self._names[topic] = tuple(names)
 
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
-        """Hand each sample of a topic to `take`: these channels in this order; None: all channels."""
+        """Hand each sample of a topic to `take`: these channels in this order; None: all
+        channels.
+        """
         self._subscriptions[topic].append((channels, take))
 
     def is_taken(self, topic: str) -> bool:
@@ -82,10 +90,16 @@ class Topics:
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
         """Record a sample, then call the subscribers. Raises ChannelError for a missing channel."""
         if self._recorded:
-            self._stamps[topic].append(sample.stamp_ns)  # first: an interrupt before the next line leaves a stamp without a row
+            self._stamps[topic].append(
+                sample.stamp_ns
+            )  # first: an interrupt before the next line leaves a stamp without a row
             self._rows[topic].append(sample.value)
         for channels, take in self._subscriptions.get(topic, ()):
-            wanted = sample.value if channels is None else select(channels, self._names[topic], sample.value)
+            wanted = (
+                sample.value
+                if channels is None
+                else select(channels, self._names[topic], sample.value)
+            )
             take(StampedVector(sample.stamp_ns, wanted), t_ns)
 
     def pop_signals(self) -> dict[str, Signal]:
@@ -94,7 +108,9 @@ class Topics:
         for topic, names in self._names.items():
             rows = self._rows.pop(topic, [])
             values = np.array(rows) if rows else np.zeros((0, len(names)))
-            signals[topic] = Signal(np.array(self._stamps.pop(topic, [])[: len(rows)], dtype=np.int64), names, values)
+            signals[topic] = Signal(
+                np.array(self._stamps.pop(topic, [])[: len(rows)], dtype=np.int64), names, values
+            )
         return signals
 
 
@@ -111,10 +127,13 @@ def _or_refuse(take: Take) -> Take:
 class AircraftStation:
     """The simulated aircraft: y, pose and truth with the last u held.
 
-    A lost sample of y is not published; a delayed sample keeps the stamp. `every_ns`: a period above the period of the sensors.
+    A lost sample of y is not published; a delayed sample keeps the stamp. `every_ns`: a period
+    above the period of the sensors.
     """
 
-    def __init__(self, parameters: AircraftConfig, topics: Topics, every_ns: int | None = None) -> None:
+    def __init__(
+        self, parameters: AircraftConfig, topics: Topics, every_ns: int | None = None
+    ) -> None:
         self._parameters = parameters
         self._topics = topics
         self.period_ns = every_ns or period_ns(parameters.rate, "rate")
@@ -149,7 +168,9 @@ class AircraftStation:
 class ReferenceStation:
     """The reference model: y_m. A u_m acts from the next step on."""
 
-    def __init__(self, parameters: ReferenceModelConfig, topics: Topics, every_ns: int | None = None) -> None:
+    def __init__(
+        self, parameters: ReferenceModelConfig, topics: Topics, every_ns: int | None = None
+    ) -> None:
         self._reference = Reference(parameters)
         self._topics = topics
         self.period_ns = every_ns or self._reference.period_ns
@@ -181,7 +202,9 @@ class GuidanceStation:
         topics.subscribe("authority", self._take_authority)
 
     def _take_authority(self, sample: StampedVector, _t_ns: int) -> None:
-        self._guidance.take_authority(dict(zip(self._authority, sample.value.tolist(), strict=True)))
+        self._guidance.take_authority(
+            dict(zip(self._authority, sample.value.tolist(), strict=True))
+        )
 
     def step(self, t_ns: int) -> None:
         """See Station."""
@@ -211,4 +234,6 @@ class ControllerStation:
         self.output = self.controller.tick(t_ns)
         if self.output is not None:
             self._topics.publish("u", StampedVector(self.output.stamp_ns, self.output.u), t_ns)
-            self._topics.publish("internals", StampedVector(self.output.stamp_ns, self.output.internals), t_ns)
+            self._topics.publish(
+                "internals", StampedVector(self.output.stamp_ns, self.output.internals), t_ns
+            )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a flight: the samples that its log should hold and holds, by topic, and the outcome that follows."""
+"""The account of a flight: the samples that its log should hold and holds, by topic, and the
+outcome that follows.
+"""
 
 import math
 import re
@@ -14,13 +16,25 @@ import numpy as np
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, LANDED, MISSED, NEVER_FLEW, NOT_FLOWN, OUTSIDE, UNKNOWN, ended_early
+from flight_core.outcome import (
+    COMPLETED,
+    INCOMPLETE,
+    LANDED,
+    MISSED,
+    NEVER_FLEW,
+    NOT_FLOWN,
+    OUTSIDE,
+    UNKNOWN,
+    ended_early,
+)
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
 from flight_log.flight_processes import controller_starts
 
-WHOLE = 0.99  # least share of the samples of a topic without a remark, unless a single one is missing
+WHOLE = (
+    0.99  # least share of the samples of a topic without a remark, unless a single one is missing
+)
 LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
 SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
@@ -28,7 +42,9 @@ LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much 
 GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
-AIRCRAFT = re.compile(r"/aircraft(#\d+)?$")  # of a process that is the simulated aircraft of the stack
+AIRCRAFT = re.compile(
+    r"/aircraft(#\d+)?$"
+)  # of a process that is the simulated aircraft of the stack
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(
@@ -45,11 +61,15 @@ class TopicAccount(NamedTuple):
     last: float | None
     gap: float | None  # longest interval between two samples
     gap_at: float | None  # begin of the interval
-    repeated: int  # samples with the stamp of the sample before, except in a failsafe; not among `found`
+    repeated: (
+        int  # samples with the stamp of the sample before, except in a failsafe; not among `found`
+    )
     unset: int  # samples without a usable stamp, left out
     step: float  # of the clock of the stamps, s; 0 without a step
     left_out: int  # samples after the step
-    unsent: int  # samples that the publisher left out on a busy host, by the numbers of the messages
+    unsent: (
+        int  # samples that the publisher left out on a busy host, by the numbers of the messages
+    )
 
     @property
     def share(self) -> float | None:
@@ -59,10 +79,12 @@ class TopicAccount(NamedTuple):
     def holds(self, count: int) -> bool:
         """Whether `count` samples are the whole topic, or their expected number is unknown.
 
-        One missing sample is no lack of a short topic: the first or the last instant of a flight may fall on either side of
-        its begin or end.
+        One missing sample is no lack of a short topic: the first or the last instant of a flight
+        may fall on either side of its begin or end.
         """
-        return self.expected is None or count >= min(WHOLE * self.expected, max(self.expected - 1, 1))
+        return self.expected is None or count >= min(
+            WHOLE * self.expected, max(self.expected - 1, 1)
+        )
 
 
 class ProcessAccount(NamedTuple):
@@ -84,7 +106,9 @@ class Commands(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for the outcome."""
+    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for
+    the outcome.
+    """
 
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
@@ -92,10 +116,14 @@ class Account(NamedTuple):
     busy: str = ""  # the sentence on a host that left out samples and ticks
     unguided: bool = False  # the controller was engaged, and guidance took no step
     legs: tuple[FlownLeg, ...] = ()  # of the route, in order
-    unflown: tuple[int, ...] = ()  # numbers of the legs that were ahead when the flight ended, in order
+    unflown: tuple[
+        int, ...
+    ] = ()  # numbers of the legs that were ahead when the flight ended, in order
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
-    late: float | None = None  # s, flight time of the first u of a flight that flew less than half of its time
+    late: float | None = (
+        None  # s, flight time of the first u of a flight that flew less than half of its time
+    )
     outside: Outside | None = None  # of the fence; None without one
 
     def over(self, *topics: str) -> str:
@@ -110,21 +138,29 @@ class Account(NamedTuple):
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user of a log."""
-        lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]  # which notes tell of
+        lacks = [
+            lack for lack in self.lacks if not any(part in lack for part in PARTS)
+        ]  # which notes tell of
         return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
         """The account for `summary.json`, which has the legs in `guidance`."""
-        topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
+        topics = {
+            name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
+        }
         return {
-            "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
-            "unflown": list(self.unflown), "processes": {name: process._asdict() for name, process in self.processes.items()},
-            "commands": None if self.commands is None else self.commands._asdict(), "late": self.late,
+            "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy,
+            "unguided": self.unguided,
+            "unflown": list(self.unflown),
+            "processes": {name: process._asdict() for name, process in self.processes.items()},
+            "commands": None if self.commands is None else self.commands._asdict(),
+            "late": self.late,
         }  # fmt: skip
 
 
 def final_outcome(outcome: str, account: Account) -> str:
-    """The outcome with the time outside of the fence, the legs missed and not flown, and with what the log lacks.
+    """The outcome with the time outside of the fence, the legs missed and not flown, and with what
+    the log lacks.
 
     As in "completed, missed leg 2 by 35 m, legs 4 to 6 not flown, log incomplete: ...".
 
@@ -134,34 +170,55 @@ def final_outcome(outcome: str, account: Account) -> str:
     if base == COMPLETED and account.late is not None:
         return f"{NEVER_FLEW}: the first u came at t = {account.late:.3f} of {account.end:.3f} s"
     if base == COMPLETED and account.unguided:
-        return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
+        return (
+            f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against "
+            "guidance.max_age"
+        )
     outing = account.outside if account.outside is not None and account.outside.left else None
-    outside = [] if outing is None else [f"{OUTSIDE} for {outing.outside_s:.1f} s, {outing.farthest_m:.0f} m at most"]
+    outside = (
+        []
+        if outing is None
+        else [f"{OUTSIDE} for {outing.outside_s:.1f} s, {outing.farthest_m:.0f} m at most"]
+    )
     if LANDED in base:
         return ", ".join([base, *outside])
     if not base.startswith((COMPLETED, UNKNOWN)):
         return base
-    parts = [base, *outside, *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed)]
+    parts = [
+        base,
+        *outside,
+        *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed),
+    ]
     if account.unflown:
         first = account.unflown[0]
         last = account.unflown[-1]
-        parts.append(f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}")
+        parts.append(
+            f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}"
+        )
     if account.lacks:
         parts.append(f"{INCOMPLETE}: {'; '.join(account.lacks)}")
     return ", ".join(parts)
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
-    """The outcome of a flight that left none, as one of nodes that were started one by one; empty for a part of a flight.
+    """The outcome of a flight that left none, as one of nodes that were started one by one; empty
+    for a part of a flight.
 
-    The flight is completed where the log holds y, y_m and u for the duration in the log, else that of the scenario. An
-    autopilot may end the last engagement, and with it u, before.
+    The flight is completed where the log holds y, y_m and u for the duration in the log, else that
+    of the scenario. An autopilot may end the last engagement, and with it u, before.
     """
-    is_part = bool(_lost_parts(tape.notes, planned=False)) or any(recording.step_ns for recording in tape.recording.values())
+    is_part = bool(_lost_parts(tape.notes, planned=False)) or any(
+        recording.step_ns for recording in tape.recording.values()
+    )
     if simulated and not {*TICKS} & {*tape.signals}:
         return "" if is_part else f"{NEVER_FLEW}: the controller never engaged"
-    loop = [tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape]
-    held = min((int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop), default=tape.start_ns)
+    loop = [
+        tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape
+    ]
+    held = min(
+        (int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop),
+        default=tape.start_ns,
+    )
     planned = scenario.flight.duration if tape.duration is None else tape.duration
     if held >= tape.start_ns + nanoseconds(planned) - LATE_TICK_NS:
         return COMPLETED
@@ -169,55 +226,86 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
 
 
 def flown(tape: Tape) -> Tape:
-    """The tape up to the controller's last tick: later samples belong to the shutdown of the processes.
+    """The tape up to the controller's last tick: later samples belong to the shutdown of the
+    processes.
 
-    A u that ends much earlier than y and y_m, or before the end of a whole flight, is a gap of the log: nothing is cut there.
+    A u that ends much earlier than y and y_m, or before the end of a whole flight, is a gap of the
+    log: nothing is cut there.
     """
-    ticks = [int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)]
-    others = [int(tape[name].stamp_ns[-1]) for name in ("y", "y_m") if name in tape and len(tape[name].stamp_ns)]
+    ticks = [
+        int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)
+    ]
+    others = [
+        int(tape[name].stamp_ns[-1])
+        for name in ("y", "y_m")
+        if name in tape and len(tape[name].stamp_ns)
+    ]
     if not ticks:
         return tape
     # one tick publishes u and internals
     end_ns = max(ticks)
     planned_ns = _planned_ns(tape)
-    if planned_ns is not None and end_ns < planned_ns - LATE_TICK_NS and end_ns < max(others, default=0) - LATE_TICK_NS:
+    if (
+        planned_ns is not None
+        and end_ns < planned_ns - LATE_TICK_NS
+        and end_ns < max(others, default=0) - LATE_TICK_NS
+    ):
         end_ns = planned_ns
     elif min(others, default=end_ns) - end_ns > nanoseconds(SILENCE):
         return tape
-    return replace(tape, signals={name: signal.until(end_ns) for name, signal in tape.signals.items()})
+    return replace(
+        tape, signals={name: signal.until(end_ns) for name, signal in tape.signals.items()}
+    )
 
 
 def _planned_ns(tape: Tape) -> int | None:
     """Stamp of the planned end; None where the log does not have it."""
-    planned = tape.scenario.flight.duration if isinstance(tape.scenario, Scenario) else tape.duration
+    planned = (
+        tape.scenario.flight.duration if isinstance(tape.scenario, Scenario) else tape.duration
+    )
     return None if planned is None else tape.start_ns + nanoseconds(planned)
 
 
-def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, simulated: bool = True) -> Account:
+def account(
+    tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, simulated: bool = True
+) -> Account:
     """The account of a flight.
 
-    The expected number of samples is rate times time, from t = 0 to the planned end where the log knows both, else from the
-    first sample of the topic to the last sample of any. Ticks of the controller count from the first, without the ticks
-    that a busy host left out, up to a tenth of the ticks. `simulated`: the aircraft of the scenario flew, no autopilot.
+    The expected number of samples is rate times time, from t = 0 to the planned end where the log
+    knows both, else from the first sample of the topic to the last sample of any. Ticks of the
+    controller count from the first, without the ticks that a busy host left out, up to a tenth of
+    the ticks. `simulated`: the aircraft of the scenario flew, no autopilot.
     """
-    lasts = [int(signal.stamp_ns.max()) for name, signal in tape.signals.items() if name in RATED and len(signal.stamp_ns)]
+    lasts = [
+        int(signal.stamp_ns.max())
+        for name, signal in tape.signals.items()
+        if name in RATED and len(signal.stamp_ns)
+    ]
     planned_ns = _planned_ns(tape)
     end_ns = max(lasts, default=tape.start_ns)
     from_start = planned_ns is not None and simulated
     if planned_ns is not None and simulated and outcome.startswith((COMPLETED, UNKNOWN)):
         end_ns = planned_ns
-    expected = {} if scenario is None else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
+    expected = (
+        {}
+        if scenario is None
+        else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
+    )
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
     begin_ns = tape.start_ns if from_start else None
     topics = {name: _topic(tape, name, expected.get(name), begin_ns, end_ns) for name in names}
     late = {} if scenario is None else _latest(scenario)
-    has_clock = tape.start_ns > SINCE_EPOCH_NS and not any(clock.step_ns for clock in tape.recording.values())
+    has_clock = tape.start_ns > SINCE_EPOCH_NS and not any(
+        clock.step_ns for clock in tape.recording.values()
+    )
     if scenario is not None and has_clock:  # in real time
         for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
             if ends_last(tape, name):
                 continue
             refused = tape.refused.get(name, 0)
-            topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)), refused)
+            topics[name] = _with_unsent(
+                topics[name], step_ns, tape.recording.get(name, Recording(0)), refused
+            )
             if unsent_at_end := _unsent_rest(tape, name, step_ns, end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 late[name] = seconds(end_ns)
@@ -226,13 +314,20 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     if "internals" in tape and "mode" in tape["internals"].names:
         failsafe = int(np.count_nonzero(tape["internals"]["mode"] != Mode.ENGAGED))
     for name, topic in topics.items():
-        # Stamps rest during a failsafe. Further equal stamps are of a clock that stands, and no sample is known to be new.
+        # Stamps rest during a failsafe. Further equal stamps are of a clock that stands, and no
+        # sample is known to be new.
         repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
     guided = [topics[name] for name in GUIDED if name in topics]
-    unguided = bool(guided) and all(topic.expected and not topic.found and not topic.unset for topic in guided)
+    unguided = bool(guided) and all(
+        topic.expected and not topic.found and not topic.unset for topic in guided
+    )
     first = _late_first_u(topics, scenario) if from_start else None
-    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end, late.get(name, 0.0), first))]
+    lacks = [
+        lack
+        for name, topic in topics.items()
+        if (lack := _lack(name, topic, end, late.get(name, 0.0), first))
+    ]
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
@@ -243,23 +338,41 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     unflown = unflown_legs(tape, section) if legs and section is not None else ()
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
     return Account(
-        end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided, tuple(legs), tuple(unflown),
-        _processes(tape), late=first if first is not None and first > end / 2.0 else None, outside=time_outside(tape, section),
+        end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided,
+        tuple(legs), tuple(unflown),
+        _processes(tape), late=first if first is not None and first > end / 2.0 else None,
+        outside=time_outside(tape, section),
     )  # fmt: skip
 
 
-RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
+RATED = (
+    "y",
+    "y_m",
+    "u",
+    "internals",
+    "truth",
+    "pose",
+    "guidance",
+    "u_m",
+)  # topics with a rate of the scenario
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """The processes in flight time. In lockstep the stamps are no times of day, and when a process was ready is not known."""
+    """The processes in flight time. In lockstep the stamps are no times of day, and when a process
+    was ready is not known.
+    """
 
     def flight_time(stamp_ns: int | None) -> float | None:
         return None if stamp_ns is None else seconds(stamp_ns - tape.start_ns)
 
     since_epoch = tape.start_ns > SINCE_EPOCH_NS
     return {
-        name: ProcessAccount(flight_time(ready_ns) if since_epoch else None, flight_time(first), flight_time(last), samples)
+        name: ProcessAccount(
+            flight_time(ready_ns) if since_epoch else None,
+            flight_time(first),
+            flight_time(last),
+            samples,
+        )
         for name, (ready_ns, first, last, samples) in tape.processes.items()
     }
 
@@ -269,14 +382,22 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
-    """Parts of a bag that are missing, and leaps of the clock. A truncated end counts where no planned end does."""
+    """Parts of a bag that are missing, and leaps of the clock. A truncated end counts where no
+    planned end does.
+    """
     kinds = PARTS if not planned else PARTS[:2]
     missing = re.compile("|".join(map(re.escape, kinds)))
-    return [note.partition(";")[0].partition(": later times")[0] for note in notes if missing.search(note)]
+    return [
+        note.partition(";")[0].partition(": later times")[0]
+        for note in notes
+        if missing.search(note)
+    ]
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
-    """The channels of the scenario that the samples of y, y_m and u do not have, a sentence a topic."""
+    """The channels of the scenario that the samples of y, y_m and u do not have, a sentence a
+    topic.
+    """
     if scenario is None:
         return []
     outputs = scenario.controller.outputs
@@ -289,7 +410,9 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
     return sentences
 
 
-def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
+def _expected(
+    tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool
+) -> dict[str, int]:
     """The number of samples by topic that the log of a flight should hold, where this is known."""
     sensors = scenario.aircraft.sensors
     pose = scenario.aircraft.pose
@@ -311,7 +434,12 @@ def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, 
     expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
         before_pose = math.ceil(pose.delay * scenario.guidance.rate)
-        steps = max(math.floor(engaged * scenario.guidance.rate / scenario.controller.rate) - 2 - before_pose, 0)
+        steps = max(
+            math.floor(engaged * scenario.guidance.rate / scenario.controller.rate)
+            - 2
+            - before_pose,
+            0,
+        )
         expected |= dict.fromkeys(GUIDED, steps)
     return expected
 
@@ -335,14 +463,18 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def _is_of_stack(tape: Tape) -> bool:
-    """Whether the simulated aircraft of the stack flew, by the names of the processes; a flight in one process has no names."""
+    """Whether the simulated aircraft of the stack flew, by the names of the processes; a flight in
+    one process has no names.
+    """
     if tape.processes:
         return any(AIRCRAFT.search(name) for name in tape.processes)
     return tape.duration is not None or "truth" in tape.recording
 
 
 def _period_in_log(tape: Tape, name: str, otherwise: int) -> int:
-    """The median interval of the samples of a topic, by the numbers of the messages without the lost messages, ns."""
+    """The median interval of the samples of a topic, by the numbers of the messages without the
+    lost messages, ns.
+    """
     intervals_ns = np.diff(tape[name].stamp_ns) if name in tape else np.zeros(0)
     if not np.any(intervals_ns > 0):
         return otherwise
@@ -352,31 +484,47 @@ def _period_in_log(tape: Tape, name: str, otherwise: int) -> int:
     return max(round(median_ns * share) if share < LEAST else round(median_ns), 1)
 
 
-def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording, refused: int) -> TopicAccount:
-    """The account of a topic with the instants between the first and the last sample that the publisher left out.
+def _with_unsent(
+    topic: TopicAccount, step_ns: int, recording: Recording, refused: int
+) -> TopicAccount:
+    """The account of a topic with the instants between the first and the last sample that the
+    publisher left out.
 
-    The numbers of the messages are the proof: no number is missing beside lost messages and samples left out.
+    The numbers of the messages are the proof: no number is missing beside lost messages and samples
+    left out.
     """
-    if topic.first is None or topic.last is None or recording.lost is None or topic.expected is None:
+    if (
+        topic.first is None
+        or topic.last is None
+        or recording.lost is None
+        or topic.expected is None
+    ):
         return topic
     instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
-    return topic._replace(unsent=max(instants - topic.found - recording.lost - recording.unset - refused, 0))
+    return topic._replace(
+        unsent=max(instants - topic.found - recording.lost - recording.unset - refused, 0)
+    )
 
 
 def ends_last(tape: Tape, name: str) -> bool:
-    """Whether a topic ends later than every further topic of the flight: a leap of the clock may be the gap."""
+    """Whether a topic ends later than every further topic of the flight: a leap of the clock may be
+    the gap.
+    """
     ends = {
-        topic: int(signal.stamp_ns[-1]) for topic, signal in tape.signals.items() if topic in RATED and len(signal.stamp_ns)
+        topic: int(signal.stamp_ns[-1])
+        for topic, signal in tape.signals.items()
+        if topic in RATED and len(signal.stamp_ns)
     }
     further = [end_ns for topic, end_ns in ends.items() if topic != name]
     return bool(further) and ends.get(name, 0) > max(further) + LATE_TICK_NS
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
-    """The number of instants from the last sample of a topic to the end, where the publisher left them out.
+    """The number of instants from the last sample of a topic to the end, where the publisher left
+    them out.
 
-    The numbers of the messages are the proof: the next sample comes after the end, or the aircraft sent y at further
-    instants alone. A log that ends with the topic proves nothing.
+    The numbers of the messages are the proof: the next sample comes after the end, or the aircraft
+    sent y at further instants alone. A log that ends with the topic proves nothing.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -387,7 +535,11 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     last_ns = int(held_ns[-1])
     if len(signal.stamp_ns) > len(held_ns):
         return max((end_ns - last_ns) // step_ns, 0)
-    if name not in OF_AIRCRAFT or "y" not in tape or tape.recording.get("y", Recording(0)).lost != 0:
+    if (
+        name not in OF_AIRCRAFT
+        or "y" not in tape
+        or tape.recording.get("y", Recording(0)).lost != 0
+    ):
         return 0
     later_ns = tape["y"].until(end_ns).stamp_ns - last_ns
     was_sent = bool(np.any((later_ns > 0) & (later_ns % step_ns == 0)))
@@ -396,7 +548,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     """The number of ticks of the controller up to the end, and the number of engaged ticks."""
-    begins = [int(tape[name].stamp_ns[0]) for name in TICKS if name in tape and len(tape[name].stamp_ns)]
+    begins = [
+        int(tape[name].stamp_ns[0]) for name in TICKS if name in tape and len(tape[name].stamp_ns)
+    ]
     if not begins:
         return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
     begin_ns = min(begins)
@@ -417,9 +571,13 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     return ticks, float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
 
 
-def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, end_ns: int) -> TopicAccount:
+def _topic(
+    tape: Tape, name: str, expected: int | None, begin_ns: int | None, end_ns: int
+) -> TopicAccount:
     recording = tape.recording.get(name, Recording(0))
-    signal = tape.signals.get(name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))).until(end_ns)
+    signal = tape.signals.get(
+        name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
+    ).until(end_ns)
     early = 0 if begin_ns is None else int(np.searchsorted(signal.stamp_ns, begin_ns))
     count = len(signal.stamp_ns)
     t = (signal.stamp_ns - tape.start_ns) / NANOSECONDS
@@ -428,26 +586,35 @@ def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, en
     return TopicAccount(
         expected, count - early,
         float(t[0]) if count else None, float(t[-1]) if count else None,
-        None if longest is None else float(gaps[longest]), None if longest is None else float(t[longest]),
+        None if longest is None else float(gaps[longest]),
+        None if longest is None else float(t[longest]),
         recording.repeated if recording.found else int(np.count_nonzero(gaps == 0.0)),
         recording.unset, seconds(recording.step_ns), recording.left_out, 0,
     )  # fmt: skip
 
 
 def _latest(scenario: Scenario) -> dict[str, float]:
-    """How long before the end the last sample of a topic may be stamped, s: the delay, and the period of a slow pose."""
+    """How long before the end the last sample of a topic may be stamped, s: the delay, and the
+    period of a slow pose.
+    """
     aircraft = scenario.aircraft
-    return {"y": aircraft.sensors.delay, "pose": aircraft.pose.delay + aircraft.pose_every() / aircraft.rate}
+    return {
+        "y": aircraft.sensors.delay,
+        "pose": aircraft.pose.delay + aircraft.pose_every() / aircraft.rate,
+    }
 
 
 def _late_first_u(topics: Mapping[str, TopicAccount], scenario: Scenario | None) -> float | None:
-    """Flight time of the first u where it came more than SILENCE after the first y could; None for one in time.
+    """Flight time of the first u where it came more than SILENCE after the first y could; None for
+    one in time.
 
     A controller that a user activates has none in time.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
-    firsts = [first for name in TICKS if name in topics and (first := topics[name].first) is not None]
+    firsts = [
+        first for name in TICKS if name in topics and (first := topics[name].first) is not None
+    ]
     late = min(firsts, default=0.0) - scenario.aircraft.sensors.delay > SILENCE
     return min(firsts) if late else None
 
@@ -461,18 +628,24 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: floa
     if name == "u" and first_u is not None:
         facts.append(f"begins at t = {first_u:.3f} of {end:.3f} s")
     if topic.step and topic.last is not None:
-        facts.append(f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s")
+        facts.append(
+            f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s"
+        )
     if topic.unset:
         facts.append(f"{topic.unset} samples without a usable stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
-    missing = not topic.holds(topic.found + topic.unsent) or (topic.share is not None and topic.share < LEAST)
+    missing = not topic.holds(topic.found + topic.unsent) or (
+        topic.share is not None and topic.share < LEAST
+    )
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
         if topic.gap is not None and topic.gap_at is not None and topic.gap > SILENCE:
-            facts.append(f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s")
+            facts.append(
+                f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"
+            )
     if not (facts or missing):
         return ""
     if missing and topic.unsent:
@@ -494,8 +667,22 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     outside = None if guided.get("fence") is None else Outside(**guided["fence"])
     unguided = content.get("unguided", False)
     unflown = tuple(content.get("unflown", ()))
-    processes = {name: ProcessAccount(**process) for name, process in content.get("processes", {}).items()}
+    processes = {
+        name: ProcessAccount(**process) for name, process in content.get("processes", {}).items()
+    }
     commands = None if content.get("commands") is None else Commands(**content["commands"])
     lacks = tuple(content["lacks"])
     late = content.get("late")
-    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands, late, outside)
+    return Account(
+        content["end"],
+        topics,
+        lacks,
+        content["busy"],
+        unguided,
+        legs,
+        unflown,
+        processes,
+        commands,
+        late,
+        outside,
+    )

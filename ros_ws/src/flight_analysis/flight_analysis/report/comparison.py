@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of several flights, channels matched by name: ratios of metrics to the first flight, and overlaid curves."""
+"""Comparison of several flights, channels matched by name: ratios of metrics to the first flight,
+and overlaid curves.
+"""
 
 from collections.abc import Callable, Sequence
 from itertools import chain
@@ -10,12 +12,25 @@ import numpy as np
 
 from flight_analysis.metrics import best_error
 from flight_analysis.report import figures, summary
-from flight_analysis.report.plotting import Curve, Figure, Interval, PlotContext, SampleStore, time_series_figure
+from flight_analysis.report.plotting import (
+    Curve,
+    Figure,
+    Interval,
+    PlotContext,
+    SampleStore,
+    time_series_figure,
+)
 from flight_analysis.report.summary import Column, DisplayUnit, RecordedFlight
 from flight_core.tape import Signal, Tape
 
 # Okabe and Ito 2008, distinct to the colour blind too; lighter on a dark page.
-DARK = {"#0072b2": "#4db3ea", "#d55e00": "#ff924a", "#009e73": "#3fcf9f", "#cc79a7": "#e8a3c8", "#7a6a00": "#d9c74a"}
+DARK = {
+    "#0072b2": "#4db3ea",
+    "#d55e00": "#ff924a",
+    "#009e73": "#3fcf9f",
+    "#cc79a7": "#e8a3c8",
+    "#7a6a00": "#d9c74a",
+}
 COLOURS = tuple(DARK)
 SAME_CURVE_TOLERANCE = 1e-3  # of the largest value: closer references are drawn as one curve
 EQUAL_RATIO_TOLERANCE = 0.05  # metrics with a ratio closer to 1 count as equal
@@ -61,7 +76,9 @@ def colours(flights: Sequence[RecordedFlight]) -> dict[str, str]:
 def labels(flights: Sequence[RecordedFlight]) -> list[str]:
     """Names of the flights; equal names get a number."""
     names = [flight.name for flight in flights]
-    return [f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)]
+    return [
+        f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)
+    ]
 
 
 def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
@@ -78,17 +95,23 @@ def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
 def metric_tables(
     flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
 ) -> list[ComparisonTable]:
-    """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with a value."""
+    """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with
+    a value.
+    """
     display = units(flights)
     tables = []
     for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
         factor = display.get(channel, summary.NO_UNIT).factor
         rows = []
         for group, head, path, scaled in columns:
-            row = _row(flights, f"{group} {head}".strip(), (key, channel, *path), factor if scaled else 1.0)
+            row = _row(
+                flights, f"{group} {head}".strip(), (key, channel, *path), factor if scaled else 1.0
+            )
             if set(row.texts) != {summary.NO_VALUE}:
                 rows.append(row._replace(lower_is_better=lower_is_better))
-        tables.append(ComparisonTable(summary.channel_label(channel, display), tuple(rows), channel))
+        tables.append(
+            ComparisonTable(summary.channel_label(channel, display), tuple(rows), channel)
+        )
     return tables
 
 
@@ -96,14 +119,18 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Metrics of the error and settling times, by channel."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
-        for table in metric_tables(flights, "errors", (*summary.ERROR_COLUMNS, summary.SWITCH_COLUMN), lower_is_better=True)
+        for table in metric_tables(
+            flights, "errors", (*summary.ERROR_COLUMNS, summary.SWITCH_COLUMN), lower_is_better=True
+        )
     ]
 
 
 def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[ComparisonRow]:
     times = {}
     for kind in ("command", "gust"):
-        times[kind] = tuple(summary.slowest_settling(flight.summary, channel, kind) for flight in flights)
+        times[kind] = tuple(
+            summary.slowest_settling(flight.summary, channel, kind) for flight in flights
+        )
     no_ratios = (None,) * len(flights)
     return [
         ComparisonRow(f"settling, {kind} (s)", texts, no_ratios)
@@ -115,15 +142,21 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers as a table; none for zeros alone."""
     rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
-    nonzero = tuple(row for row in rows if set(row.texts) - {summary.NO_VALUE, summary.format_value(0.0)})
+    nonzero = tuple(
+        row for row in rows if set(row.texts) - {summary.NO_VALUE, summary.format_value(0.0)}
+    )
     return [ComparisonTable("Ticks of the controller", nonzero)] if nonzero else []
 
 
-def _row(flights: Sequence[RecordedFlight], name: str, path: Sequence[str], factor: float) -> ComparisonRow:
+def _row(
+    flights: Sequence[RecordedFlight], name: str, path: Sequence[str], factor: float
+) -> ComparisonRow:
     values = [summary.metric(flight.summary, *path) for flight in flights]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)
-    return ComparisonRow(name, tuple(summary.format_value(value, factor) for value in values), ratios)
+    return ComparisonRow(
+        name, tuple(summary.format_value(value, factor) for value in values), ratios
+    )
 
 
 # ---- Figures
@@ -143,13 +176,18 @@ def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> 
     references: dict[str, Signal] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
         y_m = _from_zero(flight.tape["y_m"], flight)
-        equal = next((name for name, reference in references.items() if _same_curve(reference, y_m)), None)
+        equal = next(
+            (name for name, reference in references.items() if _same_curve(reference, y_m)), None
+        )
         if equal is None:
             references[label] = y_m
         elif len(y_m.stamp_ns) > len(references[equal].stamp_ns):
             references[equal] = y_m
     palette = colours(flights)
-    curves = {f"y_m {label}": Curve(signal, palette[label], 5.0, faint=True) for label, signal in references.items()}
+    curves = {
+        f"y_m {label}": Curve(signal, palette[label], 5.0, faint=True)
+        for label, signal in references.items()
+    }
     if len(references) == 1:
         (curve,) = curves.values()
         curves = {"y_m": curve._replace(colour=figures.REFERENCE, width=6.0, faint=False)}
@@ -158,7 +196,9 @@ def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> 
 
 def error_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure:
     """The best error of every flight."""
-    return time_series_figure(context, _curves(flights, "y", lambda tape: best_error(tape)[1]), height=120)
+    return time_series_figure(
+        context, _curves(flights, "y", lambda tape: best_error(tape)[1]), height=120
+    )
 
 
 def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure | None:
@@ -167,7 +207,9 @@ def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Fig
     return time_series_figure(context, curves) if curves else None
 
 
-def _curves(flights: Sequence[RecordedFlight], topic: str, signal: Callable[[Tape], Signal], **style: Any) -> dict[str, Curve]:
+def _curves(
+    flights: Sequence[RecordedFlight], topic: str, signal: Callable[[Tape], Signal], **style: Any
+) -> dict[str, Curve]:
     """A curve of every flight with a topic, in the colour of the flight."""
     return {
         label: Curve(_from_zero(signal(flight.tape), flight), colour, **style)
@@ -182,12 +224,23 @@ def _from_zero(signal: Signal, flight: RecordedFlight) -> Signal:
 
 
 def _same_curve(first: Signal, second: Signal) -> bool:
-    """Whether two references differ by at most SAME_CURVE_TOLERANCE of the largest value over their common time."""
-    if set(first.names) != set(second.names) or len(first.stamp_ns) == 0 or len(second.stamp_ns) == 0:
+    """Whether two references differ by at most SAME_CURVE_TOLERANCE of the largest value over their
+    common time.
+    """
+    if (
+        set(first.names) != set(second.names)
+        or len(first.stamp_ns) == 0
+        or len(second.stamp_ns) == 0
+    ):
         return False
     instants = first.stamp_ns[first.stamp_ns <= second.stamp_ns[-1]]
     return all(
-        np.max(np.abs(first[name][: len(instants)] - np.interp(instants, second.stamp_ns, second[name])), initial=0.0)
+        np.max(
+            np.abs(
+                first[name][: len(instants)] - np.interp(instants, second.stamp_ns, second[name])
+            ),
+            initial=0.0,
+        )
         <= SAME_CURVE_TOLERANCE * np.max(np.abs(first[name]))
         for name in first.names
     )

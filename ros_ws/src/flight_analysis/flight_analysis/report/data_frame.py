@@ -14,16 +14,21 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
 
 
 def data_frame(tape: Tape) -> "pl.DataFrame":
-    """The signals as a table, SI: a row per instant with a sample of any topic, a column "topic.channel" per channel.
+    """The signals as a table, SI: a row per instant with a sample of any topic, a column
+    "topic.channel" per channel.
 
-    The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has
-    nulls there. Of two samples with equal stamps the table holds the later.
+    The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a
+    sample at an instant has nulls there. Of two samples with equal stamps the table holds the
+    later.
     """
     import polars as pl  # noqa: PLC0415
 
     as_tape(tape)
     stamps = np.unique(np.concatenate([signal.stamp_ns for signal in tape.signals.values()]))
-    columns: dict[str, np.ndarray] = {"stamp_ns": stamps, "t": (stamps - tape.start_ns) / NANOSECONDS}
+    columns: dict[str, np.ndarray] = {
+        "stamp_ns": stamps,
+        "t": (stamps - tape.start_ns) / NANOSECONDS,
+    }
     missing: dict[str, np.ndarray] = {}
     for topic, signal in tape.signals.items():
         rows = np.searchsorted(stamps, signal.stamp_ns)

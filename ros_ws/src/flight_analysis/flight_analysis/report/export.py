@@ -29,7 +29,9 @@ DPI = 120
 
 
 def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
-    """The table of a flight, or of several flights with the name of the flight in a first column "run"."""
+    """The table of a flight, or of several flights with the name of the flight in a first column
+    "run".
+    """
     import polars as pl  # noqa: PLC0415
 
     if len(flights) == 1:
@@ -54,7 +56,9 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 class _PlotColumn(NamedTuple):
-    """A column of the PNG: a signal of the tapes with some topics, with the channels of the first."""
+    """A column of the PNG: a signal of the tapes with some topics, with the channels of the
+    first.
+    """
 
     title: str
     topics: tuple[str, ...]
@@ -71,11 +75,20 @@ PLOT_COLUMNS = (
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity, a row a channel."""
+    """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity,
+    a row a channel.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    require(path.suffix.lower() in {"", ".png"}, "png", path.name, "a name that ends in .png; figure writes .pdf and .svg")
-    columns = [(column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topics))]
+    require(
+        path.suffix.lower() in {"", ".png"},
+        "png",
+        path.name,
+        "a name that ends in .png; figure writes .pdf and .svg",
+    )
+    columns = [
+        (column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topics))
+    ]
     rows = max(len(names) for _, names in columns)
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
@@ -88,7 +101,9 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
         for axis in axes[len(names) :]:
             axis.set_axis_off()
     grid[0, 0].set_xlim(0.0, max(flight_end(flight.tape) for flight in flights) or 1.0)
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, frameon=False)
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, frameon=False
+    )
     with replacing(path) as stream:
         figure.savefig(stream, dpi=DPI, format="png")
 
@@ -98,7 +113,9 @@ def _channels(flights: Sequence[RecordedFlight], topics: Sequence[str]) -> list[
     return list(dict.fromkeys(chain.from_iterable(tape[topics[0]].names for tape in tapes)))
 
 
-def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str) -> None:
+def _plot_channel(
+    axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str
+) -> None:
     """Plot a channel of the flights, with the reference and the gusts of the first flight."""
     units = comparison.units(flights)
     factor = units.get(name, NO_UNIT).factor
@@ -114,7 +131,9 @@ def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _Plot
     for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
         tape = flight.tape
         if {*column.topics} <= {*tape.signals} and name in tape[column.topics[0]].names:
-            plot(tape, column.signal(tape), color=colour, linewidth=1.0, label=label, **column.style)
+            plot(
+                tape, column.signal(tape), color=colour, linewidth=1.0, label=label, **column.style
+            )
     axes.set_ylabel(channel_label(name, units))
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import Windows, known_entries, mask_spans, spectra, tick_periods, tracking_error, true_error
+from flight_analysis.metrics import (
+    Windows,
+    known_entries,
+    mask_spans,
+    spectra,
+    tick_periods,
+    tracking_error,
+    true_error,
+)
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
@@ -61,17 +69,25 @@ NOISE_FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
 INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals` and their labels
 MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
-FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]  # Hz, ticks of a spectrum
-MIN_VISIBLE_FRACTION = 1 / 500  # of the axis, about two pixels: shorter intervals are lengthened to it
+FREQUENCIES = [
+    digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))
+]  # Hz, ticks of a spectrum
+MIN_VISIBLE_FRACTION = (
+    1 / 500
+)  # of the axis, about two pixels: shorter intervals are lengthened to it
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
-Limits = Mapping[str, tuple[float, float]]  # lower and upper limit by input, SI; infinite without a limit
+Limits = Mapping[
+    str, tuple[float, float]
+]  # lower and upper limit by input, SI; infinite without a limit
 
 Runs = Mapping[str, tuple[Tape, int]]  # tape and period of the ticks in ns, by label of the flight
 
 
 def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -> PlotContext:
-    """The context of a flight: every figure shades the gusts and the failsafe modes of the controller."""
+    """The context of a flight: every figure shades the gusts and the failsafe modes of the
+    controller.
+    """
     end = flight_end(tape)
     intervals = [*gust_intervals(tape, gusts), *mode_intervals(tape, end * MIN_VISIBLE_FRACTION)]
     return PlotContext(tape, units, intervals, end, SampleStore())
@@ -79,13 +95,20 @@ def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -
 
 def flight_end(tape: Tape) -> float:
     """The last instant of any signal, s; 0 for a tape without samples."""
-    return max((float(tape.time(topic)[-1]) for topic in tape.signals if len(tape[topic].stamp_ns)), default=0.0)
+    return max(
+        (float(tape.time(topic)[-1]) for topic in tape.signals if len(tape[topic].stamp_ns)),
+        default=0.0,
+    )
 
 
 def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
     """The gusts up to the end of the flight."""
     end = flight_end(tape)
-    return [Interval(f"{name} gust", start, min(stop, end), GUST, True) for name, (start, stop) in gusts.items() if start < end]
+    return [
+        Interval(f"{name} gust", start, min(stop, end), GUST, True)
+        for name, (start, stop) in gusts.items()
+        if start < end
+    ]
 
 
 def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
@@ -97,18 +120,23 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     intervals = []
     for mode, colour in MODE_COLOURS.items():
         spans = mask_spans(t, modes == mode, min_length)
-        intervals += [Interval(mode.name.lower(), start, stop, colour, False) for start, stop in spans]
+        intervals += [
+            Interval(mode.name.lower(), start, stop, colour, False) for start, stop in spans
+        ]
     return intervals
 
 
 def tracking_figure(context: PlotContext) -> Figure:
     """Y over y_m of every output."""
     tape = context.tape
-    return time_series_figure(context, {"y_m": Curve(tape["y_m"], REFERENCE, 6.0), "y": Curve(tape["y"], PLANT)})
+    return time_series_figure(
+        context, {"y_m": Curve(tape["y_m"], REFERENCE, 6.0), "y": Curve(tape["y"], PLANT)}
+    )
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
-    """E = y - y_m of every output. With errors of the sensors on the tape, the true error over the measured error.
+    """E = y - y_m of every output. With errors of the sensors on the tape, the true error over the
+    measured error.
 
     Noise floors, by channel in SI, are lines above and below 0 where wide enough to see.
     """
@@ -130,18 +158,29 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 
 
 def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure | None:
-    """Actuator positions over the command u, at most two kinds of limits as lines, and marks where an input was saturated."""
+    """Actuator positions over the command u, at most two kinds of limits as lines, and marks where
+    an input was saturated.
+    """
     tape = context.tape
     if "u" not in tape:
         return None
     curves = {"u": Curve(tape["u"], PLANT, steps=True)}
     if (position := _truth_group(tape, "actuator")).names:
-        curves = {"command u": Curve(tape["u"], REFERENCE, 4.0, steps=True), "actuator": Curve(position, PLANT)}
+        curves = {
+            "command u": Curve(tape["u"], REFERENCE, 4.0, steps=True),
+            "actuator": Curve(position, PLANT),
+        }
     figure = time_series_figure(context, curves)
     for index, name in enumerate(tape["u"].names):
         factor = context.units.get(name, NO_UNIT).factor
-        values = [curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names]
-        bounds = {kind: np.array(by_input[name]) * factor for kind, by_input in limits.items() if name in by_input}
+        values = [
+            curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names
+        ]
+        bounds = {
+            kind: np.array(by_input[name]) * factor
+            for kind, by_input in limits.items()
+            if name in by_input
+        }
         low, high = _axis_range(np.concatenate(values), np.concatenate([[], *bounds.values()]))
         for (kind, pair), style in zip(bounds.items(), LIMIT_LINES, strict=False):
             for bound in pair[np.isfinite(pair)]:
@@ -149,31 +188,52 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
         mark = high + 0.07 * (high - low)
         top = high + 0.14 * (high - low)
         for saturation, colour in SATURATION_COLOURS.items():
-            spans = mask_spans(*_saturated(tape, name, saturation), context.end * MIN_VISIBLE_FRACTION)
+            spans = mask_spans(
+                *_saturated(tape, name, saturation), context.end * MIN_VISIBLE_FRACTION
+            )
             x: list[float | None] = []
             for start, stop in spans:
                 x += [start, stop, None]
-            add_line(figure, index, f"saturated: {saturation.name.lower()}", x, [mark] * len(x), {"color": colour, "width": 9})
+            add_line(
+                figure,
+                index,
+                f"saturated: {saturation.name.lower()}",
+                x,
+                [mark] * len(x),
+                {"color": colour, "width": 9},
+            )
         figure.y[index]["range"] = [low, top]
     return set_layout(figure, labels=16)
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Limits of u by kind and by input: end stops of the actuators where these are simulated, and limits of the controller."""
+    """Limits of u by kind and by input: end stops of the actuators where these are simulated, and
+    limits of the controller.
+    """
     actuators = scenario.aircraft.actuators
     controller = scenario.controller
     commanded = controller.effector_limits()
     limits = {
-        "limits of the controller": _limit_pairs(controller.effectors, commanded.lower.tolist(), commanded.upper.tolist())
+        "limits of the controller": _limit_pairs(
+            controller.effectors, commanded.lower.tolist(), commanded.upper.tolist()
+        )
     }
     if not _truth_group(tape, "actuator").names:
         return limits
-    return {"end stops": _limit_pairs(tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper)} | limits
+    return {
+        "end stops": _limit_pairs(
+            tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper
+        )
+    } | limits
 
 
 def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[float]) -> Limits:
     none = [float("inf")] * len(names)
-    return dict(zip(names, zip(lower or [-bound for bound in none], upper or none, strict=True), strict=True))
+    return dict(
+        zip(
+            names, zip(lower or [-bound for bound in none], upper or none, strict=True), strict=True
+        )
+    )
 
 
 def integral_figure(context: PlotContext) -> Figure | None:
@@ -193,7 +253,8 @@ def integral_figure(context: PlotContext) -> Figure | None:
 
 
 def learned_figure(context: PlotContext) -> Figure | None:
-    """Entries of A and B over time, as identified in flight, with bars of two deviations; open marks: no model was proposed.
+    """Entries of A and B over time, as identified in flight, with bars of two deviations; open
+    marks: no model was proposed.
 
     None without a learner. An entry that is not among `known_entries` is left out.
     """
@@ -211,16 +272,32 @@ def learned_figure(context: PlotContext) -> Figure | None:
     figure = Figure(len(known), columns, 110, spacing=0.06)
     for index, name in enumerate(known):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
-        marks = {"type": "scatter", "x": t, "y": values[name], "mode": "markers", "name": name, "error_y": bars}
-        style = {"marker": {"color": PLANT, "size": 7, "symbol": symbols}, "showlegend": False, "cliponaxis": False}
+        marks = {
+            "type": "scatter",
+            "x": t,
+            "y": values[name],
+            "mode": "markers",
+            "name": name,
+            "error_y": bars,
+        }
+        style = {
+            "marker": {"color": PLANT, "size": 7, "symbol": symbols},
+            "showlegend": False,
+            "cliponaxis": False,
+        }
         figure.add(marks | style | {"hovertemplate": "%{y:.4g} at %{x:.1f} s"}, index)
-        figure.x[index] |= {"range": [0.0, context.end], "showticklabels": index + columns >= len(known)}
+        figure.x[index] |= {
+            "range": [0.0, context.end],
+            "showticklabels": index + columns >= len(known),
+        }
         figure.x[index] |= {"title": {"text": "t (s)"}} if index + columns >= len(known) else {}
         figure.y[index]["title"] = {"text": name}
     return set_layout(figure)
 
 
-def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> Figure | None:
+def spectrum_figure(
+    runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]
+) -> Figure | None:
     """Amplitude spectral density of u, logarithmic axes: a subplot per channel with the runs.
 
     A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
@@ -232,7 +309,9 @@ def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, 
     }
     if not runs:
         return None
-    channels = list(dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values())))
+    channels = list(
+        dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values()))
+    )
     columns = min(len(channels), 2)
     figure = Figure(len(channels), columns, 190, spacing=0.2)
     for label, (tape, period_ns) in runs.items():
@@ -263,16 +342,23 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
-        samples["tick to tick, off a whole period"] = (periods - period_ns * np.round(periods / period_ns)) / 1e6
+        samples["tick to tick, off a whole period"] = (
+            periods - period_ns * np.round(periods / period_ns)
+        ) / 1e6
         samples["tick after its deadline"] = tape["internals"]["late"] * 1e3
         samples["age of y at the tick"] = tape["internals"]["age"] * 1e3
     if "latency" in tape:
         samples["y sent to u sent"] = tape["latency"].values[:, 0] * 1e3
-    return {quantity: values for quantity, values in samples.items() if len(values) and np.any(np.abs(values) > 1e-6)}
+    return {
+        quantity: values
+        for quantity, values in samples.items()
+        if len(values) and np.any(np.abs(values) > 1e-6)
+    }
 
 
 def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
-    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None for zeros alone.
+    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None for
+    zeros alone.
 
     A quantity has a subplot with the runs.
     """
@@ -313,23 +399,35 @@ def wind_figure(context: PlotContext) -> Figure | None:
     if not wind.names:
         return None
     units = dict.fromkeys(wind.names, DisplayUnit("m/s", 1.0))
-    return time_series_figure(context._replace(units=units), {"wind": Curve(wind, WIND)}, height=110)
+    return time_series_figure(
+        context._replace(units=units), {"wind": Curve(wind, WIND)}, height=110
+    )
 
 
 def state_figure(context: PlotContext) -> Figure | None:
     """The states of a simulated aircraft."""
     x = _truth_group(context.tape, "x")
-    return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130) if x.names else None
+    return (
+        time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130)
+        if x.names
+        else None
+    )
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
     """Y less the true output, of every sensor with an error."""
     noise = _nonzero_group(context.tape, "noise")
-    return time_series_figure(context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120) if noise.names else None
+    return (
+        time_series_figure(context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120)
+        if noise.names
+        else None
+    )
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
-    """Lateness, age of y and dt of the controller's ticks; None for ticks in time with a fresh y alone."""
+    """Lateness, age of y and dt of the controller's ticks; None for ticks in time with a fresh y
+    alone.
+    """
     tape = context.tape
     channels = ("late", "age", "dt")
     if "internals" not in tape:
@@ -340,23 +438,33 @@ def tick_figure(context: PlotContext) -> Figure | None:
         return None
     signal = Signal(ticks.stamp_ns, channels, np.stack([ticks[name] for name in channels]).T)
     units = dict.fromkeys(channels, DisplayUnit("ms", 1e3))
-    return time_series_figure(context._replace(units=units), {"ticks": Curve(signal, PLANT, 1.0)}, height=100)
+    return time_series_figure(
+        context._replace(units=units), {"ticks": Curve(signal, PLANT, 1.0)}, height=100
+    )
 
 
 def _truth_group(tape: Tape, group: str) -> Signal:
     """The channels "group.name" of `truth`; no channels on a tape without `truth`."""
-    return tape["truth"].group(group) if "truth" in tape else Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
+    return (
+        tape["truth"].group(group)
+        if "truth" in tape
+        else Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
+    )
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:
     """The nonzero channels of `_truth_group`."""
     signal = _truth_group(tape, group)
     nonzero = np.flatnonzero(signal.values.any(axis=0))
-    return Signal(signal.stamp_ns, tuple(signal.names[i] for i in nonzero), signal.values[:, nonzero])
+    return Signal(
+        signal.stamp_ns, tuple(signal.names[i] for i in nonzero), signal.values[:, nonzero]
+    )
 
 
 def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The instants of `internals`, and the mask of the instants of a kind of saturation of an input."""
+    """The instants of `internals`, and the mask of the instants of a kind of saturation of an
+    input.
+    """
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:
         return np.zeros(0), np.zeros(0, dtype=bool)
@@ -367,7 +475,11 @@ def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
     """Range of an axis: the values, and near bounds."""
     low = float(values.min(initial=0.0))
     high = float(values.max(initial=0.0))
-    near = [bound for bound in bounds if 0.0 < bound <= LIMIT_VIEW_RATIO * high or LIMIT_VIEW_RATIO * low <= bound < 0.0]
+    near = [
+        bound
+        for bound in bounds
+        if 0.0 < bound <= LIMIT_VIEW_RATIO * high or LIMIT_VIEW_RATIO * low <= bound < 0.0
+    ]
     low = min([low, *near])
     high = max([high, *near])
     margin = 0.06 * (high - low) or 1.0

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of merit of a guided flight: the segments, by mode and leg, with the errors of the held quantities."""
+"""Figures of merit of a guided flight: the segments, by mode and leg, with the errors of the held
+quantities.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -44,7 +46,9 @@ BANDS: Mapping[str, float] = {
 
 
 class Held(NamedTuple):
-    """Errors of a held quantity over a segment, in SI. A segment with a begin outside the band has overshoot and settling."""
+    """Errors of a held quantity over a segment, in SI. A segment with a begin outside the band has
+    overshoot and settling.
+    """
 
     quantity: str
     rms: float
@@ -60,7 +64,9 @@ class FlownLeg(NamedTuple):
     start: float  # s, from then on the aircraft is under way to the leg
     joined: float | None  # s, from then on the aircraft is on the leg; None: never
     stop: float  # s
-    result: str  # "flown", "missed", or "not ended": by another command, or by the end of the flight
+    result: (
+        str  # "flown", "missed", or "not ended": by another command, or by the end of the flight
+    )
     missed: float  # m, distance from the end of a missed leg; else 0
 
 
@@ -76,16 +82,26 @@ class Segment(NamedTuple):
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin a single segment."""
+    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart
+    begin a single segment.
+    """
     t = tape.time("guidance")
     errors = control_errors(tape)
     times = sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
     targets = [f"target.{name}" for name in TARGETS if f"target.{name}" in log.names]
-    named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
+    named = [
+        "mode.lateral",
+        "mode.vertical",
+        "leg",
+        *targets,
+        *(name for name in ("joining",) if name in log.names),
+    ]
     columns = np.column_stack([log[name] for name in named])
     follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
-    columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = 0.0  # they change along the leg
+    columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = (
+        0.0  # they change along the leg
+    )
     changes = np.any(np.diff(columns, axis=0) != 0.0, axis=1)
     starts = [0]
     for k in np.flatnonzero(changes) + 1:
@@ -97,8 +113,15 @@ def segments(tape: Tape) -> list[Segment]:
         lateral = Lateral(int(log["mode.lateral"][last]))
         vertical = Vertical(int(log["mode.vertical"][last]))
         on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
-        quantities = (on_path, "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(), "V")
-        held = [_held(name, t[first:after], errors[name][first:after], times[first:after]) for name in quantities]
+        quantities = (
+            on_path,
+            "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(),
+            "V",
+        )
+        held = [
+            _held(name, t[first:after], errors[name][first:after], times[first:after])
+            for name in quantities
+        ]
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
         flown.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
     return flown
@@ -126,15 +149,25 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
         missed = float(log["missed"][after]) if ends else 0.0
         result = "not ended" if not ends else "missed" if missed else "flown"
         joined = float(t[first + on_leg[0]]) if len(on_leg) else None
-        flown.append(FlownLeg(int(legs[first]), float(t[first]), joined, float(t[min(after, len(t) - 1)]), result, missed))
+        flown.append(
+            FlownLeg(
+                int(legs[first]),
+                float(t[first]),
+                joined,
+                float(t[min(after, len(t) - 1)]),
+                result,
+                missed,
+            )
+        )
     return flown
 
 
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     """Numbers of the legs ahead at the end of the flight, the leg under way among them.
 
-    The last leg of a route is an orbit without end and not among them. Empty where a command replaced the route, and for a
-    route outside the log. A route that the fence, a lost pose or a lost link ended has its legs still ahead.
+    The last leg of a route is an orbit without end and not among them. Empty where a command
+    replaced the route, and for a route outside the log. A route that the fence, a lost pose or a
+    lost link ended has its legs still ahead.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
@@ -142,8 +175,12 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
         return range(0)
     last = int(on_route[-1])
     limit = section.home.link_timeout or math.inf
-    lost = LINK_AGE in log.names and last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
-    replaced = last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
+    lost = (
+        LINK_AGE in log.names and last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
+    )
+    replaced = (
+        last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
+    )
     route = None if replaced else known_routes(tape, section).get(int(log["route"][last]))
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
 
@@ -157,9 +194,16 @@ class Outside(NamedTuple):
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Time outside of the fence by `pose`, as of the first step of guidance; None without a fence, or without a pose then."""
+    """Time outside of the fence by `pose`, as of the first step of guidance; None without a fence,
+    or without a pose then.
+    """
     fence = None if section is None else section.fence_zones()
-    if fence is None or "pose" not in tape or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
+    if (
+        fence is None
+        or "pose" not in tape
+        or "guidance" not in tape
+        or not len(tape["guidance"].stamp_ns)
+    ):
         return None
     begun = tape["pose"].stamp_ns >= tape["guidance"].stamp_ns[0]
     t = tape.time("pose")[begun]
@@ -169,14 +213,17 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     is_outside = inside < 0.0
     lasted = float(np.sum(np.diff(t)[is_outside[:-1]]))
     after_inside = is_outside & (np.maximum.accumulate(inside) >= 0.0)
-    return Outside(lasted, max(float(-np.min(inside)), 0.0), bool(after_inside.any() or is_outside[-1]))
+    return Outside(
+        lasted, max(float(-np.min(inside)), 0.0), bool(after_inside.any() or is_outside[-1])
+    )
 
 
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
     """What a map shows of a mission, ready for JSON, in m.
 
-    `route` and `legs` of the routes, points of the line and [number, north, east]; `to_end`, the lengths after each leg of the
-    last route up to its last orbit; `fence` and `home` as in the section.
+    `route` and `legs` of the routes, points of the line and [number, north, east]; `to_end`, the
+    lengths after each leg of the last route up to its last orbit; `fence` and `home` as in the
+    section.
     """
     legs: list[list[float]] = []
     outline: list[Any] = []
@@ -194,13 +241,19 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """The legs of a summary with their results: "legs: 0 flown, 1 missed by 321 m, 2 not ended"; empty without legs."""
-    results = [f"{leg['leg']} {leg['result']}" + (f" by {leg['missed']:.0f} m" if leg["missed"] else "") for leg in legs]
+    """The legs of a summary with their results: "legs: 0 flown, 1 missed by 321 m, 2 not ended";
+    empty without legs.
+    """
+    results = [
+        f"{leg['leg']} {leg['result']}" + (f" by {leg['missed']:.0f} m" if leg["missed"] else "")
+        for leg in legs
+    ]
     return f"legs: {', '.join(results)}" if results else ""
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Errors of the quantities of guidance, measured less commanded, at the samples of `guidance`, shape (N,).
+    """Errors of the quantities of guidance, measured less commanded, at the samples of `guidance`,
+    shape (N,).
 
     The cross-track error comes from the log, positive to the right. Angles are within half a turn.
     """
@@ -241,18 +294,25 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     flown = known_routes(tape, section)
     notes = []
     for number, k in zip(*np.unique(log["route"], return_index=True), strict=True):
-        notes += [Notice(float(t[k]), text) for text in (flown[int(number)].notes if int(number) in flown else ())]
+        notes += [
+            Notice(float(t[k]), text)
+            for text in (flown[int(number)].notes if int(number) in flown else ())
+        ]
     notices = notes + section.notices().read_log(t, {name: log[name] for name in log.names})
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 
 def _segment_figures(segment: Segment) -> dict[str, Any]:
     """The figures of a segment and of the held quantities."""
-    return segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
+    return segment._asdict() | {
+        name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")
+    }
 
 
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
-    """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without guidance."""
+    """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without
+    guidance.
+    """
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None
     log = tape["guidance"]
@@ -270,9 +330,15 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
 
 
 def _mean_wind(tape: Tape) -> dict[str, float] | None:
-    """Mean of the estimated wind to the north and to the east, m/s; None for a log of a version without the channels."""
+    """Mean of the estimated wind to the north and to the east, m/s; None for a log of a version
+    without the channels.
+    """
     log = tape["guidance"]
-    return {name: float(np.mean(log[f"wind.{name}"])) for name in WIND} if "wind.north" in log.names else None
+    return (
+        {name: float(np.mean(log[f"wind.{name}"])) for name in WIND}
+        if "wind.north" in log.names
+        else None
+    )
 
 
 def _largest(values: NDArray[np.float64]) -> float:

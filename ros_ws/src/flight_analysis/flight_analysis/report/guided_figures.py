@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a guided flight: ground track, altitude, airspeed and attitude over their commands, cross-track error."""
+"""Figures of a guided flight: ground track, altitude, airspeed and attitude over their commands,
+cross-track error.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,9 +38,14 @@ TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
-MODE_SHADES = {Mode.DEAD_RECKONING: MODE_COLOURS[ControllerMode.HOLD], Mode.POSE_LOST: MODE_COLOURS[ControllerMode.RAMP]}
+MODE_SHADES = {
+    Mode.DEAD_RECKONING: MODE_COLOURS[ControllerMode.HOLD],
+    Mode.POSE_LOST: MODE_COLOURS[ControllerMode.RAMP],
+}
 
-Bounds = Mapping[str, tuple[float, float]]  # least and largest command by channel, SI; infinite without a limit
+Bounds = Mapping[
+    str, tuple[float, float]
+]  # least and largest command by channel, SI; infinite without a limit
 
 
 def guided_context(context: PlotContext) -> PlotContext:
@@ -48,7 +55,10 @@ def guided_context(context: PlotContext) -> PlotContext:
     stale = []
     for shaded, colour in MODE_SHADES.items():
         label = f"guidance: {shaded.name.lower().replace('_', ' ')}"
-        stale += [Interval(label, start, stop, colour, False) for start, stop in mask_spans(t, mode == shaded)]
+        stale += [
+            Interval(label, start, stop, colour, False)
+            for start, stop in mask_spans(t, mode == shaded)
+        ]
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
 
 
@@ -70,18 +80,30 @@ def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
     if scenario is None or scenario.guidance is None:
         return []
     flown = set(tape["guidance"]["route"].tolist())
-    return [route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown]
+    return [
+        route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown
+    ]
 
 
-def track_figure(tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None) -> Figure:
-    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s.
+def track_figure(
+    tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None
+) -> Figure:
+    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`:
+    trim speed V0, m/s.
 
     With the numbers of lines and circles, the start, the end, and the fence with home.
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
-    ends = {"x": pose["east"][[0, -1]], "y": pose["north"][[0, -1]], "text": ["start", "end"], "name": "start and end"}
-    _add_labels(figure, ends | {"marker": {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}})
+    ends = {
+        "x": pose["east"][[0, -1]],
+        "y": pose["north"][[0, -1]],
+        "text": ["start", "end"],
+        "name": "start and end",
+    }
+    _add_labels(
+        figure, ends | {"marker": {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}}
+    )
     for route in routes:
         _add_numbers(figure, route)
     if fence is not None:
@@ -91,14 +113,29 @@ def track_figure(tape: Tape, routes: Sequence[Route], speed: float, fence: Fence
 
 
 def _add_labels(figure: Figure, trace: dict[str, Any]) -> None:
-    labels = {"type": "scatter", "mode": "markers+text", "textposition": "top center", "hoverinfo": "skip", "showlegend": False}
+    labels = {
+        "type": "scatter",
+        "mode": "markers+text",
+        "textposition": "top center",
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
     figure.add(labels | trace)
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
     places = leg_places(route)
     north, east = (np.array(values) for values in zip(*places.values(), strict=True))
-    _add_labels(figure, {"x": east, "y": north, "text": [f"{number}" for number in places], "mode": "text", "name": "legs"})
+    _add_labels(
+        figure,
+        {
+            "x": east,
+            "y": north,
+            "text": [f"{number}" for number in places],
+            "mode": "text",
+            "name": "legs",
+        },
+    )
 
 
 def _add_fence(figure: Figure, fence: Fence) -> None:
@@ -111,18 +148,39 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
             east = zone.east[0] + zone.radius * np.sin(turn)
         line = {"color": END_STOP, "width": 2.0, "dash": "dot" if zone.exclude else "solid"}
         name = "keep out" if zone.exclude else "fence"
-        figure.add({"type": "scatter", "x": east, "y": north, "mode": "lines", "name": name, "line": line, "hoverinfo": "skip"})
+        figure.add(
+            {
+                "type": "scatter",
+                "x": east,
+                "y": north,
+                "mode": "lines",
+                "name": name,
+                "line": line,
+                "hoverinfo": "skip",
+            }
+        )
     home = {"x": [fence.home[1]], "y": [fence.home[0]], "text": ["home"], "name": "home"}
     _add_labels(figure, home | {"marker": {"color": END_STOP, "size": 9, "symbol": "diamond"}})
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
-    """Ground tracks over routes, equal axes: the tape of a guided flight and the colour by label."""
+    """Ground tracks over routes, equal axes: the tape of a guided flight and the colour by
+    label.
+    """
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
         line = {"color": REFERENCE, "width": 6.0}
-        north, east, _ = (np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True))
-        outline = {"type": "scatter", "x": east, "y": north, "mode": "lines", "name": "route", "line": line}
+        north, east, _ = (
+            np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True)
+        )
+        outline = {
+            "type": "scatter",
+            "x": east,
+            "y": north,
+            "mode": "lines",
+            "name": "route",
+            "line": line,
+        }
         figure.add(outline | {"hoverinfo": "skip"})
     for label, (tape, colour) in tracks.items():
         t = tape.time("guidance")
@@ -130,22 +188,36 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
         keep = np.unique(np.linspace(0, len(t) - 1, TRACK_POINTS).astype(int))
         north, east = (pose[name][keep].astype(np.float32) for name in ("north", "east"))
         line = {"color": colour, "width": 1.4}
-        track = {"type": "scatter", "x": east, "y": north, "mode": "lines", "name": label, "line": line}
-        figure.add(track | {"text": [f"t = {instant:.1f} s" for instant in t[keep]], "hoverinfo": "x+y+text"})
+        track = {
+            "type": "scatter",
+            "x": east,
+            "y": north,
+            "mode": "lines",
+            "name": label,
+            "line": line,
+        }
+        figure.add(
+            track
+            | {"text": [f"t = {instant:.1f} s" for instant in t[keep]], "hoverinfo": "x+y+text"}
+        )
     figure.x[0]["title"] = {"text": "east (m)"}
     figure.y[0] |= {"title": {"text": "north (m)"}, "scaleanchor": "x", "scaleratio": 1.0}
     return set_layout(figure, labels=16)
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
-    """Mean wind over equal parts of the flight, to the north and to the east, m/s, shape (parts, 2).
+    """Mean wind over equal parts of the flight, to the north and to the east, m/s, shape (parts,
+    2).
 
-    The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
+    The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi +
+    beta, with V = V0 + V of y.
     """
     log = tape["guidance"]
     pose = log.group("pose")
     heading = log["pose.psi"] + log["pose.beta"]
-    wind = np.column_stack(wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, speed + log["y.V"]))
+    wind = np.column_stack(
+        wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, speed + log["y.V"])
+    )
     return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
 
 
@@ -155,21 +227,47 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
     if (strongest := float(strength.max())) < LEAST_WIND:
         return
     pose = tape["guidance"].group("pose")
-    middles = [int(part[len(part) // 2]) for part in np.array_split(np.arange(len(pose.stamp_ns)), len(wind))]
+    middles = [
+        int(part[len(part) // 2])
+        for part in np.array_split(np.arange(len(pose.stamp_ns)), len(wind))
+    ]
     for k, (to_north, to_east) in zip(middles, wind * (ARROW_PIXELS / strongest), strict=True):
-        arrow = {"x": pose["east"][k], "y": pose["north"][k], "ax": -to_east, "ay": to_north, "text": ""}  # ay points down
+        arrow = {
+            "x": pose["east"][k],
+            "y": pose["north"][k],
+            "ax": -to_east,
+            "ay": to_north,
+            "text": "",
+        }  # ay points down
         arrow |= {"showarrow": True, "arrowhead": 2, "arrowwidth": 1.6, "arrowcolor": WIND}
         figure.layout["annotations"].append(arrow)
     label = f"wind, the longest arrow {strongest:.2g} m/s"
-    figure.add({"type": "scatter", "x": [None], "y": [None], "mode": "lines", "name": label, "line": {"color": WIND}})
+    figure.add(
+        {
+            "type": "scatter",
+            "x": [None],
+            "y": [None],
+            "mode": "lines",
+            "name": label,
+            "line": {"color": WIND},
+        }
+    )
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
-    """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim speed V0, m/s."""
+    """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim
+    speed V0, m/s.
+    """
     log = context.tape["guidance"]
-    commanded = np.where(np.isin(log["mode.vertical"], [Vertical.ALTITUDE, Vertical.PROFILE]), log["target.altitude"], np.nan)
+    commanded = np.where(
+        np.isin(log["mode.vertical"], [Vertical.ALTITUDE, Vertical.PROFILE]),
+        log["target.altitude"],
+        np.nan,
+    )
     commands = {"altitude": commanded, "V": log["V_c"]}
-    return _over_commands(context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds)
+    return _over_commands(
+        context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds
+    )
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
@@ -177,12 +275,17 @@ def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
     log = context.tape["guidance"]
     names = ("phi", "theta")
     return _over_commands(
-        context, {name: log[f"{name}_c"] for name in names}, {name: log[f"pose.{name}"] for name in names}, bounds
+        context,
+        {name: log[f"{name}_c"] for name in names},
+        {name: log[f"pose.{name}"] for name in names},
+        bounds,
     )
 
 
 def cross_track_figure(context: PlotContext) -> Figure | None:
-    """Cross-track error while a path is followed, by leg of the route; None for a flight without a path."""
+    """Cross-track error while a path is followed, by leg of the route; None for a flight without a
+    path.
+    """
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]
     on_path = np.isin(lateral, [Lateral.ORBIT, Lateral.ROUTE])
@@ -196,16 +299,23 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     spans = []
     for leg in np.unique(legs[legs >= 0.0]):
         colour = END_STOP if leg % 2 else "#ffffff"
-        spans += [Interval(f"leg {int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)]
+        spans += [
+            Interval(f"leg {int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)
+        ]
     return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})
 
 
 def _signal(context: PlotContext, channels: Mapping[str, FloatArray]) -> Signal:
-    return Signal(context.tape["guidance"].stamp_ns, tuple(channels), np.stack(list(channels.values())).T)
+    return Signal(
+        context.tape["guidance"].stamp_ns, tuple(channels), np.stack(list(channels.values())).T
+    )
 
 
 def _over_commands(
-    context: PlotContext, commands: Mapping[str, FloatArray], flown: Mapping[str, FloatArray], bounds: Bounds
+    context: PlotContext,
+    commands: Mapping[str, FloatArray],
+    flown: Mapping[str, FloatArray],
+    bounds: Bounds,
 ) -> Figure:
     curves = {
         "command": Curve(_signal(context, commands), REFERENCE, 5.0),
@@ -224,8 +334,17 @@ def _over_commands(
         view = (low - margin, high + margin)
         for bound, edge in zip((lower, upper), view, strict=True):
             if math.isfinite(bound):
-                shape = {"type": "rect", "x0": 0.0, "x1": context.end, "y0": bound, "y1": edge, "layer": "below"}
+                shape = {
+                    "type": "rect",
+                    "x0": 0.0,
+                    "x1": context.end,
+                    "y0": bound,
+                    "y1": edge,
+                    "layer": "below",
+                }
                 shape |= {"xref": axis("x", index), "yref": axis("y", index), "line": {"width": 0}}
-                figure.layout["shapes"].append(shape | {"fillcolor": END_STOP, "opacity": INTERVAL_OPACITY})
+                figure.layout["shapes"].append(
+                    shape | {"fillcolor": END_STOP, "opacity": INTERVAL_OPACITY}
+                )
         figure.y[index]["range"] = view
     return set_layout(figure, labels=16)

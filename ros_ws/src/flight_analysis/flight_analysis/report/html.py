@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report as an HTML page without network access: tables and figures of a flight, or a comparison of flights."""
+"""The report as an HTML page without network access: tables and figures of a flight, or a
+comparison of flights.
+"""
 
 import base64
 import json
@@ -15,7 +17,14 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report import comparison, figures, guided_figures, margin_figures, plotting, tables
+from flight_analysis.report import (
+    comparison,
+    figures,
+    guided_figures,
+    margin_figures,
+    plotting,
+    tables,
+)
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay
 from flight_analysis.report.summary import (
@@ -37,7 +46,9 @@ HERE = Path(__file__).parent
 
 
 class Line(NamedTuple):
-    """A line under the title: colour, label and outcome of a flight, and text; any part may be empty."""
+    """A line under the title: colour, label and outcome of a flight, and text; any part may be
+    empty.
+    """
 
     text: str
     outcome: str = ""
@@ -108,14 +119,23 @@ def _imported_page(flight: RecordedFlight) -> Page:
     pose = None
     spectrum = figures.spectrum_figure({"u": (tape, flight.period_ns)}, {"u": colour}, flight.units)
     if "pose" in tape:
-        pose = time_series_figure(context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2)
-    text = f"{format_seconds(flight.summary['duration'])} of {source['log']}, {source['kind']}, by the map {source['map']}."
+        pose = time_series_figure(
+            context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2
+        )
+    text = (
+        f"{format_seconds(flight.summary['duration'])} of {source['log']}, {source['kind']}, "
+        f"by the map {source['map']}."
+    )
     return Page(
         f"Flight {flight.name}",
         [Line(text)],
         [TableGroup(flight_tables)],
         [
-            Section("Output y", "about trim", time_series_figure(context, {"y": Curve(tape["y"], colour)})),
+            Section(
+                "Output y",
+                "about trim",
+                time_series_figure(context, {"y": Curve(tape["y"], colour)}),
+            ),
             Section("Input u", "about trim", figures.input_figure(context, {})),
             Section("Pose", "", pose),
             Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
@@ -131,16 +151,21 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     gusts = flight.gusts
     context = figures.plot_context(flight.tape, units, gusts)
     loop = _linear_loop(scenario)
-    flight_tables = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts, scenario))
+    flight_tables = tables.flight_tables(
+        flight.summary, units, tables.events(flight.tape, gusts, scenario)
+    )
+    description = filter(None, [_description(flight, scenario), command_results(flight.summary)])
     return Page(
         f"Flight {flight.name}",
+        [Line(f"{'; '.join(description)}.", flight.summary["outcome"])],
         [
-            Line(
-                f"{'; '.join(filter(None, [_description(flight, scenario), command_results(flight.summary)]))}.",
-                flight.summary["outcome"],
+            TableGroup(
+                [
+                    *flight_tables,
+                    *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))]),
+                ]
             )
         ],
-        [TableGroup([*flight_tables, *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))])])],
         [*_sections(flight, scenario, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,
         flight.summary["notes"],
@@ -152,13 +177,18 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context = comparison.plot_context(flights)
     colours = comparison.colours(flights)
     scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
-    runs = {label: (flight.tape, flight.period_ns) for label, flight in zip(colours, flights, strict=True)}
+    runs = {
+        label: (flight.tape, flight.period_ns)
+        for label, flight in zip(colours, flights, strict=True)
+    }
     lines = []
     for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
         lines.append(Line(text, flight.summary["outcome"], label, colour))
     palette = list(colours.values())
-    legend = ". ".join(dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]))
+    legend = ". ".join(
+        dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND])
+    )
     inputs = comparison.metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
     groups = [
         TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
@@ -166,27 +196,48 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
     ]
     sections = [
-        Section("Output y over the reference y_m", "", comparison.tracking_figure(context, flights)),
+        Section(
+            "Output y over the reference y_m", "", comparison.tracking_figure(context, flights)
+        ),
         Section("Tracking error e = y - y_m", "", comparison.error_figure(context, flights)),
         Section("Input u", "", comparison.input_figure(context, flights)),
-        Section("Spectrum of u", "", figures.spectrum_figure(runs, colours, context.units), over_time=False),
+        Section(
+            "Spectrum of u",
+            "",
+            figures.spectrum_figure(runs, colours, context.units),
+            over_time=False,
+        ),
         Section("Timing of the ticks", "", figures.timing_figure(runs, colours), over_time=False),
     ]
-    guided = {label: flight for label, flight in zip(colours, flights, strict=True) if flight.summary["guidance"] is not None}
+    guided = {
+        label: flight
+        for label, flight in zip(colours, flights, strict=True)
+        if flight.summary["guidance"] is not None
+    }
     if guided:
         first = next(iter(guided.values()))
         routes = guided_figures.flown_routes(first.scenario, first.tape)
         tracks = {label: (flight.tape, colours[label]) for label, flight in guided.items()}
-        sections.insert(0, Section("Ground track", "", guided_figures.tracks_figure(tracks, routes), over_time=False))
+        sections.insert(
+            0,
+            Section(
+                "Ground track", "", guided_figures.tracks_figure(tracks, routes), over_time=False
+            ),
+        )
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
 
 
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:
     controller = scenario.controller
-    return f"{format_seconds(flight.summary['duration'])} flown at {controller.rate:g} Hz with the {controller.summary()}"
+    return (
+        f"{format_seconds(flight.summary['duration'])} flown at {controller.rate:g} Hz with "
+        f"the {controller.summary()}"
+    )
 
 
-def _sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
+def _sections(
+    flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext
+) -> list[Section]:
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
     limits = figures.input_limits(scenario, flight.tape)
     run = (flight.tape, flight.period_ns)
@@ -202,12 +253,14 @@ def _sections(flight: RecordedFlight, scenario: Scenario, context: plotting.Plot
         ),
         Section(
             "Input u and the actuators",
-            "Limits are in view where u comes near them. Marks above each row: the controller saturated the input.",
+            "Limits are in view where u comes near them. Marks above each row: the controller "
+            "saturated the input.",
             figures.input_figure(context, limits),
         ),
         Section(
             "What was learned",
-            "A and B as identified, SI, with bars of two standard deviations; open marks: no model was proposed",
+            "A and B as identified, SI, with bars of two standard deviations; open marks: no "
+            "model was proposed",
             figures.learned_figure(context),
         ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
@@ -224,12 +277,19 @@ def _sections(flight: RecordedFlight, scenario: Scenario, context: plotting.Plot
             "late: after its deadline; age: of y at the tick; dt: as integrated",
             figures.tick_figure(context),
         ),
-        Section("Timing of the ticks", "", figures.timing_figure({"": run}, {"": colour}), over_time=False),
+        Section(
+            "Timing of the ticks",
+            "",
+            figures.timing_figure({"": run}, {"": colour}),
+            over_time=False,
+        ),
     ]
 
 
 def _linear_loop(scenario: Scenario) -> LinearLoop | None:
-    """The linear loop of a scenario; None without one: the literal sign, an aircraft without a model."""
+    """The linear loop of a scenario; None without one: the literal sign, an aircraft without a
+    model.
+    """
     try:
         return scenario_loop(scenario, scenario.controller)
     except ParameterError:
@@ -237,7 +297,10 @@ def _linear_loop(scenario: Scenario) -> LinearLoop | None:
 
 
 def _loop_sections(loop: LinearLoop) -> list[Section]:
-    hint = f"L at each input, the other inputs closed: the sampled loop with actuators, delay and hold; {loop.model}"
+    hint = (
+        "L at each input, the other inputs closed: the sampled loop with actuators, delay "
+        f"and hold; {loop.model}"
+    )
     return [
         Section("Bode plot of the loop", hint, margin_figures.bode_figure(loop), over_time=False),
         Section(
@@ -249,7 +312,9 @@ def _loop_sections(loop: LinearLoop) -> list[Section]:
     ]
 
 
-def _guidance_sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
+def _guidance_sections(
+    flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext
+) -> list[Section]:
     if flight.summary["guidance"] is None:
         return []
     speed = scenario.aircraft.channels().speed
@@ -260,9 +325,11 @@ def _guidance_sections(flight: RecordedFlight, scenario: Scenario, context: plot
     return [
         Section(
             "Ground track",
-            "North is up. Numbers: legs of the route. Arrows: mean wind over a part of the flight, from the velocities over"
-            " ground and through the air.",
-            guided_figures.track_figure(flight.tape, routes, speed, None if guidance is None else guidance.fence_zones()),
+            "North is up. Numbers: legs of the route. Arrows: mean wind over a part of the "
+            "flight, from the velocities over ground and through the air.",
+            guided_figures.track_figure(
+                flight.tape, routes, speed, None if guidance is None else guidance.fence_zones()
+            ),
             over_time=False,
             opens=True,
         ),
@@ -272,7 +339,9 @@ def _guidance_sections(flight: RecordedFlight, scenario: Scenario, context: plot
             guided_figures.vertical_figure(context, speed, bounds),
         ),
         Section("Attitude over its commands", "", guided_figures.attitude_figure(context, bounds)),
-        Section("Cross-track error", "positive to the right", guided_figures.cross_track_figure(context)),
+        Section(
+            "Cross-track error", "positive to the right", guided_figures.cross_track_figure(context)
+        ),
     ]
 
 
@@ -284,7 +353,11 @@ def page_html(page: Page) -> str:
 def _parts(page: Page) -> Iterator[str]:
     """The text of a page in parts: that of a long flight has some 100 MB."""
     environment = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters |= {"script_json": script_json, "ratio": format_ratio, "css": Markup}
     return environment.get_template("page.html.jinja").generate(
@@ -298,7 +371,9 @@ def _parts(page: Page) -> Iterator[str]:
 
 def script_json(value: Any) -> Markup:
     """JSON for a script element: "<" occurs only in strings, as an escape."""
-    content = finite_or_null({"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value)
+    content = finite_or_null(
+        {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
+    )
     text = json.dumps(content, default=_typed_array, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c"))  # noqa: S704
 

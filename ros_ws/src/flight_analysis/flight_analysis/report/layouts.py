@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layouts of Foxglove, PlotJuggler and RViz for the runs of a scenario or of a fleet.
 
-Foxglove addresses a channel by the index in `position`, PlotJuggler by the name. A layout therefore fits every scenario with
-the same channels in the same order.
+Foxglove addresses a channel by the index in `position`, PlotJuggler by the name. A layout therefore
+fits every scenario with the same channels in the same order.
 """
 
 import json
@@ -59,7 +59,9 @@ class Tab(NamedTuple):
 def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
     """The channels of the topics of a run."""
     controller = scenario.controller
-    guided = {} if scenario.guidance is None else {"guidance": guidance.names(scenario.guidance.outputs)}
+    guided = (
+        {} if scenario.guidance is None else {"guidance": guidance.names(scenario.guidance.outputs)}
+    )
     return guided | {
         "y": tuple(scenario.aircraft.channels().outputs),
         "y_m": scenario.reference_model.outputs,
@@ -70,15 +72,20 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def tabs_of(channels: Channels) -> tuple[Tab, ...]:
-    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind.
+    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of
+    the controller, the wind.
 
     A guided flight has a further tab, of the commands and measurements of guidance.
     """
     outputs = channels["y_m"]
     wind = [name for name in channels["truth"] if name.startswith("gust.")]
-    inputs = [name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")]
+    inputs = [
+        name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")
+    ]
     integrals = [f"{group}.{name}" for name, group in product(outputs, ("integral_e", "Pi"))]
-    integrals = [name for name in integrals if name in channels["internals"]]  # another law may have neither
+    integrals = [
+        name for name in integrals if name in channels["internals"]
+    ]  # another law may have neither
 
     def log(title: str, *names: str) -> Plot:
         return Plot(title, tuple(("internals", name) for name in names))
@@ -96,9 +103,15 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
     )
     return (
         *([Tab("guidance", held)] if "guidance" in channels else []),
-        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (("y", name), ("y_m", name))) for name in outputs)),
+        Tab(
+            "tracking",
+            tuple(Plot(f"{name}: y, y_m", (("y", name), ("y_m", name))) for name in outputs),
+        ),
         Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
-        Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
+        Tab(
+            "input",
+            tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs),
+        ),
         Tab("integrals", tuple(log(name.replace(".", " "), name) for name in integrals)),
         Tab(
             "controller",
@@ -114,10 +127,11 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
 
 
 def foxglove(aircraft: Mapping[str, Channels]) -> str:
-    """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels. `aircraft`: channels by namespace, "" the root.
+    """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels. `aircraft`: channels
+    by namespace, "" the root.
 
-    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep. With
-    several aircraft each namespace has a tab, beside a common map.
+    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from
+    log time in lockstep. With several aircraft each namespace has a tab, beside a common map.
     """
     panels: dict[str, Any] = {}
     tabs: list[dict[str, Any]] = []
@@ -136,7 +150,9 @@ def foxglove(aircraft: Mapping[str, Channels]) -> str:
     return json.dumps({"configById": panels, **defaults, "layout": "Tab!rise_di"}, indent=2) + "\n"
 
 
-def _foxglove_tabs(panels: dict[str, Any], namespace: str, channels: Channels) -> list[dict[str, Any]]:
+def _foxglove_tabs(
+    panels: dict[str, Any], namespace: str, channels: Channels
+) -> list[dict[str, Any]]:
     """The tabs of an aircraft; their plots are added to the panels."""
     tabs = []
     for tab in tabs_of(channels):
@@ -183,9 +199,11 @@ def _foxglove_plot(plot: Plot, namespace: str, channels: Channels) -> dict[str, 
 def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
     return {
         "cameraState": {
-            "distance": CAMERA_DISTANCE, "perspective": True, "phi": 45.0, "thetaOffset": 0.0, "fovy": 45.0,
+            "distance": CAMERA_DISTANCE, "perspective": True, "phi": 45.0, "thetaOffset": 0.0,
+            "fovy": 45.0,
             "near": 1.0, "far": 100.0 * CAMERA_DISTANCE,
-            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.0], "targetOrientation": [0.0, 0.0, 0.0, 1.0],
+            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.0],
+            "targetOrientation": [0.0, 0.0, 0.0, 1.0],
         },
         "followMode": "follow-none",
         "followTf": "map",
@@ -194,8 +212,10 @@ def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
         "topics": {_topic(*pair): {"visible": True} for pair in product(namespaces, MAP_TOPICS)},
         "layers": {
             "grid": {
-                "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid", "frameId": "map",
-                "size": GRID_SIZE, "divisions": 10, "color": "#808080ff", "position": [0, 0, 0], "rotation": [0, 0, 0],
+                "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid",
+                "frameId": "map",
+                "size": GRID_SIZE, "divisions": 10, "color": "#808080ff", "position": [0, 0, 0],
+                "rotation": [0, 0, 0],
             }
         },
     }  # fmt: skip
@@ -203,7 +223,9 @@ def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
 
 def _mosaic(names: Sequence[str]) -> Any:
     """Panels in rows of COLUMNS as a binary tree: a node splits off the first panel."""
-    rows = [_split(names[start : start + COLUMNS], "row") for start in range(0, len(names), COLUMNS)]
+    rows = [
+        _split(names[start : start + COLUMNS], "row") for start in range(0, len(names), COLUMNS)
+    ]
     return _split(rows, "column")
 
 
@@ -212,7 +234,12 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
     if not others:
         return first
     share = 100.0 / len(parts)
-    return {"direction": direction, "first": first, "second": _split(others, direction), "splitPercentage": share}
+    return {
+        "direction": direction,
+        "first": first,
+        "second": _split(others, direction),
+        "splitPercentage": share,
+    }
 
 
 def _plotjuggler_tab(window: ElementTree.Element, namespace: str, tab: Tab) -> None:
@@ -230,9 +257,13 @@ def _plotjuggler_tab(window: ElementTree.Element, namespace: str, tab: Tab) -> N
 
 
 def plotjuggler(aircraft: Mapping[str, Channels]) -> str:
-    """A layout of PlotJuggler: XML, tabs of docked plots, curves "/topic/channel/position". `aircraft` as in `foxglove`."""
+    """A layout of PlotJuggler: XML, tabs of docked plots, curves "/topic/channel/position".
+    `aircraft` as in `foxglove`.
+    """
     root = ElementTree.Element("root")
-    window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
+    window = ElementTree.SubElement(
+        root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"}
+    )
     for namespace, channels in aircraft.items():
         for tab in tabs_of(channels):
             _plotjuggler_tab(window, namespace, tab)
@@ -244,7 +275,9 @@ def plotjuggler(aircraft: Mapping[str, Channels]) -> str:
 
 def _splitter(parent: ElementTree.Element, orientation: str, count: int) -> ElementTree.Element:
     sizes = ";".join([f"{1.0 / count:.6g}"] * count)
-    return ElementTree.SubElement(parent, "DockSplitter", {"orientation": orientation, "count": str(count), "sizes": sizes})
+    return ElementTree.SubElement(
+        parent, "DockSplitter", {"orientation": orientation, "count": str(count), "sizes": sizes}
+    )
 
 
 def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot, namespace: str) -> None:
@@ -253,22 +286,40 @@ def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot, namespace: str) -
         area, "plot", {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
     )
     for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False):
-        ElementTree.SubElement(element, "curve", {"name": f"{_topic(namespace, topic)}/{channel}/position", "color": colour})
+        ElementTree.SubElement(
+            element,
+            "curve",
+            {"name": f"{_topic(namespace, topic)}/{channel}/position", "color": colour},
+        )
 
 
 def rviz(namespaces: Sequence[str], description: Path) -> str:
-    """A configuration of RViz: aircraft, path and route of each namespace in the frame `map`, a camera that follows the first.
+    """A configuration of RViz: aircraft, path and route of each namespace in the frame `map`, a
+    camera that follows the first.
 
     `description`: the file of `urdf`.
     """
     displays: list[dict[str, Any]] = [
-        {"Class": "rviz_default_plugins/Grid", "Name": "Grid", "Cell Size": 100.0, "Plane Cell Count": int(GRID_SIZE / 100.0)}
+        {
+            "Class": "rviz_default_plugins/Grid",
+            "Name": "Grid",
+            "Cell Size": 100.0,
+            "Plane Cell Count": int(GRID_SIZE / 100.0),
+        }
     ]
     for name in namespaces:
-        model = {"Description Source": "File", "Description File": str(description), "TF Prefix": name}
+        model = {
+            "Description Source": "File",
+            "Description File": str(description),
+            "TF Prefix": name,
+        }
         displays += [
             {"Class": "rviz_default_plugins/RobotModel", "Name": name or "aircraft"} | model,
-            {"Class": "rviz_default_plugins/Path", "Name": f"{name} path".strip(), "Topic": {"Value": _topic(name, "path")}},
+            {
+                "Class": "rviz_default_plugins/Path",
+                "Name": f"{name} path".strip(),
+                "Topic": {"Value": _topic(name, "path")},
+            },
             {
                 "Class": "rviz_default_plugins/MarkerArray",
                 "Name": f"{name} route".strip(),
@@ -282,7 +333,9 @@ def rviz(namespaces: Sequence[str], description: Path) -> str:
         "Displays": [display | {"Enabled": True, "Value": True} for display in displays],
         "Global Options": {"Fixed Frame": "map", "Frame Rate": 30},
         "Tools": [{"Class": "rviz_default_plugins/MoveCamera"}],
-        "Views": {"Current": {"Class": "rviz_default_plugins/Orbit", "Name": "Current View"} | behind},
+        "Views": {
+            "Current": {"Class": "rviz_default_plugins/Orbit", "Name": "Current View"} | behind
+        },
     }
     panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
     return yaml.safe_dump({"Panels": panels, "Visualization Manager": manager}, sort_keys=False)

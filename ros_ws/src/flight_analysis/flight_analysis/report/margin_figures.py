@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of a linear loop as rows of a table, as figures of a file, and as Bode and Nyquist plots."""
+"""Margins of a linear loop as rows of a table, as figures of a file, and as Bode and Nyquist
+plots.
+"""
 
 import math
 from collections.abc import Sequence
@@ -28,8 +30,10 @@ ALONE = ".3g"  # format of a column without the worst aircraft
 FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
 ALL_INPUTS = "all inputs"
 MARGIN_LEGEND = (
-    "one input open, all others closed: phase margin and its frequency, gain margin, largest sensitivity, balanced disk margin,"
-    " delay margin. all inputs: an independent disk of this size in each input at once, the phase and gain that it guarantees,"
+    "one input open, all others closed: phase margin and its frequency, gain margin, largest "
+    "sensitivity, balanced disk margin,"
+    " delay margin. all inputs: an independent disk of this size in each input at once, the "
+    "phase and gain that it guarantees,"
     " the largest sensitivity under diagonal scaling, the delay in all inputs"
 )
 SHOWN_DAMPING = 0.8  # slow modes with less damping are listed
@@ -47,16 +51,26 @@ def decibels(factor: FloatArray | float) -> FloatArray:
 
 
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
-    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS: nominal (worst uncertain aircraft)."""
+    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS: nominal (worst uncertain
+    aircraft).
+    """
     columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
     uncertain = columns
     if margins.worst is not None:
-        uncertain = _values(margins.worst, (*[math.nan] * len(margins.inputs), margins.worst_delay or 0.0))
+        uncertain = _values(
+            margins.worst, (*[math.nan] * len(margins.inputs), margins.worst_delay or 0.0)
+        )
     rows = []
     for i, name in enumerate((*margins.inputs, ALL_INPUTS)):
         pairs = zip(columns, uncertain, FORMATS, strict=True)
         rows.append(
-            [name, *(_cell(values[i], None if margins.worst is None else worst[i], form) for values, worst, form in pairs)]
+            [
+                name,
+                *(
+                    _cell(values[i], None if margins.worst is None else worst[i], form)
+                    for values, worst, form in pairs
+                ),
+            ]
         )
     return rows
 
@@ -79,7 +93,13 @@ def _cell(value: float, worst: float | None, form: str) -> str:
     """A value, and the value of the worst aircraft in parentheses."""
 
     def text(number: float) -> str:
-        return NO_VALUE if math.isnan(number) else "none" if math.isinf(number) else format(number, form)
+        return (
+            NO_VALUE
+            if math.isnan(number)
+            else "none"
+            if math.isinf(number)
+            else format(number, form)
+        )
 
     alone = worst is None or math.isnan(worst) or form == ALONE
     return text(value) if worst is None or alone else f"{text(value)} ({text(worst)})"
@@ -93,7 +113,8 @@ LEAST_MARGINS = {
     "damping of slow modes": ".2f",
     "delay margin, ms": ".0f",
 }
-"""The least margins of a loop, each with its format: of the worst input, or of all inputs at once."""
+"""The least margins of a loop, each with its format: of the worst input, or of all inputs at
+once."""
 
 
 def least_margins(margins: LoopMargins | None) -> list[str]:
@@ -111,7 +132,14 @@ def _least(margins: Margins, delay: float) -> list[float]:
     """LEAST_MARGINS of a set of margins, in the units of the names."""
     phase = np.degrees(margins.phase.min())
     gain = decibels(margins.gain.min())
-    values = (phase, gain, margins.sensitivity.max(), margins.disk_all, margins.damping, 1e3 * delay)
+    values = (
+        phase,
+        gain,
+        margins.sensitivity.max(),
+        margins.disk_all,
+        margins.damping,
+        1e3 * delay,
+    )
     return [float(value) for value in values]
 
 
@@ -119,23 +147,41 @@ def modes_text(margins: LoopMargins) -> str:
     """The slow modes with little damping as a sentence."""
     shown = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in shown)
-    least = f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}" if margins.worst is not None else ""
+    least = (
+        f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}"
+        if margins.worst is not None
+        else ""
+    )
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 
 def margin_table(margins: LoopMargins) -> Table:
     """The margins of a flight's loop."""
-    return Table("Margins of the linear loop", MARGIN_COLUMNS, margin_rows(margins), f"{MARGIN_LEGEND}. {modes_text(margins)}")
+    return Table(
+        "Margins of the linear loop",
+        MARGIN_COLUMNS,
+        margin_rows(margins),
+        f"{MARGIN_LEGEND}. {modes_text(margins)}",
+    )
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
     """The margins in SI: phase in rad, gain as factors, delay in s. None for an infinite margin."""
-    nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {"stable": bool(margins.nominal.stable)}
-    nominal["modes"] = [{"frequency": w, "damping": zeta} for w, zeta in zip(*map(list, margins.modes), strict=True)]
-    nominal["delay"] = {"all": margins.delay, "inputs": dict(zip(margins.inputs, margins.channel_delay, strict=True))}
+    nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {
+        "stable": bool(margins.nominal.stable)
+    }
+    nominal["modes"] = [
+        {"frequency": w, "damping": zeta} for w, zeta in zip(*map(list, margins.modes), strict=True)
+    ]
+    nominal["delay"] = {
+        "all": margins.delay,
+        "inputs": dict(zip(margins.inputs, margins.channel_delay, strict=True)),
+    }
     result: dict[str, Any] = {"nominal": nominal}
     if margins.worst is not None:
-        result["worst"] = _aircraft_as_json(margins.worst, margins.inputs) | {"delay": {"all": margins.worst_delay}}
+        result["worst"] = _aircraft_as_json(margins.worst, margins.inputs) | {
+            "delay": {"all": margins.worst_delay}
+        }
         result |= {"aircraft": margins.aircraft, "stable": margins.stable}
     return result
 
@@ -160,13 +206,21 @@ def bode_figure(loop: LinearLoop) -> Figure:
         phase = np.degrees(np.unwrap(np.angle(L[:, k])))
         phase -= 360.0 * np.ceil(phase[0] / 360.0)
         for place, (values, unit) in enumerate(((decibels(np.abs(L[:, k])), "dB"), (phase, "deg"))):
-            trace = _trace(name, colour, w, values) | {"hovertemplate": f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"}
+            trace = _trace(name, colour, w, values) | {
+                "hovertemplate": f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"
+            }
             figure.add(trace | {"showlegend": place == 0}, place)
     ends = [float(w[0]), float(w[-1])]
     for place, level in ((0, 0.0), (1, -180.0)):
-        add_line(figure, place, "", ends, [level, level], {"color": BOUND, "width": 1.0, "dash": "dot"})
+        add_line(
+            figure, place, "", ends, [level, level], {"color": BOUND, "width": 1.0, "dash": "dot"}
+        )
         figure.data[-1]["showlegend"] = False
-        figure.x[place] |= {"type": "log", "range": [math.log10(end) for end in ends], "showticklabels": place == 1}
+        figure.x[place] |= {
+            "type": "log",
+            "range": [math.log10(end) for end in ends],
+            "showticklabels": place == 1,
+        }
     figure.x[1] |= {"title": {"text": "rad/s"}, "matches": None}
     figure.y[0] |= {"title": {"text": "gain (dB)"}, "range": [-60.0, 60.0]}
     figure.y[1] |= {"title": {"text": "phase (deg)"}, "dtick": 90.0}
@@ -183,13 +237,26 @@ def nyquist_figure(loop: LinearLoop) -> Figure:
         "S = 2": (0.5 * np.cos(turn) - 1.0, 0.5 * np.sin(turn), BOUND),
     }
     for label, (x, y, colour) in circles.items():
-        add_line(figure, 0, label, x.tolist(), y.tolist(), {"color": colour, "width": 1.0, "dash": "dot"})
+        add_line(
+            figure, 0, label, x.tolist(), y.tolist(), {"color": colour, "width": 1.0, "dash": "dot"}
+        )
     for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
         near = np.abs(L[:, k]) < 10.0
-        figure.add(_trace(name, colour, L[near, k].real, L[near, k].imag) | {"hovertemplate": "%{x:.3g} %{y:+.3g} j"})
+        figure.add(
+            _trace(name, colour, L[near, k].real, L[near, k].imag)
+            | {"hovertemplate": "%{x:.3g} %{y:+.3g} j"}
+        )
     point = {"symbol": "cross", "size": 9, "color": BOUND}
     figure.add(
-        {"type": "scatter", "x": [-1.0], "y": [0.0], "mode": "markers", "name": "-1", "marker": point, "showlegend": False}
+        {
+            "type": "scatter",
+            "x": [-1.0],
+            "y": [0.0],
+            "mode": "markers",
+            "name": "-1",
+            "marker": point,
+            "showlegend": False,
+        }
     )
     across, up = NYQUIST_RANGE
     figure.x[0] |= {"title": {"text": "Re L"}, "range": list(across), "constrain": "domain"}

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a paper needs of flights: a figure as vectors in the width of a column, a MAT-file, a table a topic, LaTeX."""
+"""What a paper needs of flights: a figure as vectors in the width of a column, a MAT-file, a table
+a topic, LaTeX.
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -83,25 +85,38 @@ MATLAB_KEYWORDS = frozenset(
 
 
 def write_figure(
-    path: Path, flights: Sequence[RecordedFlight], width: str | float = WIDTH, channels: str | Sequence[str] = ()
+    path: Path,
+    flights: Sequence[RecordedFlight],
+    width: str | float = WIDTH,
+    channels: str | Sequence[str] = (),
 ) -> None:
-    """Write a figure for a paper: a row a channel, y over y_m, the error or u, in the width of a column.
+    """Write a figure for a paper: a row a channel, y over y_m, the error or u, in the width of a
+    column.
 
     Args:
         path: File: .pdf, .svg and .eps have vectors and text, .png pixels.
         flights: The flights, one curve each.
         width: Width of the figure, with a unit ("88mm", "3.5in") or in m.
-        channels: Names of outputs (y over y_m) and inputs (u), and "e.NAME" for the error of an output; empty: each output.
+        channels: Names of outputs (y over y_m) and inputs (u), and "e.NAME" for the error of an
+            output; empty: each output.
 
-    Raises ParameterError for a different ending, an unknown channel and a width that is not 30 mm to 1 m.
+    Raises ParameterError for a different ending, an unknown channel and a width that is not 30 mm
+    to 1 m.
     """
     import matplotlib as mpl  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     suffix = path.suffix.removeprefix(".").lower()
-    require(suffix in FORMATS, "figure", f"{path.name}", f"a name that ends in {', '.join(f'.{name}' for name in FORMATS)}")
+    require(
+        suffix in FORMATS,
+        "figure",
+        f"{path.name}",
+        f"a name that ends in {', '.join(f'.{name}' for name in FORMATS)}",
+    )
     metres = in_si(width, "width", "m")
-    require(NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm")
+    require(
+        NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm"
+    )
     outputs = _names(flights, "y")
     inputs = _names(flights, "u")
     known = [*outputs, *inputs, *(f"e.{name}" for name in outputs if _names(flights, "y_m"))]
@@ -110,7 +125,9 @@ def write_figure(
         require(name in known, "channels", f"{name!r}", one_of(known, name))
     inches = metres / (FOOT / 12.0)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(inches, ROW_RATIO * inches * len(wanted) + LEGEND_HEIGHT), layout="constrained")
+        figure = Figure(
+            figsize=(inches, ROW_RATIO * inches * len(wanted) + LEGEND_HEIGHT), layout="constrained"
+        )
         grid = figure.subplots(len(wanted), 1, sharex=True, squeeze=False)[:, 0]
         for axes, name in zip(grid, wanted, strict=True):
             _draw(axes, flights, name)
@@ -120,7 +137,9 @@ def write_figure(
         for axes in grid:
             lines, labels = axes.get_legend_handles_labels()
             handles |= dict(zip(labels, lines, strict=True))
-        figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False)
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False
+        )
         stamps = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(suffix, {})
         with replacing(path) as stream:
             figure.savefig(stream, format=suffix, dpi=DPI, metadata=stamps or None)
@@ -128,7 +147,13 @@ def write_figure(
 
 def _names(flights: Sequence[RecordedFlight], topic: str) -> list[str]:
     """Channels of a topic on any of the tapes."""
-    return list(dict.fromkeys(chain.from_iterable(flight.tape[topic].names for flight in flights if topic in flight.tape)))
+    return list(
+        dict.fromkeys(
+            chain.from_iterable(
+                flight.tape[topic].names for flight in flights if topic in flight.tape
+            )
+        )
+    )
 
 
 def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
@@ -146,7 +171,9 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
     for gust in gust_intervals(first.tape, first.gusts):
         axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
     if is_output and not is_error and "y_m" in first.tape and plain in first.tape["y_m"].names:
-        plot(first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * LINE_WIDTH, label="y_m")
+        plot(
+            first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * LINE_WIDTH, label="y_m"
+        )
     for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
         tape = flight.tape
         signal = best_error(tape)[1] if is_error else tape.signals.get("y" if is_output else "u")
@@ -160,16 +187,20 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
 
 
 def write_mat(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a MAT-file of version 5: a structure a topic with stamp_ns, t in s and a column a channel, SI.
+    """Write a MAT-file of version 5: a structure a topic with stamp_ns, t in s and a column a
+    channel, SI.
 
-    Several flights are structures run_1, run_2, ... with the name of the run in `name`. Names are those that MATLAB permits:
-    "Pi.q" is Pi_q. `channels` has the names of the log by the names of MATLAB.
+    Several flights are structures run_1, run_2, ... with the name of the run in `name`. Names are
+    those that MATLAB permits: "Pi.q" is Pi_q. `channels` has the names of the log by the names of
+    MATLAB.
     """
     from scipy.io import savemat  # noqa: PLC0415
 
     require(path.suffix == ".mat", "mat", f"{path.name}", "a name that ends in .mat")
     runs = [_mat_structure(flight) for flight in flights]
-    content = runs[0] if len(runs) == 1 else {f"run_{k}": run for k, run in enumerate(runs, start=1)}
+    content = (
+        runs[0] if len(runs) == 1 else {f"run_{k}": run for k, run in enumerate(runs, start=1)}
+    )
     buffer: Any = BytesIO()
     savemat(buffer, content, do_compression=True, long_field_names=True, oned_as="column")
     write_file(path, buffer.getvalue())
@@ -190,17 +221,24 @@ def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
     notes: dict[str, Any] = {"name": flight.name, "outcome": str(flight.summary["outcome"])}
     notes |= {"scenario": flight.summary["scenario"] or ""}
     free = matlab_names(("info",), used_names=structure)
-    notes |= {"units_of_report": {matlab_names((name,))[name]: unit for name, unit in units.items()}, "channels": original}
+    notes |= {
+        "units_of_report": {matlab_names((name,))[name]: unit for name, unit in units.items()},
+        "channels": original,
+    }
     return structure | {free["info"]: notes}
 
 
 def matlab_names(names: Iterable[str], used_names: Iterable[str] = ()) -> dict[str, str]:
-    """Names that MATLAB permits by name: letters, digits and _, a letter first, 63 characters, no keyword, each once."""
+    """Names that MATLAB permits by name: letters, digits and _, a letter first, 63 characters, no
+    keyword, each once.
+    """
     used = set(used_names)
     permitted = {}
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
-        plain = plain if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS else f"x_{plain}"
+        plain = (
+            plain if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS else f"x_{plain}"
+        )
         plain = plain[:MATLAB_NAME]
         count = 1
         while plain in used:
@@ -212,7 +250,8 @@ def matlab_names(names: Iterable[str], used_names: Iterable[str] = ()) -> dict[s
 
 
 def write_tables(folder: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a CSV a topic, RUN_TOPIC.csv of several flights and TOPIC.csv of one: stamp_ns, t in s and the channels, SI.
+    """Write a CSV a topic, RUN_TOPIC.csv of several flights and TOPIC.csv of one: stamp_ns, t in s
+    and the channels, SI.
 
     A table has the rows of its own topic, so no cell is empty.
     """
@@ -222,18 +261,27 @@ def write_tables(folder: Path, flights: Sequence[RecordedFlight]) -> None:
     for label, flight in zip(comparison.labels(flights), flights, strict=True):
         for topic, signal in flight.tape.signals.items():
             t = (signal.stamp_ns - flight.tape.start_ns) / NANOSECONDS
-            columns = {"stamp_ns": signal.stamp_ns, "t": t, **{name: signal[name] for name in signal.names}}
+            columns = {
+                "stamp_ns": signal.stamp_ns,
+                "t": t,
+                **{name: signal[name] for name in signal.names},
+            }
             stem = topic if len(flights) == 1 else f"{label}_{topic}"
             with replacing(folder / f"{re.sub(r'[^A-Za-z0-9_.() -]', '_', stem)}.csv") as stream:
                 pl.DataFrame(columns).write_csv(stream)
 
 
 def write_latex(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the tables of errors and of inputs as LaTeX, a tabular each, with the rules of booktabs."""
+    """Write the tables of errors and of inputs as LaTeX, a tabular each, with the rules of
+    booktabs.
+    """
     parts = []
     for label, flight in zip(comparison.labels(flights), flights, strict=True):
         units = flight.units
-        for title, key, known in (("Tracking error", "errors", ERROR_COLUMNS), ("Inputs about trim", "inputs", INPUT_COLUMNS)):
+        for title, key, known in (
+            ("Tracking error", "errors", ERROR_COLUMNS),
+            ("Inputs about trim", "inputs", INPUT_COLUMNS),
+        ):
             if not flight.summary[key]:
                 continue
             columns = columns_of(known, flight.summary[key])

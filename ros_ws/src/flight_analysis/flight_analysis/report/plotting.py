@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time-series figures for plotly.js: a subplot per channel, shaded intervals over every subplot.
 
-The figures of a page share the time axis and the margins, so the subplots line up. A figure holds short curves. `SampleStore`
-holds the samples of longer curves: the page decimates the samples to the view. A figure also holds the extremes of a very
-long curve, since the page takes long to unpack the samples. Of a curve of more than MAX_STORED samples the page has the
-smallest and the largest value of each bin of time alone; the figures in numbers are of all samples.
+The figures of a page share the time axis and the margins, so the subplots line up. A figure holds
+short curves. `SampleStore` holds the samples of longer curves: the page decimates the samples to
+the view. A figure also holds the extremes of a very long curve, since the page takes long to unpack
+the samples. Of a curve of more than MAX_STORED samples the page has the smallest and the largest
+value of each bin of time alone; the figures in numbers are of all samples.
 """
 
 import base64
@@ -25,12 +26,18 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 T = TypeVar("T", bound=np.generic)
-MAX_POINTS = 2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
+MAX_POINTS = (
+    2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
+)
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
-MAX_READ = 100_000  # samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
-MAX_STORED = 200_000  # samples of a curve on a page, of 400 s at 500 Hz: with all of them an hour of flight has 141 MB
-MANTISSA = 16  # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4 digits of a hover
+# samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
+MAX_READ = 100_000
+# samples of a curve on a page, of 400 s at 500 Hz: with all of them an hour of flight has 141 MB
+MAX_STORED = 200_000
+# bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
+# digits of a hover
+MANTISSA = 16
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 LABEL_WIDTH = 0.08  # width of the label of an interval, as a fraction of the flight's duration
@@ -46,19 +53,27 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 class Instants(NamedTuple):
     """The instants of a curve."""
 
-    t_ns: NDArray[np.int64]  # since the start of the flight, with one more at the start of each gap; two of each bin
+    t_ns: NDArray[
+        np.int64
+    ]  # since the start of the flight, with one more at the start of each gap; two of each bin
     gaps: NDArray[np.intp]  # the samples before which a NaN stands for a gap
     width: int  # samples of a bin; 1 where each sample is drawn
 
 
 class SampleStore:
-    """The samples of the long curves of a page, packed. Equal arrays are stored once, under a hash of the content."""
+    """The samples of the long curves of a page, packed. Equal arrays are stored once, under a hash
+    of the content.
+    """
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
-        self._pool = ThreadPoolExecutor(PACKERS)  # compression leaves the interpreter to the other threads
+        self._pool = ThreadPoolExecutor(
+            PACKERS
+        )  # compression leaves the interpreter to the other threads
         self._instants: dict[tuple[str, int, bool], Instants] = {}
-        self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}  # of stamps by their id, which the stamps keep
+        self._digests: dict[
+            int, tuple[str, NDArray[np.int64]]
+        ] = {}  # of stamps by their id, which the stamps keep
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 
     @property
@@ -78,22 +93,31 @@ class SampleStore:
     def times(self, t_ns: NDArray[np.int64]) -> str:
         """Store instants as float64 steps in ns, the first from 0. Equal steps compress well."""
         if id(t_ns) not in self._times:
-            self._times[id(t_ns)] = self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8")), t_ns
+            self._times[id(t_ns)] = (
+                self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8")),
+                t_ns,
+            )
         return self._times[id(t_ns)][0]
 
     def values(self, values: FloatArray) -> str:
-        """Store values as float32, rounded to MANTISSA bits: noise does not compress, and a pixel shows fewer digits.
+        """Store values as float32, rounded to MANTISSA bits: noise does not compress, and a pixel
+        shows fewer digits.
 
-        Their bits are stored as steps modulo 2^32, the first from 0, since successive samples hardly differ.
+        Their bits are stored as steps modulo 2^32, the first from 0, since successive samples
+        hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
-        return self._add("v", np.diff(bits + (1 << spare - 1) >> spare << spare, prepend=np.uint32(0)))
+        return self._add(
+            "v", np.diff(bits + (1 << spare - 1) >> spare << spare, prepend=np.uint32(0))
+        )
 
     def _add(self, kind: str, array: NDArray[Any]) -> str:
         name = kind + _digest(array)
         if name not in self._packed:
-            wait([packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS])  # each holds its array
+            wait(
+                [packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS]
+            )  # each holds its array
             self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
 
@@ -105,7 +129,8 @@ def _digest(array: NDArray[Any]) -> str:
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
     """Base64 of the zlib stream of bytes, after a byte shuffle of items of `width` bytes.
 
-    The shuffle puts the first bytes of the items first, then the second bytes, and so on: high bytes of small steps are equal.
+    The shuffle puts the first bytes of the items first, then the second bytes, and so on: high
+    bytes of small steps are equal.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()
@@ -142,10 +167,11 @@ class Curve(NamedTuple):
 
 
 class Figure:
-    """Subplots for plotly.js: the traces `data` and the `layout`; `x` and `y` are the axes by subplot.
+    """Subplots for plotly.js: the traces `data` and the `layout`; `x` and `y` are the axes by
+    subplot.
 
-    `count` subplots are filled row by row, `height` pixels high, with `spacing` between the rows as a fraction of the figure.
-    Source of the names: https://plotly.com/javascript/reference.
+    `count` subplots are filled row by row, `height` pixels high, with `spacing` between the rows as
+    a fraction of the figure. Source of the names: https://plotly.com/javascript/reference.
     """
 
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
@@ -178,9 +204,15 @@ def axis(name: str, index: int) -> str:
     return name if index == 0 else f"{name}{index + 1}"
 
 
-def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> Figure:
-    """A subplot of `height` pixels per channel, with the curves of the channel; two columns are filled row by row."""
-    channels = list(dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values())))
+def time_series_figure(
+    context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150
+) -> Figure:
+    """A subplot of `height` pixels per channel, with the curves of the channel; two columns are
+    filled row by row.
+    """
+    channels = list(
+        dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
+    )
     columns = min(columns, len(channels))
     figure = Figure(len(channels), columns, height)
     followed = (figure.rows - 1) * columns
@@ -190,7 +222,12 @@ def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, col
             if channel in curve.signal.names:
                 trace = _trace(context, curve, channel, factor, MAX_POINTS // columns)
                 shown = len(curves) > 1 and first_in_legend(figure, label)
-                trace |= {"name": label, "legendgroup": label, "showlegend": shown, "hovertemplate": f"%{{y:.4g}} {unit}"}
+                trace |= {
+                    "name": label,
+                    "legendgroup": label,
+                    "showlegend": shown,
+                    "hovertemplate": f"%{{y:.4g}} {unit}",
+                }
                 figure.add(trace, index)
         figure.y[index]["title"] = {"text": channel_label(channel, context.units)}
         lowest = index + columns >= len(channels)
@@ -203,15 +240,25 @@ def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, col
 
 
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
-    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis `below` the rows."""
+    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis
+    `below` the rows.
+    """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows
     for axes, standoff in ((figure.x, 4), (figure.y, 6)):
         for axis in axes:
-            axis |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": axis.get("title", {}) | {"standoff": standoff}}
-            axis |= {"type": axis.get("type", "linear")}  # plotly reads the samples of an axis without a type
+            axis |= {
+                "gridcolor": GRID,
+                "zerolinecolor": ZERO,
+                "title": axis.get("title", {}) | {"standoff": standoff},
+            }
+            axis |= {
+                "type": axis.get("type", "linear")
+            }  # plotly reads the samples of an axis without a type
     for axis in figure.y:
-        axis["ticklabeloverflow"] = "allow"  # the margin has room for them: plotly does not measure each
+        axis["ticklabeloverflow"] = (
+            "allow"  # the margin has room for them: plotly does not measure each
+        )
     figure.layout |= {
         "height": above + rows + below,
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
@@ -220,7 +267,13 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
         "modebar": {"bgcolor": TRANSPARENT},
         "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
         "margin": {"l": 80, "r": 20, "t": above, "b": below},
-        "legend": {"orientation": "h", "x": 0.0, "y": 1.0 + labels / rows, "yanchor": "bottom", "bgcolor": TRANSPARENT},
+        "legend": {
+            "orientation": "h",
+            "x": 0.0,
+            "y": 1.0 + labels / rows,
+            "yanchor": "bottom",
+            "bgcolor": TRANSPARENT,
+        },
     }
     return figure
 
@@ -231,37 +284,71 @@ def first_in_legend(figure: Figure, label: str) -> bool:
 
 
 def add_line(
-    figure: Figure, index: int, label: str, x: Sequence[float | None], y: Sequence[float], style: Mapping[str, Any]
+    figure: Figure,
+    index: int,
+    label: str,
+    x: Sequence[float | None],
+    y: Sequence[float],
+    style: Mapping[str, Any],
 ) -> None:
     """Add a line to a subplot, with an entry in the legend. None in x breaks the line."""
     if not x:
         return
-    trace = {"type": "scatter", "x": x, "y": y, "mode": "lines", "name": label, "legendgroup": label, "line": style}
+    trace = {
+        "type": "scatter",
+        "x": x,
+        "y": y,
+        "mode": "lines",
+        "name": label,
+        "legendgroup": label,
+        "line": style,
+    }
     figure.add(trace | {"hoverinfo": "skip", "showlegend": first_in_legend(figure, label)}, index)
 
 
-def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most: int) -> dict[str, Any]:
+def _trace(
+    context: PlotContext, curve: Curve, channel: str, factor: float, most: int
+) -> dict[str, Any]:
     t_ns, values = _drawn(context, curve.signal, channel, factor, curve.steps)
-    style = {"color": curve.colour, "width": curve.width, "shape": "hv" if curve.steps else "linear"}
+    style = {
+        "color": curve.colour,
+        "width": curve.width,
+        "shape": "hv" if curve.steps else "linear",
+    }
     # plotly's simplification cuts off peaks
     trace = {"type": "scatter", "mode": "lines", "line": style | {"simplify": False}} | (
         {"opacity": 0.35} if curve.faint else {}
     )
     if len(values) <= most:
         return trace | {"x": t_ns / NANOSECONDS, "y": values}
-    trace |= {"meta": {"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most}}
+    trace |= {
+        "meta": {
+            "t": context.samples.times(t_ns),
+            "v": context.samples.values(values),
+            "most": most,
+        }
+    }
     if len(values) <= MAX_READ:
         return trace
     rows = extremes(values, most)
-    return trace | {"x": (t_ns[rows] / NANOSECONDS).astype(np.float32), "y": values[rows].astype(np.float32)}
+    return trace | {
+        "x": (t_ns[rows] / NANOSECONDS).astype(np.float32),
+        "y": values[rows].astype(np.float32),
+    }
 
 
 def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
-    """Rows of the minimum, the maximum and the first NaN in `most` / 2 bins, as the page decimates a view."""
+    """Rows of the minimum, the maximum and the first NaN in `most` / 2 bins, as the page decimates
+    a view.
+    """
     width = -(-len(values) // (most // 2))
     bins = _bins(values, width)
     gaps = np.isnan(bins)
-    below, above = (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins)) if gaps.any() else (bins, bins)
+    below, above = (
+        (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins))
+        if gaps.any()
+        else (bins, bins)
+    )
     low = below.argmin(axis=1)
     high = above.argmax(axis=1)
     gap = np.where(gaps.any(axis=1), gaps.argmax(axis=1), low)
@@ -270,7 +357,9 @@ def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
-    """Places of the times and the values of a channel, times a factor, on the page. A long curve is there once."""
+    """Places of the times and the values of a channel, times a factor, on the page. A long curve is
+    there once.
+    """
     t_ns, values = _drawn(context, signal, channel, factor, steps=False)
     return context.samples.times(t_ns), context.samples.values(values)
 
@@ -279,14 +368,18 @@ def _drawn(
     context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Instants and values of a channel times a factor, with a NaN at the start of a gap."""
-    t_ns, gaps, width = context.samples.instants(signal.stamp_ns, context.tape.start_ns, steps=steps)
+    t_ns, gaps, width = context.samples.instants(
+        signal.stamp_ns, context.tape.start_ns, steps=steps
+    )
     values = signal[channel] * factor
     values = np.insert(values, gaps, np.nan) if len(gaps) else values
     return t_ns, values if width == 1 else _extremes_of_bins(values, width)
 
 
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
-    """Smallest and largest value of each bin in their order, two a bin; a NaN in place of the second in a bin with a gap."""
+    """Smallest and largest value of each bin in their order, two a bin; a NaN in place of the
+    second in a bin with a gap.
+    """
     bins = _bins(values, width)
     gaps = np.isnan(bins)
     low = np.where(gaps, np.inf, bins).argmin(axis=1)
@@ -313,25 +406,43 @@ def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
     return Instants(drawn, before + 1, width)
 
 
-def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int, end: float) -> None:
+def _shade_intervals(
+    figure: Figure, intervals: Sequence[Interval], columns: int, end: float
+) -> None:
     for interval in intervals:
         for column in range(columns):
             figure.layout["shapes"].append(
                 {
-                    "type": "rect", "xref": axis("x", column), "yref": "paper", "x0": interval.start, "x1": interval.stop,
-                    "y0": 0, "y1": 1, "fillcolor": interval.colour, "opacity": INTERVAL_OPACITY, "line": {"width": 0},
+                    "type": "rect", "xref": axis("x", column), "yref": "paper",
+                    "x0": interval.start, "x1": interval.stop,
+                    "y0": 0, "y1": 1, "fillcolor": interval.colour, "opacity": INTERVAL_OPACITY,
+                    "line": {"width": 0},
                     "layer": "below",
                 }
             )  # fmt: skip
     if columns > 1:
         return  # too narrow for labels
-    for start, text in _merged_labels([interval for interval in intervals if interval.labelled], end).items():
+    for start, text in _merged_labels(
+        [interval for interval in intervals if interval.labelled], end
+    ).items():
         position = {"x": start, "xanchor": "left", "y": 1.0, "yref": "paper", "yanchor": "bottom"}
-        figure.layout["annotations"].append({"text": text, **position, "showarrow": False, "font": {"size": 11}})
-    for label, colour in {interval.label: interval.colour for interval in intervals if not interval.labelled}.items():
+        figure.layout["annotations"].append(
+            {"text": text, **position, "showarrow": False, "font": {"size": 11}}
+        )
+    for label, colour in {
+        interval.label: interval.colour for interval in intervals if not interval.labelled
+    }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
         figure.add(
-            {"type": "scatter", "x": [None], "y": [None], "mode": "markers", "name": label, "marker": mark, "showlegend": True}
+            {
+                "type": "scatter",
+                "x": [None],
+                "y": [None],
+                "mode": "markers",
+                "name": label,
+                "marker": mark,
+                "showlegend": True,
+            }
         )
 
 
@@ -339,6 +450,9 @@ def _merged_labels(intervals: Sequence[Interval], end: float) -> dict[float, str
     """Labels of intervals by start, s. Overlapping labels are merged."""
     labels: dict[float, str] = {}
     for interval in sorted(intervals, key=lambda interval: interval.start):
-        start = next((start for start in labels if interval.start - start < LABEL_WIDTH * end), interval.start)
+        start = next(
+            (start for start in labels if interval.start - start < LABEL_WIDTH * end),
+            interval.start,
+        )
         labels[start] = f"{labels[start]}, {interval.label}" if start in labels else interval.label
     return labels

@@ -17,7 +17,10 @@ from flight_core.tape import Signal
 
 HERE = Path(__file__).parent
 SCENE = HERE / "scene"
-SCRIPTS = (*(SCENE / f"{name}.js" for name in ("canvas", "series", "units", "map", "scene")), HERE / "replay.js")
+SCRIPTS = (
+    *(SCENE / f"{name}.js" for name in ("canvas", "series", "units", "map", "scene")),
+    HERE / "replay.js",
+)
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude")
 POSE_RATE = 10.0  # Hz; the page interpolates
@@ -33,7 +36,9 @@ class Replay(NamedTuple):
 
 
 def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
-    """The replay of a flight with a logged attitude, else None. Adds the poses to the samples of the page."""
+    """The replay of a flight with a logged attitude, else None. Adds the poses to the samples of
+    the page.
+    """
     tape = flight.tape
     topics = {}
     truth = tape.signals.get("truth")
@@ -41,7 +46,11 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
         topics["pose"] = _topic(context, _thinned(pose), {name: name for name in POSE})
     attitude = () if "pose" in topics else ("x.phi", "x.theta")
     if truth is not None:
-        groups = [name for name in truth.names if name.startswith(("actuator.", "gust.")) or name in attitude]
+        groups = [
+            name
+            for name in truth.names
+            if name.startswith(("actuator.", "gust.")) or name in attitude
+        ]
         topics["truth"] = _topic(context, truth, {name: name.partition(".")[2] for name in groups})
     names = set().union(*(topic["channels"] for topic in topics.values()))
     if not {"phi", "x.phi"} & names:
@@ -54,13 +63,23 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
         "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
         "positive": {} if scenario is None else scenario.aircraft.channels().positive,
         "modes": {int(mode): mode.name for mode in Mode},
-        **({} if scenario is None or scenario.guidance is None else mission_drawing(scenario.guidance, routes)),
+        **(
+            {}
+            if scenario is None or scenario.guidance is None
+            else mission_drawing(scenario.guidance, routes)
+        ),
     }
-    return Replay({"topics": topics, "info": info}, pack(_code().encode()), (SCENE / "scene.css").read_text(encoding="utf-8"))
+    return Replay(
+        {"topics": topics, "info": info},
+        pack(_code().encode()),
+        (SCENE / "scene.css").read_text(encoding="utf-8"),
+    )
 
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
-    """Where times and values of channels are, with the factors of their units; `channels` maps names to names of the units."""
+    """Where times and values of channels are, with the factors of their units; `channels` maps
+    names to names of the units.
+    """
     stored_channels = {}
     times = ""
     for name, quantity in channels.items():
@@ -75,13 +94,19 @@ def _thinned(pose: Signal) -> Signal:
     """The channels of a pose at POSE_RATE, at most MAX_POSES rows."""
     count = len(pose.stamp_ns)
     span = (pose.stamp_ns[-1] - pose.stamp_ns[0]) / 1e9 if count > 1 else 0.0
-    rows = np.unique(np.linspace(0, max(count - 1, 0), min(count, MAX_POSES, int(span * POSE_RATE) + 2)).astype(int))
+    rows = np.unique(
+        np.linspace(0, max(count - 1, 0), min(count, MAX_POSES, int(span * POSE_RATE) + 2)).astype(
+            int
+        )
+    )
     names = tuple(name for name in POSE if name in pose.names)
     return Signal(pose.stamp_ns[rows], names, np.column_stack([pose[name][rows] for name in names]))
 
 
 def _code() -> str:
-    """The scripts as a function with an immediate call: modules without imports, exports, comment lines and indentation."""
+    """The scripts as a function with an immediate call: modules without imports, exports, comment
+    lines and indentation.
+    """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)
     return "(() => {\n" + re.sub(r"^export ", "", text, flags=re.MULTILINE) + "})();\n"

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report of recorded runs: the page of one run or of a comparison, and the data for other programs."""
+"""The report of recorded runs: the page of one run or of a comparison, and the data for other
+programs.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -44,24 +46,29 @@ def report(
     remaps: Mapping[str, str] = {},
     scenario: FilePath | None = None,
 ) -> Report:
-    """Write the report page of a recorded run, or a page that compares several runs with the first, as `rise-di report` does.
+    """Write the report page of a recorded run, or a page that compares several runs with the first,
+    as `rise-di report` does.
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Page of a comparison; None: comparison.html beside the first run. With one run: its page alone.
+        html: Page of a comparison; None: comparison.html beside the first run. With one run: its
+            page alone.
         output: Folder for the report of one run; None: the folder of the log.
         png: File for y over y_m, e and u as one figure.
         csv: File for all signals, one row an instant, one column a channel.
         parquet: File for the same table as Parquet.
         figure: File for a figure of a paper: .pdf, .svg or .eps as vectors, or .png.
         width: Width of the figure, with a unit ("88mm") or in m.
-        channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output; empty: each output.
+        channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output;
+            empty: each output.
         mat: File for the signals as a MAT-file, a structure a topic.
         tables: Folder for a CSV a topic.
         latex: File for the tables of errors and inputs as LaTeX.
         namespace: Namespace of the aircraft, for logs with several aircraft.
-        remaps: Topics of the log by names of the stack, for logs of remapped nodes, as {"y": "/sensors/y"}.
-        scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in each log.
+        remaps: Topics of the log by names of the stack, for logs of remapped nodes, as {"y":
+            "/sensors/y"}.
+        scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in
+            each log.
 
     Raises ParameterError for a run that cannot be read, and for a file that cannot be written.
     """
@@ -78,20 +85,37 @@ def report(
         ("latex", latex, write_latex),
     )
     if figure is None:
-        require(not channels and width == WIDTH, "channels" if channels else "width", "it without a figure", "figure beside it")
-    files = [(key, as_path(path, key, A_FILE), write) for key, path, write in wanted if path is not None]
+        require(
+            not channels and width == WIDTH,
+            "channels" if channels else "width",
+            "it without a figure",
+            "figure beside it",
+        )
+    files = [
+        (key, as_path(path, key, A_FILE), write) for key, path, write in wanted if path is not None
+    ]
     alone = len(folders) == 1 and html is None
     require(output is None or alone, "output", "a comparison", "one run; html for several")
     if alone:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
-        result = write_report(folders[0], output=folder, namespace=namespace, scenario=scenario, remaps=remaps)
+        result = write_report(
+            folders[0], output=folder, namespace=namespace, scenario=scenario, remaps=remaps
+        )
         page = result.report
         flights = [result.flight]
     else:
-        flights = [read_flight(folder, namespace=namespace, scenario=scenario, remaps=remaps) for folder in folders]
+        flights = [
+            read_flight(folder, namespace=namespace, scenario=scenario, remaps=remaps)
+            for folder in folders
+        ]
         for folder, flight in zip(folders, flights, strict=True):
             expected = "a flight of the stack: a comparison is of tracking errors"
-            require(len(flights) == 1 or flight.scenario is not None, str(folder), "an imported log", expected)
+            require(
+                len(flights) == 1 or flight.scenario is not None,
+                str(folder),
+                "an imported log",
+                expected,
+            )
         if html is None:
             files.insert(0, ("html", folders[0].absolute().parent / "comparison.html", write_page))
         page = files[0][1]

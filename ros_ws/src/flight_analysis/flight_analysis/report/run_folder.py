@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run: created before a flight, with the attachments of the log; read back and reported on afterwards."""
+"""The folder of a run: created before a flight, with the attachments of the log; read back and
+reported on afterwards.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,9 +14,20 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import (
+    ParameterOverrides,
+    Scenario,
+    parse_scenario,
+    scenario_yaml,
+)
 from flight_analysis.report.account import Account, account, flown, outcome_of_log
-from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise, summarise_imported
+from flight_analysis.report.summary import (
+    RecordedFlight,
+    empty_summary,
+    engagement_notes,
+    summarise,
+    summarise_imported,
+)
 from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
 from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
@@ -46,10 +59,14 @@ class FlightResult(NamedTuple):
 
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
-    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for a failure."""
+    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for
+    a failure.
+    """
     place = str(runs.absolute())
     is_text = not any("\ud800" <= character <= "\udfff" for character in place)
-    require(is_text, "runs", ascii(place), "a folder with a name in UTF-8, as logs and reports hold it")
+    require(
+        is_text, "runs", ascii(place), "a folder with a name in UTF-8, as logs and reports hold it"
+    )
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
@@ -60,21 +77,27 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove the folders of runs without a file: those of flights that were interrupted before they began."""
+    """Remove the folders of runs without a file: those of flights that were interrupted before they
+    began.
+    """
     for run in runs:
         with suppress(OSError):
             run.rmdir()
 
 
 def attachments_for(
-    scenario: Scenario, run: Path, overrides: Mapping[str, ParameterOverrides] | None = None, further: Sequence[Path] = ()
+    scenario: Scenario,
+    run: Path,
+    overrides: Mapping[str, ParameterOverrides] | None = None,
+    further: Sequence[Path] = (),
 ) -> LogAttachments:
-    """The attachments of the log of a flight, written into the folder of the run where they are not files yet.
+    """The attachments of the log of a flight, written into the folder of the run where they are not
+    files yet.
 
-    These are the scenario, the airframe or the user's own model of JSBSim, every parameter after validation, `further` files,
-    and the provenance.
-    `overrides` are parameters of the scenario's nodes by the node's name; None for a flight without nodes. Raises
-    ParameterError where a file cannot be written.
+    These are the scenario, the airframe or the user's own model of JSBSim, every parameter after
+    validation, `further` files, and the provenance.
+    `overrides` are parameters of the scenario's nodes by the node's name; None for a flight without
+    nodes. Raises ParameterError where a file cannot be written.
     """
     attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
     if not scenario.aircraft.is_jsbsim:
@@ -100,8 +123,8 @@ def read_flight(
 ) -> RecordedFlight:
     """Read a recorded flight and summarise it. No file is written.
 
-    Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the log cannot be read, or holds
-    no scenario. `namespace`, `scenario` and `remaps` as in `read_run`.
+    Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the
+    log cannot be read, or holds no scenario. `namespace`, `scenario` and `remaps` as in `read_run`.
     """
     return _flight(read_run(run, namespace, scenario, remaps), run, outcome)
 
@@ -112,15 +135,24 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     name = printable(run.resolve().name if run.is_dir() else run.stem)
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         recorded.require("y", "u")
-        require(recorded.scenario is None, "scenario", "an imported log", "none: nothing of a scenario was flown")
+        require(
+            recorded.scenario is None,
+            "scenario",
+            "an imported log",
+            "none: nothing of a scenario was flown",
+        )
         summary = summarise_imported(recorded.tape, source)
-        return RecordedFlight(name, None, recorded.tape, summary, recorded.metadata.get(CHANNEL_UNITS, {}))
+        return RecordedFlight(
+            name, None, recorded.tape, summary, recorded.metadata.get(CHANNEL_UNITS, {})
+        )
     scenario = _scenario_in(recorded, run)
     timed = {"latency": recorded.latency, "age_of_u": recorded.age_of_u}
     signals = {name: signal for name, signal in timed.items() if signal is not None}
     log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
     engagements = recorded.engagements
-    outcome = outcome or _previous_outcome(folder, recorded.tape, scenario, simulated=engagements is None)
+    outcome = outcome or _previous_outcome(
+        folder, recorded.tape, scenario, simulated=engagements is None
+    )
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
     tape = flown(log)
@@ -130,18 +162,25 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     summary = summarise(engaged if has_figures else tape, scenario, outcome, flight_account)
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
-        summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
+        summary["notes"] = [
+            *engagement_notes(summary["engagements"], has_figures=has_figures),
+            *summary["notes"],
+        ]
     return RecordedFlight(name, scenario, tape, summary)
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """What a log lacks; None for a log without a flight, and without a scenario that can be read."""
+    """What a log lacks; None for a log without a flight, and without a scenario that can be
+    read.
+    """
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None
     if IMPORTED in recorded.metadata:
         return account(recorded.tape, None)
     try:
-        scenario = parse_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
+        scenario = parse_scenario(
+            recorded.scenario_file().content, Path(recorded.scenario_file().name)
+        )
     except ParameterError:
         return None
     simulated = recorded.engagements is None
@@ -151,21 +190,37 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
-    """The engaged part of a flight with a bridge, for the figures. Without an engagement: the whole tape, for the duration."""
-    end_ns = max((int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)), default=0)
+    """The engaged part of a flight with a bridge, for the figures. Without an engagement: the whole
+    tape, for the duration.
+    """
+    end_ns = max(
+        (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
+        default=0,
+    )
     windows = [(engagement.start_ns, engagement.stop_ns or end_ns) for engagement in flown]
-    signals = {name: signal.within(windows) for name, signal in tape.signals.items()} if windows else tape.signals
-    return replace(tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)})
+    signals = (
+        {name: signal.within(windows) for name, signal in tape.signals.items()}
+        if windows
+        else tape.signals
+    )
+    return replace(
+        tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)}
+    )
 
 
 def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
     """Start and end of an engagement in flight time, s, and the reason of the end."""
-    start, stop = ((time_ns - tape.start_ns) / NANOSECONDS if time_ns else None for time_ns in (flown.start_ns, flown.stop_ns))
+    start, stop = (
+        (time_ns - tape.start_ns) / NANOSECONDS if time_ns else None
+        for time_ns in (flown.start_ns, flown.stop_ns)
+    )
     return {"start": start, "stop": stop, "reason": flown.reason}
 
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
-    """The scenario in a log, written beside the log. Raises ParameterError where the log holds none."""
+    """The scenario in a log, written beside the log. Raises ParameterError where the log holds
+    none.
+    """
     recorded = read_run(run, namespace)
     scenario = _scenario_in(recorded, run)
     _write_scenario(recorded, scenario.path)
@@ -179,7 +234,9 @@ def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
-    """Write the scenario of a log, once. Raises ParameterError where a file with different content has the name."""
+    """Write the scenario of a log, once. Raises ParameterError where a file with different content
+    has the name.
+    """
     if recorded.scenario is None:
         return
     if path.is_symlink() or not path.exists():
@@ -202,11 +259,12 @@ def write_report(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> FlightResult:
-    """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the run.
+    """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the
+    run.
 
-    The files go beside the log, or into the new folder `output`. Without an outcome the report of an old run is
-    written again and runs/latest stays. A `scenario` in place of the scenario in the log is not written. Raises ParameterError
-    as `read_flight` does, before any file is written.
+    The files go beside the log, or into the new folder `output`. Without an outcome the report of
+    an old run is written again and runs/latest stays. A `scenario` in place of the scenario in the
+    log is not written. Raises ParameterError as `read_flight` does, before any file is written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
@@ -225,7 +283,9 @@ def write_report(
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> dict[str, Any]:
-    """Write summary.json of a flight with an end before the first sample. The log does not change. Raises ParameterError."""
+    """Write summary.json of a flight with an end before the first sample. The log does not change.
+    Raises ParameterError.
+    """
     summary = empty_summary(scenario, outcome)
     with writing("", run, "a folder that can"):
         write_file(run / SUMMARY, json.dumps(summary, indent=2) + "\n")
@@ -238,8 +298,11 @@ def _folder(run: Path) -> Path:
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
-def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
-    """The outcome in the log, else in the summary of the run, else the outcome that a launch left beside the log.
+def _previous_outcome(
+    folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool
+) -> str:
+    """The outcome in the log, else in the summary of the run, else the outcome that a launch left
+    beside the log.
 
     The samples in the log tell the outcome of nodes started by hand.
     """
@@ -247,11 +310,18 @@ def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, si
         return tape.outcome
     if folder is not None:
         with suppress(OSError, ValueError, TypeError, KeyError):
-            before = printable(str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"]))
+            before = printable(
+                str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"])
+            )
             if not before.startswith(UNKNOWN):  # as of an earlier version
                 return before
     if folder is not None:
         with suppress(ParameterError):
-            if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):
+            if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(
+                errors="replace"
+            ):
                 return bounded(outcome.strip())
-    return outcome_of_log(tape, scenario, simulated=simulated) or f"{UNKNOWN}: neither the run nor the log has one"
+    return (
+        outcome_of_log(tape, scenario, simulated=simulated)
+        or f"{UNKNOWN}: neither the run nor the log has one"
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight for `summary.json` and the tables, with the units and columns of the tables."""
+"""Metrics of a flight for `summary.json` and the tables, with the units and columns of the
+tables.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,7 +34,15 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
-from flight_analysis.report.account import WHOLE, Account, Commands, account, account_of_json, ends_last, final_outcome
+from flight_analysis.report.account import (
+    WHOLE,
+    Account,
+    Commands,
+    account,
+    account_of_json,
+    ends_last,
+    final_outcome,
+)
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.modes import Mode
 from flight_core.outcome import IMPORT
@@ -58,7 +68,8 @@ NO_UNIT = DisplayUnit("", 1.0)  # for a channel of unknown unit: its SI value wi
 
 
 QUANTITY_UNITS = {
-    name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0) for name, unit in UNITS.items()
+    name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0)
+    for name, unit in UNITS.items()
 }
 """Units of the quantities that guidance holds."""
 
@@ -70,21 +81,31 @@ def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same unit."""
-    return DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / si_per_unit(unit))
+    """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same
+    unit.
+    """
+    return (
+        DisplayUnit("mrad/s", 1e3)
+        if unit == "rad/s"
+        else DisplayUnit(unit, 1.0 / si_per_unit(unit))
+    )
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
     """Units of tables and figures by channel of y and u."""
     channels = scenario.aircraft.channels()
-    return {name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()}
+    return {
+        name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()
+    }
 
 
 def pulse_edges(scenario: Scenario) -> list[Transient]:
     """Edges of the scenario's pulses as transients, in order of time."""
     profile = scenario.reference_model.profile()
     edges = []
-    for name, times, changes in zip(scenario.reference_model.outputs, profile.time, profile.change, strict=True):
+    for name, times, changes in zip(
+        scenario.reference_model.outputs, profile.time, profile.change, strict=True
+    ):
         for time, change in zip(times, changes, strict=True):
             if change != 0.0:
                 edges.append(Transient("command", name, float(time), float(time + profile.rise)))
@@ -92,7 +113,8 @@ def pulse_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts. From the first live command on, live commands replace the commands of the scenario.
+    """Engagements, commands and gusts. From the first live command on, live commands replace the
+    commands of the scenario.
 
     Turns and captures replace the commands of a guided flight.
     """
@@ -101,7 +123,12 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
         return [*engagements(tape), *guided_transients(tape), *gusts]
     live = live_commands(tape)
     until = float(tape.time("u_m")[0]) if live else math.inf
-    return [*engagements(tape), *(edge for edge in pulse_edges(scenario) if edge.start < until), *live, *gusts]
+    return [
+        *engagements(tape),
+        *(edge for edge in pulse_edges(scenario) if edge.start < until),
+        *live,
+        *gusts,
+    ]
 
 
 class RecordedFlight(NamedTuple):
@@ -134,25 +161,44 @@ class RecordedFlight(NamedTuple):
 
 
 def summarise(
-    tape: Tape, scenario: Scenario | None = None, outcome: str | None = None, flight_account: Account | None = None
+    tape: Tape,
+    scenario: Scenario | None = None,
+    outcome: str | None = None,
+    flight_account: Account | None = None,
 ) -> dict[str, Any]:
-    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys.
+    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains
+    the keys.
 
-    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `flight_account`:
-    the account of the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
+    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the
+    argument. `flight_account`: the account of the whole flight where the tape is a part. Raises
+    ParameterError for a tape without y and y_m.
     """
     flown = as_tape(tape).scenario if scenario is None else scenario
-    require(flown is not None, "scenario", "none on the tape of a log", "summarise(run.tape, recorded_scenario(run))")
+    require(
+        flown is not None,
+        "scenario",
+        "none on the tape of a log",
+        "summarise(run.tape, recorded_scenario(run))",
+    )
     scenario = as_scenario(flown)
     outcome = tape.outcome if outcome is None else outcome
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refused = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
-        require(topic in tape, "the log", f"no sample of {topic}{unset}{refused}", "a flight with y and y_m")
+        require(
+            topic in tape,
+            "the log",
+            f"no sample of {topic}{unset}{refused}",
+            "a flight with y and y_m",
+        )
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     events = transients(scenario, tape)
     flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
-    ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
+    ticks = (
+        tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate"))
+        if "internals" in tape
+        else None
+    )
     latency = latency_metrics(tape)
     age = age_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS and not ends_last(tape, "internals"):  # in real time
@@ -186,25 +232,37 @@ def summarise(
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
-    """The metrics of a flight that the stack did not fly: of y and u about trim, and the account of the topics.
+    """The metrics of a flight that the stack did not fly: of y and u about trim, and the account of
+    the topics.
 
-    It has no reference, and so no error. `source`: of `rise-di import`, the metadata record IMPORTED.
+    It has no reference, and so no error. `source`: of `rise-di import`, the metadata record
+    IMPORTED.
     """
     flight_account = account(tape, None)
     deviations = {}
     for key, topic in (("outputs", "y"), ("inputs", "u")):
         by_channel = inputs_by_part(tape, (), topic=topic)
-        deviations[key] = {name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()}
-    summary = empty_summary(None, IMPORT) | deviations | {"duration": flight_account.end, "account": flight_account.as_json()}
-    summary |= {"source": dict(source), "notes": [*filter(None, [source.get(COMPARED)]), *flight_account.notes(), *tape.notes]}
+        deviations[key] = {
+            name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()
+        }
+    summary = (
+        empty_summary(None, IMPORT)
+        | deviations
+        | {"duration": flight_account.end, "account": flight_account.as_json()}
+    )
+    summary |= {
+        "source": dict(source),
+        "notes": [*filter(None, [source.get(COMPARED)]), *flight_account.notes(), *tape.notes],
+    }
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """The sentence on u older at the aircraft than planned, beside the delay margin of the gains; empty for u as planned.
+    """The sentence on u older at the aircraft than planned, beside the delay margin of the gains;
+    empty for u as planned.
 
-    The linear loop has the delay of the controller's parameters; further delay takes from the delay margin, computed
-    where u is more than a period older.
+    The linear loop has the delay of the controller's parameters; further delay takes from the delay
+    margin, computed where u is more than a period older.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -218,27 +276,45 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     margin = delay_margin(linear.nominal, linear.law, linear.loop)
     late = f"u is {1e3 * age.mean:.1f} ms old at the aircraft"
     late_past_margin = age.mean - controller.delay - margin
-    designed = f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of {1e3 * margin:.1f} ms"
-    return [f"{late}, {designed}: {'more than' if late_past_margin > 0.0 else 'within'} the margin; see rise-di gains --delay"]
+    designed = (
+        f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of "
+        f"{1e3 * margin:.1f} ms"
+    )
+    return [
+        (
+            f"{late}, {designed}: {'more than' if late_past_margin > 0.0 else 'within'} the "
+            "margin; see rise-di gains --delay"
+        )
+    ]
 
 
 def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
     commands = [event.start for event in events if event.kind == "command"]
-    targets = sum(tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording)
+    targets = sum(
+        tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording
+    )
     guided = "guidance" in tape and "given" in tape["guidance"].names
     steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if guided else 0
     return Commands(len(commands), sum(start <= end for start in commands), targets, steps_taken)
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """The commands that the flight did not fly, and the targets: "8 of 24 commands flown"; empty without any."""
+    """The commands that the flight did not fly, and the targets: "8 of 24 commands flown"; empty
+    without any.
+    """
     flight_account = account_of_json(summary)
     if flight_account is None or flight_account.commands is None:
         return ""
     planned, flown, targets, steps_taken = flight_account.commands
-    parts = [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"] if flown < planned else []
+    parts = (
+        [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"]
+        if flown < planned
+        else []
+    )
     if targets:
-        parts.append(f"{targets} targets and routes given, guidance took commands in {steps_taken} steps")
+        parts.append(
+            f"{targets} targets and routes given, guidance took commands in {steps_taken} steps"
+        )
     return "; ".join(parts)
 
 
@@ -246,8 +322,11 @@ STANDS_STILL = 5.0  # s, after which a vane at the end of a flight is named
 BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 
 
-def _with_late_ticks(flight_account: Account, ticks: TickMetrics | None, scenario: Scenario) -> Account:
-    """The account with the ticks that found no new y although the log has every y: the host is too busy.
+def _with_late_ticks(
+    flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
+) -> Account:
+    """The account with the ticks that found no new y although the log has every y: the host is too
+    busy.
 
     The rate of y is that of the scenario: that of an autopilot is not known.
     """
@@ -258,12 +337,18 @@ def _with_late_ticks(flight_account: Account, ticks: TickMetrics | None, scenari
     )
     y = flight_account.topics.get("y")
     rated = (
-        y is not None and y.expected is not None and y.expected >= (1.0 - BUSY) * flight_account.end * scenario.controller.rate
+        y is not None
+        and y.expected is not None
+        and y.expected >= (1.0 - BUSY) * flight_account.end * scenario.controller.rate
     )
     if ticks is None or not log_complete or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
         return flight_account
     late = f"{ticks.without_new_y} ticks without a new y"
-    reason = f"; {flight_account.busy}" if flight_account.busy else ": this host is too busy; see docs/faults.md"
+    reason = (
+        f"; {flight_account.busy}"
+        if flight_account.busy
+        else ": this host is too busy; see docs/faults.md"
+    )
     return flight_account._replace(busy=f"{late}{reason}")
 
 
@@ -283,11 +368,14 @@ FIGURES = {
     "latency": ("y", "u"),
     "age_of_u": ("u",),
 }
-"""Topics of the tables and lines of figures beside the error: the values, and the parts of the flight."""
+"""Topics of the tables and lines of figures beside the error: the values, and the parts of the
+flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
-    """The part of the flight over which the figures of a table are taken, after a comma; empty for the whole flight."""
+    """The part of the flight over which the figures of a table are taken, after a comma; empty for
+    the whole flight.
+    """
     flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
     part = "" if flight_account is None else flight_account.over(*truth, *FIGURES[table])
@@ -295,18 +383,32 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
 
 
 def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Sentences on the engagements of a flight with a bridge, with figures unless shorter than a sample."""
+    """Sentences on the engagements of a flight with a bridge, with figures unless shorter than a
+    sample.
+    """
     if not flown:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
     sentences = []
     for engagement in flown:
-        end = "the end of the log" if engagement["stop"] is None else f"{engagement['stop']:.1f} s: {engagement['reason']}"
+        end = (
+            "the end of the log"
+            if engagement["stop"] is None
+            else f"{engagement['stop']:.1f} s: {engagement['reason']}"
+        )
         sentences.append(f"engaged from {engagement['start']:.1f} s to {end}")
-    return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
+    return [
+        *sentences,
+        (
+            "the figures are of the "
+            f"{'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"
+        ),
+    ]
 
 
 def mode_notes(tape: Tape) -> list[str]:
-    """A sentence on a controller that did not fly the law for more than 1 % of the ticks from its first engagement on."""
+    """A sentence on a controller that did not fly the law for more than 1 % of the ticks from its
+    first engagement on.
+    """
     if "internals" not in tape:
         return []
     engaged = (mode := tape["internals"]["mode"]) == Mode.ENGAGED
@@ -315,7 +417,12 @@ def mode_notes(tape: Tape) -> list[str]:
         return []
     absent = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
     parts = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
-    return [f"the controller was {parts} of the ticks: the figures are of the whole flight, with u held or at trim"]
+    return [
+        (
+            f"the controller was {parts} of the ticks: the figures are of the whole flight, with u "
+            "held or at trim"
+        )
+    ]
 
 
 def vane_notes(tape: Tape) -> list[str]:
@@ -329,7 +436,10 @@ def vane_notes(tape: Tape) -> list[str]:
         moved = np.flatnonzero(measures[name] != 0.0)
         since = float(t[moved[-1]] if len(moved) else t[0])
         if t[-1] - since > STANDS_STILL:
-            notes.append(f"vane {name} stands still from t = {since:.1f} s on and is left out: frozen, or in calm air")
+            notes.append(
+                f"vane {name} stands still from t = {since:.1f} s on and is left out: frozen, "
+                "or in calm air"
+            )
     return notes
 
 
@@ -390,7 +500,9 @@ def finite_or_null(value: Any) -> Any:
 
 
 class Column(NamedTuple):
-    """A column of a table: the heading, the common heading of neighbouring columns above, and the path of the metric."""
+    """A column of a table: the heading, the common heading of neighbouring columns above, and the
+    path of the metric.
+    """
 
     group: str
     head: str
@@ -426,14 +538,17 @@ INPUT_COLUMNS = (
     Column("rate", "whole", ("whole", "rate")),
     Column("rate", "undisturbed", ("calm", "rate")),
 )
-"""Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a flight."""
+"""Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a
+flight."""
 
 SATURATION_COLUMN = Column("saturated", "%")
 SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """The columns whose part of the flight the metrics have: a guided flight has "capture" and "turn" in place of "command"."""
+    """The columns whose part of the flight the metrics have: a guided flight has "capture" and
+    "turn" in place of "command".
+    """
     parts = set().union(*channels.values())
     return tuple(column for column in columns if column.path[0] in parts)
 
@@ -462,7 +577,9 @@ def format_seconds(time: float | None) -> str:
     return "an unknown time" if time is None else f"{time:.1f} s"
 
 
-def model_rows(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]) -> tuple[list[str], list[list[str]]]:
+def model_rows(
+    models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
+) -> tuple[list[str], list[list[str]]]:
     """Headings and rows for "models" of a summary: model, times and rms of the errors."""
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
@@ -474,29 +591,43 @@ def model_rows(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayU
     return headings, rows
 
 
-def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per column."""
+def table_rows(
+    channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]
+) -> list[list[str]]:
+    """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per
+    column.
+    """
     rows = []
     for name, metrics in channels.items():
         factor = units.get(name, NO_UNIT).factor
-        cells = [format_value(metric(metrics, *column.path), factor if column.scaled else 1.0) for column in columns]
+        cells = [
+            format_value(metric(metrics, *column.path), factor if column.scaled else 1.0)
+            for column in columns
+        ]
         rows.append([channel_label(name, units), *cells])
     return rows
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent, by magnitude / by rate."""
+    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent,
+    by magnitude / by rate.
+    """
     rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
     for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
         shares = metrics["limited"]
-        row.append(NO_VALUE if shares is None else " / ".join(f"{100 * shares[kind]:.3g}" for kind in ("magnitude", "rate")))
+        row.append(
+            NO_VALUE
+            if shares is None
+            else " / ".join(f"{100 * shares[kind]:.3g}" for kind in ("magnitude", "rate"))
+        )
     return rows
 
 
 def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
     """The longest settling time of a channel after transients of a kind, s.
 
-    "> x" where the error did not settle after a transient; x is then the longest time, settled or not.
+    "> x" where the error did not settle after a transient; x is then the longest time, settled or
+    not.
     """
     settled: list[float] = []
     unsettled: list[float] = []

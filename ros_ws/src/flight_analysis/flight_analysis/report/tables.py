@@ -39,17 +39,25 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
 ERROR_LEGEND = (
-    "ultimate bound: the largest undisturbed error. switches: of the sign term's direction. settling: time"
-    f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest y_m, or within"
-    f" {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
+    "ultimate bound: the largest undisturbed error. switches: of the sign term's direction. "
+    "settling: time"
+    f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest "
+    f"y_m, or within {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
-NOISE_FLOOR_LEGEND = ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
-IMPORTED_LEGEND = "about trim, the median; rate: mean abs of the derivative, in the unit of the row per second"
+NOISE_FLOOR_LEGEND = (
+    ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
+)
+IMPORTED_LEGEND = (
+    "about trim, the median; rate: mean abs of the derivative, in the unit of the row per second"
+)
 INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
 GUIDANCE_LEGEND = (
-    "a segment has the same modes, commands and leg of the route. overshoot: the largest error beyond the command;"
-    " settling: time until the error stays within "
-    + ", ".join(f"{band * QUANTITY_UNITS[name].factor:g} {QUANTITY_UNITS[name].unit} of {name}" for name, band in BANDS.items())
+    "a segment has the same modes, commands and leg of the route. overshoot: the largest error "
+    "beyond the command; settling: time until the error stays within "
+    + ", ".join(
+        f"{band * QUANTITY_UNITS[name].factor:g} {QUANTITY_UNITS[name].unit} of {name}"
+        for name, band in BANDS.items()
+    )
     + f" for {SETTLING_DWELL:g} s; both where it begins outside"
 )
 MODEL_LEGEND = "start: the law of the start. Commands and wind of the spans differ"
@@ -67,17 +75,25 @@ class Table(NamedTuple):
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Common headings of neighbouring columns, with the number of columns."""
-        return [(group, len(list(columns))) for group, columns in groupby(self.columns, key=lambda column: column.group)]
+        return [
+            (group, len(list(columns)))
+            for group, columns in groupby(self.columns, key=lambda column: column.group)
+        ]
 
     @property
     def group_starts(self) -> list[bool]:
         """Whether the columns start a group; a column without a group does."""
         groups = [column.group for column in self.columns]
-        return [not group or group != before for group, before in zip(groups, [None, *groups], strict=False)]
+        return [
+            not group or group != before
+            for group, before in zip(groups, [None, *groups], strict=False)
+        ]
 
 
 class Interval(NamedTuple):
-    """A gust, a failsafe mode, a saturation or a still vane, from the first to the last instant in s."""
+    """A gust, a failsafe mode, a saturation or a still vane, from the first to the last instant in
+    s.
+    """
 
     name: str
     start: float
@@ -86,7 +102,9 @@ class Interval(NamedTuple):
 
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
-    """Ticks in which a vane stands still, shape (N,): from an engagement on once the vane has moved or `time` s have passed."""
+    """Ticks in which a vane stands still, shape (N,): from an engagement on once the vane has moved
+    or `time` s have passed.
+    """
     internals = tape["internals"]
     t = tape.time("internals")
     tick = np.arange(len(measures))
@@ -108,7 +126,14 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
         times = f", {len(spans)} times" if len(spans) > 1 else ""
-        listed.append(Interval(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
+        listed.append(
+            Interval(
+                label,
+                spans[0][0],
+                spans[-1][1],
+                f"{sum(stop - start for start, stop in spans):.2f} s{times}",
+            )
+        )
     if "internals" in tape:
         limited = tape["internals"].group("limited")
         t = tape.time("internals")
@@ -117,7 +142,9 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             if saturated.any():
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
-                listed.append(Interval(f"{name} saturated: {kind.name.lower()}", first, last, extent))
+                listed.append(
+                    Interval(f"{name} saturated: {kind.name.lower()}", first, last, extent)
+                )
         measures = tape["internals"].group("vane_measures")
         observer = flown.controller.observer if isinstance(flown, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
@@ -125,19 +152,40 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             if (still := _stands_still(measures[name], tape, time)).any():
                 first, last = t[still][[0, -1]]
                 listed.append(
-                    Interval(f"vane {name} stands still: left out", first, last, f"{still.sum()} of {len(still)} ticks")
+                    Interval(
+                        f"vane {name} stands still: left out",
+                        first,
+                        last,
+                        f"{still.sum()} of {len(still)} ticks",
+                    )
                 )
     return sorted(listed, key=lambda event: event.start)
 
 
-def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]) -> list[Table]:
-    """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
+def flight_tables(
+    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]
+) -> list[Table]:
+    """Tables of the error, the inputs, the events and the ticks; a table without rows is left
+    out.
+    """
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     tables = (
         _error_table(summary, units),
-        Table(f"Inputs{taken_over(summary, 'inputs')}", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
-        Table("Events", times, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]),
+        Table(
+            f"Inputs{taken_over(summary, 'inputs')}",
+            inputs,
+            input_rows(summary, units),
+            INPUT_LEGEND + SATURATION_LEGEND,
+        ),
+        Table(
+            "Events",
+            times,
+            [
+                (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
+                for event in event_list
+            ],
+        ),
         _guidance_table(summary),
         _model_table(summary, units),
         _tick_table(summary),
@@ -151,14 +199,19 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
     tables = []
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
-        tables.append(Table(title, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND))
+        tables.append(
+            Table(title, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
+        )
     flight_account = account_of_json(summary)
     rows = []
     for name, topic in ({} if flight_account is None else flight_account.topics).items():
         length = (topic.last or 0.0) - (topic.first or 0.0)
         rate = (topic.found - 1) / length if length else None
         rows.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
-    return [*tables, Table("Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows)]
+    return [
+        *tables,
+        Table("Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows),
+    ]
 
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
@@ -187,15 +240,22 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
         for quantity in (segment["lateral"], segment["vertical"]):
             unit, factor = QUANTITY_UNITS[quantity["quantity"]]
             factors = (factor, factor, factor, 1.0)
-            row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in metrics), factors)]
+            row += [
+                f"{quantity['quantity']} ({unit})",
+                *map(format_value, (quantity[name] for name in metrics), factors),
+            ]
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
-    legend = "; ".join(filter(None, [leg_results(guidance["legs"]), GUIDANCE_LEGEND])) if rows else ""
+    legend = (
+        "; ".join(filter(None, [leg_results(guidance["legs"]), GUIDANCE_LEGEND])) if rows else ""
+    )
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
 
 
 def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
     headings, rows = model_rows(summary["models"], units)
-    return Table("Rms of the error by model", [Column("", head) for head in headings], rows, MODEL_LEGEND)
+    return Table(
+        "Rms of the error by model", [Column("", head) for head in headings], rows, MODEL_LEGEND
+    )
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
@@ -210,7 +270,10 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
         rows = [
             ("ticks", f"{ticks['ticks']}"),
             ("periods without a new y", f"{ticks['without_new_y']}"),
-            ("period mean / p99 / max (ms)", ms(ticks["period_mean"], ticks["period_p99"], ticks["period_max"])),
+            (
+                "period mean / p99 / max (ms)",
+                ms(ticks["period_mean"], ticks["period_p99"], ticks["period_max"]),
+            ),
             ("jitter rms (ms)", ms(ticks["jitter"])),
             ("after the deadline p99 / max (ms)", ms(ticks["late_p99"], ticks["late_max"])),
             ("age of y p99 (ms)", ms(ticks["age_p99"])),
@@ -225,7 +288,10 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
 def _process_table(summary: Mapping[str, Any]) -> Table:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
-    columns = [Column("", "ready (s)"), *(Column("output", head) for head in ("first (s)", "last (s)", "samples"))]
+    columns = [
+        Column("", "ready (s)"),
+        *(Column("output", head) for head in ("first (s)", "last (s)", "samples")),
+    ]
     rows = []
     for name, (*times, samples) in processes.items():
         cells = ["" if time is None else f"{time:.3f}" for time in times]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Start the nodes of a launch in stages: a stage waits for the `node_state` "ready" of the stage before."""
+"""Start the nodes of a launch in stages: a stage waits for the `node_state` "ready" of the stage
+before.
+"""
 
 import math
 import os
@@ -34,14 +36,31 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instant, start_lead
-from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
+from flight_bringup.processes import (
+    FIRST_U,
+    LOG_TIMEOUT,
+    READY_TIMEOUT,
+    end_with_parent,
+    leave_outcome,
+)
 from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
 from flight_ros import transport
 from flight_ros.messages import instant
-from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, START, STATES, NodeState, U, offered
+from flight_ros.topics import (
+    FLIGHT,
+    LOCKSTEP,
+    NEWEST_SAMPLES,
+    NODE_STATE,
+    RECORDED,
+    START,
+    STATES,
+    NodeState,
+    U,
+    offered,
+)
 from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
@@ -66,25 +85,37 @@ class FlownEvent(Event):
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
     """The argument `scenario`; `otherwise` describes an empty argument."""
-    description = f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file (.yaml){otherwise}"
+    description = (
+        f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file "
+        f"(.yaml){otherwise}"
+    )
     return DeclareLaunchArgument("scenario", default_value=default, description=description)
 
 
 def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunchArgument:
     """An argument "true" or "false"."""
-    return DeclareLaunchArgument(name, default_value=str(default).lower(), choices=BOOLEAN, description=description)
+    return DeclareLaunchArgument(
+        name, default_value=str(default).lower(), choices=BOOLEAN, description=description
+    )
 
 
 def runs_argument() -> DeclareLaunchArgument:
     """The argument `runs`."""
-    return DeclareLaunchArgument("runs", default_value="runs", description="folder in which the folder of the run is created")
+    return DeclareLaunchArgument(
+        "runs", default_value="runs", description="folder in which the folder of the run is created"
+    )
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
     """The argument `recorder`."""
-    description = "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
+    description = (
+        "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
+    )
     return DeclareLaunchArgument(
-        "recorder", default_value="true", choices=["true", "rosbag2", *further], description=description
+        "recorder",
+        default_value="true",
+        choices=["true", "rosbag2", *further],
+        description=description,
     )
 
 
@@ -94,14 +125,20 @@ def watch_argument() -> DeclareLaunchArgument:
 
 
 def watch_page(context: LaunchContext, run: Path) -> list[Action]:
-    """The process of the live page of a run, on demand. The flight does not depend on this process."""
+    """The process of the live page of a run, on demand. The flight does not depend on this
+    process.
+    """
     if argument(context, "watch") != "true":
         return []
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    return [ExecuteProcess(cmd=[rise_di, "watch", str(run), "--wait"], name="watch", output="screen")]
+    return [
+        ExecuteProcess(cmd=[rise_di, "watch", str(run), "--wait"], name="watch", output="screen")
+    ]
 
 
-def namespace_argument(description: str = "namespace of all nodes, one an aircraft") -> DeclareLaunchArgument:
+def namespace_argument(
+    description: str = "namespace of all nodes, one an aircraft",
+) -> DeclareLaunchArgument:
     """The argument `namespace`."""
     return DeclareLaunchArgument("namespace", default_value="", description=description)
 
@@ -112,12 +149,18 @@ def argument(context: LaunchContext, name: str) -> str:
 
 
 def end_with_launch(context: LaunchContext) -> None:
-    """Let every process end with this process. Launch leaves processes running after an end by anything but SIGINT."""
+    """Let every process end with this process. Launch leaves processes running after an end by
+    anything but SIGINT.
+    """
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
 
-def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, run: Path) -> Node:
-    """A node of a flight into the folder `run`, with a section of the scenario and parameter overrides."""
+def flight_node(
+    spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, run: Path
+) -> Node:
+    """A node of a flight into the folder `run`, with a section of the scenario and parameter
+    overrides.
+    """
     return Node(
         package=spec.package,
         executable=spec.executable,
@@ -129,26 +172,47 @@ def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverride
     )
 
 
-def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
-    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides` belong to the recorder.
+def rosbag2(
+    context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides
+) -> ExecuteProcess:
+    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides`
+    belong to the recorder.
 
     The attachments of the recorder become a separate log in the folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
         files = LogAttachments(
-            Path(overrides["scenario_file"]), tuple(map(Path, overrides["attach"])), Path(overrides["metadata_file"])
+            Path(overrides["scenario_file"]),
+            tuple(map(Path, overrides["attach"])),
+            Path(overrides["metadata_file"]),
         )
         bag.add_attachments(files, time.time_ns())
     further = overrides.get("topics", scenario.recorder.topics)
     topics = [*(topic.name for topic in FLIGHT), *further]
-    names = dict.fromkeys(name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics)
-    command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(run / ROSBAG2), "--topics", *names]
-    return ExecuteProcess(cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, run=run))
+    names = dict.fromkeys(
+        name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics
+    )
+    command = [
+        "ros2",
+        "bag",
+        "record",
+        "--storage",
+        "mcap",
+        "--output",
+        str(run / ROSBAG2),
+        "--topics",
+        *names,
+    ]
+    return ExecuteProcess(
+        cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, run=run)
+    )
 
 
 def fail_on_exit(event: ProcessExited, context: LaunchContext, run: Path) -> None:
-    """End the launch with exit status 1 when a process ends before the flight, with the outcome in the folder `run`."""
+    """End the launch with exit status 1 when a process ends before the flight, with the outcome in
+    the folder `run`.
+    """
     if not context.is_shutdown:
         end_with(run, f"{event.process_name} ended before the flight did")
 
@@ -161,14 +225,19 @@ def end_with(run: Path, outcome: str) -> None:
 
 def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
     """Say that the learner has ended before the flight."""
-    ended = f"{event.process_name} ended before the flight did: the law flies on with the model that it has"
+    ended = (
+        f"{event.process_name} ended before the flight did: the law flies on with the model "
+        "that it has"
+    )
     return [] if context.is_shutdown else [LogInfo(msg=ended)]
 
 
 def on_state(
     context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
-    """Run the actions of `then` once, when a node of this launch publishes a state, or a later one."""
+    """Run the actions of `then` once, when a node of this launch publishes a state, or a later
+    one.
+    """
     node = f"{_namespace(context)}/{spec.executable}"
     states = [*NodeState]
     reached = {*states[states.index(state) :]}
@@ -177,17 +246,25 @@ def on_state(
         return isinstance(event, NodeStateEvent) and event.node == node and event.state in reached
 
     return RegisterEventHandler(
-        EventHandler(matcher=matches, entities=[OpaqueFunction(function=lambda context: [*then()])], handle_once=True)
+        EventHandler(
+            matcher=matches,
+            entities=[OpaqueFunction(function=lambda context: [*then()])],
+            handle_once=True,
+        )
     )
 
 
 def start_in_stages(
-    context: LaunchContext, run: Path, first: Mapping[NodeSpec, Node], second: Callable[[float, float], Sequence[Action]]
+    context: LaunchContext,
+    run: Path,
+    first: Mapping[NodeSpec, Node],
+    second: Callable[[float, float], Sequence[Action]],
 ) -> list[Action]:
-    """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the actions of `second`.
+    """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the
+    actions of `second`.
 
-    The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that is not ready after
-    READY_TIMEOUT ends the launch with exit status 1.
+    The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that
+    is not ready after READY_TIMEOUT ends the launch with exit status 1.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
@@ -204,23 +281,40 @@ def start_in_stages(
             names = ", ".join(spec.executable for spec in waiting)
             end_with(run, f"{NEVER_FLEW}: {names} not ready after {READY_TIMEOUT:g} s")
 
-    handlers = [on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first]
-    return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_ready)])]
+    handlers = [
+        on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
+    ]
+    return [
+        *handlers,
+        *first.values(),
+        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_ready)]),
+    ]
 
 
 def begin_when_matched(
-    context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], duration: float, *, by_rosbag2: bool
+    context: LaunchContext,
+    run: Path,
+    nodes: Sequence[NodeSpec],
+    duration: float,
+    *,
+    by_rosbag2: bool,
 ) -> list[Action]:
-    """Begin the flight once each node is ready and each input has a publisher: t = 0 on the topic `start`.
+    """Begin the flight once each node is ready and each input has a publisher: t = 0 on the topic
+    `start`.
 
-    End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end. A node that does
-    not get so far, and an aircraft that takes no u, end the launch with exit status 1.
+    End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of
+    the end. A node that does not get so far, and an aircraft that takes no u, end the launch with
+    exit status 1.
     """
     waiting = dict.fromkeys(nodes)
     flying = []
     start_ns = [0]
     held_ns = [-1]
-    publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", offered(START)).publish
+    publish = (
+        get_ros_node(context)
+        .create_publisher(START.type, f"{_namespace(context)}/{START.name}", offered(START))
+        .publish
+    )
 
     def matched(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
@@ -231,7 +325,10 @@ def begin_when_matched(
         start_ns[0] = nanoseconds(start_time)
         return [
             TimerAction(period=LEAD + FIRST_U, actions=[OpaqueFunction(function=require_flight)]),
-            TimerAction(period=LEAD + duration + 2.0 * LOG_TIMEOUT, actions=[OpaqueFunction(function=give_up)]),
+            TimerAction(
+                period=LEAD + duration + 2.0 * LOG_TIMEOUT,
+                actions=[OpaqueFunction(function=give_up)],
+            ),
         ]
 
     def fly() -> Sequence[Action]:
@@ -241,12 +338,20 @@ def begin_when_matched(
     def require_matched(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in waiting)
-            end_with(run, f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
+            end_with(
+                run,
+                f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after "
+                f"{READY_TIMEOUT:g} s",
+            )
 
     def require_flight(context: LaunchContext) -> None:
         if not flying and not context.is_shutdown:
             lines = "the lines of the nodes say what they wait for"
-            end_with(run, f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the aircraft; {lines}")
+            end_with(
+                run,
+                f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the "
+                f"aircraft; {lines}",
+            )
 
     def give_up(context: LaunchContext) -> None:
         if not context.is_shutdown:
@@ -258,18 +363,29 @@ def begin_when_matched(
 
     return [
         _complete_at(context, run, held, by_rosbag2=by_rosbag2),
-        *(on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec)) for spec in nodes),
+        *(
+            on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec))
+            for spec in nodes
+        ),
         on_state(context, AIRCRAFT, NodeState.FLYING, fly),
         TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
     ]
 
 
 def end_with_log(
-    context: LaunchContext, run: Path, lead: float, end_time: float, duration: float, *, by_rosbag2: bool
+    context: LaunchContext,
+    run: Path,
+    lead: float,
+    end_time: float,
+    duration: float,
+    *,
+    by_rosbag2: bool,
 ) -> list[Action]:
-    """End a flight of `duration`, which began with `lead`, once the log holds y, y_m and u to the system time `end_time`, s.
+    """End a flight of `duration`, which began with `lead`, once the log holds y, y_m and u to the
+    system time `end_time`, s.
 
-    A log without u, as of a bridge that is not engaged, ends it after the duration; one that has stopped, LOG_TIMEOUT later.
+    A log without u, as of a bridge that is not engaged, ends it after the duration; one that has
+    stopped, LOG_TIMEOUT later.
     """
     last = [-math.inf]  # monotonic time of the last change of the log, s
 
@@ -287,8 +403,12 @@ def end_with_log(
     return [timer, _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
 
 
-def _complete_at(context: LaunchContext, run: Path, held: Callable[[int], bool], *, by_rosbag2: bool) -> RegisterEventHandler:
-    """Complete the flight once the stamp up to which the log holds y, y_m and u satisfies `held`; with rosbag2 that of u."""
+def _complete_at(
+    context: LaunchContext, run: Path, held: Callable[[int], bool], *, by_rosbag2: bool
+) -> RegisterEventHandler:
+    """Complete the flight once the stamp up to which the log holds y, y_m and u satisfies `held`;
+    with rosbag2 that of u.
+    """
 
     def receive(message: Any) -> None:
         stamp = message.header.stamp if by_rosbag2 else message
@@ -296,7 +416,9 @@ def _complete_at(context: LaunchContext, run: Path, held: Callable[[int], bool],
             context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent())
 
     topic, qos = (U, NEWEST_SAMPLES) if by_rosbag2 else (RECORDED, LOCKSTEP)
-    get_ros_node(context).create_subscription(topic.type, f"{_namespace(context)}/{topic.name}", receive, qos)
+    get_ros_node(context).create_subscription(
+        topic.type, f"{_namespace(context)}/{topic.name}", receive, qos
+    )
     flown = EventHandler(
         matcher=lambda event: isinstance(event, FlownEvent),
         entities=[OpaqueFunction(function=lambda context: complete(run))],
@@ -306,7 +428,9 @@ def _complete_at(context: LaunchContext, run: Path, held: Callable[[int], bool],
 
 
 def complete(run: Path, reason: str = "flight completed") -> list[Action]:
-    """The actions at the end of a flight of full duration. The recorder closes the log with the outcome."""
+    """The actions at the end of a flight of full duration. The recorder closes the log with the
+    outcome.
+    """
     leave = OpaqueFunction(function=lambda context: leave_outcome(run, COMPLETED))
     return [
         leave,
@@ -316,28 +440,39 @@ def complete(run: Path, reason: str = "flight completed") -> list[Action]:
 
 
 def _subscribe_states(context: LaunchContext) -> None:
-    """Emit a NodeStateEvent for every published state of a node of this launch; see launch_ros.actions.LifecycleNode."""
+    """Emit a NodeStateEvent for every published state of a node of this launch; see
+    launch_ros.actions.LifecycleNode.
+    """
 
     def receive(message: KeyValue) -> None:
         node, _, pid = message.key.rpartition("#")
         if pid.isdecimal() and _is_descendant(int(pid)) and not context.is_shutdown:
-            context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, NodeStateEvent(node, message.value))
+            context.asyncio_loop.call_soon_threadsafe(
+                context.emit_event_sync, NodeStateEvent(node, message.value)
+            )
 
     transport.prepare()  # before the first rclpy.init of this process
     ros_node = get_ros_node(context)
-    ros_node.create_subscription(NODE_STATE.type, f"{_namespace(context)}/{NODE_STATE.name}", receive, STATES)
-    # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a timer.
+    ros_node.create_subscription(
+        NODE_STATE.type, f"{_namespace(context)}/{NODE_STATE.name}", receive, STATES
+    )
+    # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a
+    # timer.
     ros_node.create_timer(SHUTDOWN_DELAY, lambda: None)
 
 
 def _namespace(context: LaunchContext) -> str:
     """The absolute namespace of the nodes, as launch_ros.actions.Node has it; "" for the root."""
     base = context.launch_configurations.get("ros_namespace")
-    return str(make_namespace_absolute(prefix_namespace(base, argument(context, "namespace")))).rstrip("/")
+    return str(
+        make_namespace_absolute(prefix_namespace(base, argument(context, "namespace")))
+    ).rstrip("/")
 
 
 def _is_descendant(pid: int) -> bool:
-    """Whether a process belongs to this launch, directly or behind a launch prefix, not to a second flight."""
+    """Whether a process belongs to this launch, directly or behind a launch prefix, not to a second
+    flight.
+    """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
     return False

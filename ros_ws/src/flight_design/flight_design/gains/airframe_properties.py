@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The theorem's assumptions on an airframe, checked on the matrices: Remark 1 and Assumptions 1 and 3 as a table.
+"""The theorem's assumptions on an airframe, checked on the matrices: Remark 1 and Assumptions 1 and
+3 as a table.
 
-Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and sine terms, which are C1 and
-have bounded rates for bounded angular rates.
+Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and
+sine terms, which are C1 and have bounded rates for bounded angular rates.
 """
 
 from collections.abc import Sequence
@@ -20,24 +21,34 @@ from flight_core.arguments import FilePath
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.effectors import LAW_INPUT
-from rise_di_controller.decomposition import MANY, DecompositionError, Pairing, coupling, leading_minors, search, signs
+from rise_di_controller.decomposition import (
+    MANY,
+    DecompositionError,
+    Pairing,
+    coupling,
+    leading_minors,
+    search,
+    signs,
+)
 from rise_di_controller.feedforward import ZERO_REAL_PART
 
 ComplexArray = NDArray[np.complex128]
 
 MAX_FINITE_ZERO = 1e4
-"""1/s. The pencil has double zeros at infinity. Rounding may make these finite, but not less than about 1e7, the inverse
-root of 2e-16. The largest finite zero in the library is 7.2."""
+"""1/s. The pencil has double zeros at infinity. Rounding may make these finite, but not less than
+about 1e7, the inverse root of 2e-16. The largest finite zero in the library is 7.2."""
 
 RANK_TOLERANCE = 1e-9
-"""Singular values below this fraction of the largest one are zero: rounding gives 1e-15, published data have five digits."""
+"""Singular values below this fraction of the largest one are zero: rounding gives 1e-15, published
+data have five digits."""
 
 
 class ZeroDynamics(StrEnum):
     """Location of the invariant zeros, the criterion of Assumption 3."""
 
     STABLE = "stable"  # all in the open left half plane
-    MARGINAL = "marginal"  # some on the imaginary axis, outside too: angles that integrate the rates need an outer loop
+    # some on the imaginary axis, outside too: angles that integrate the rates need an outer loop
+    MARGINAL = "marginal"
     UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
 
 
@@ -48,42 +59,61 @@ class AirframeFacts(NamedTuple):
     n: int
     m: int
     poles: ComplexArray  # (n,) eigenvalues of A, 1/s
-    zeros: ComplexArray  # finite invariant zeros of (A, B, C), 1/s: n - m of them if Omega is nonsingular
+    # finite invariant zeros of (A, B, C), 1/s: n - m of them if Omega is nonsingular
+    zeros: ComplexArray
     Omega: FloatArray  # (m, m) C B
     minors: FloatArray  # (m,) leading minors of Omega
     D: FloatArray | None  # (m,) diagonal of D, None if a minor is (nearly) zero
     coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    pairing: Pairing | None  # `search`: a change to D = I, None where no order that was tried has one
+    pairing: (
+        Pairing | None
+    )  # `search`: a change to D = I, None where no order that was tried has one
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
-    integrated: tuple[str, ...]  # states that integrate outputs only: each gives a zero at the origin
+    integrated: tuple[
+        str, ...
+    ]  # states that integrate outputs only: each gives a zero at the origin
 
     @property
     def in_theorem(self) -> bool:
-        """Whether the checks hold: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
-        return self.controllable and self.D is not None and self.zero_dynamics is not ZeroDynamics.UNSTABLE
+        """Whether the checks hold: Assumption 1, D exists (10)-(11), no zero in the right half
+        plane.
+        """
+        return (
+            self.controllable
+            and self.D is not None
+            and self.zero_dynamics is not ZeroDynamics.UNSTABLE
+        )
 
     @property
     def remedy(self) -> str:
-        """Change for D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
+        """Change for D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip
+        rudder", "none".
+        """
         if self.pairing is None:
             return "none" if self.m <= MANY else "none of three orders tried"
         outputs, inputs, input_signs, _ = self.pairing
         in_place = outputs == inputs == tuple(range(self.m))
-        pairs = ", ".join(f"{self.outputs[i]}-{self.inputs[j]}" for i, j in zip(outputs, inputs, strict=True))
-        flips = ", ".join(self.inputs[j] for j, sign in zip(inputs, input_signs, strict=True) if sign < 0)
+        pairs = ", ".join(
+            f"{self.outputs[i]}-{self.inputs[j]}" for i, j in zip(outputs, inputs, strict=True)
+        )
+        flips = ", ".join(
+            self.inputs[j] for j, sign in zip(inputs, input_signs, strict=True) if sign < 0
+        )
         steps = ([] if in_place else [f"pair {pairs}"]) + ([f"flip {flips}"] if flips else [])
         return ", ".join(steps) or "none needed"
 
 
 def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
-    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, or of a name or file; SI.
+    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, or of a name or
+    file; SI.
 
-    Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
-    part (A, B, C): f is left out. A published A may contain gravity. More inputs than outputs count as m inputs of the law
-    through the pseudo-inverse of C B, in SI.
+    Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu,
+    Zergeroglu. Zeros are of the linear part (A, B, C): f is left out. A published A may contain
+    gravity. More inputs than outputs count as m inputs of the law through the pseudo-inverse of C
+    B, in SI.
     """
     airframe = load_airframe(airframe)
     if len(airframe.inputs) > len(airframe.outputs):
@@ -116,21 +146,26 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
         zero_dynamics=zero_dynamics(zeros),
         controllable=controllable(A, B),
         integrated=tuple(
-            state for i, state in enumerate(airframe.states) if hidden[i] and not B[i].any() and not (A[i] @ unseen).any()
+            state
+            for i, state in enumerate(airframe.states)
+            if hidden[i] and not B[i].any() and not (A[i] @ unseen).any()
         ),
     )
 
 
 def library() -> list[AirframeFacts]:
-    """Facts of every airframe of the library, by name. Raises ParameterError for an invalid file."""
+    """Facts of every airframe of the library, by name. Raises ParameterError for an invalid
+    file.
+    """
     return [airframe_facts(load_airframe(name)) for name in airframes()]
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
     """Finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank, by real part.
 
-    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. These are the poles of the zero dynamics, the
-    motion of the aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. These are the poles of
+    the zero dynamics, the motion of the aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space
+    and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -141,15 +176,19 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x: the outputs, and n - m states beside them.
+    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x: the outputs, and n
+    - m states beside them.
 
-    C (m, n) of full rank, else ParameterError. The states of eta are those that C contains least, by a QR decomposition with
-    pivoting. C that selects states gives P = C', N = H.
+    C (m, n) of full rank, else ParameterError. The states of eta are those that C contains least,
+    by a QR decomposition with pivoting. C that selects states gives P = C', N = H.
     """
     m, n = C.shape
     _, R, pivots = qr(C, pivoting=True)
     require(
-        abs(R[-1, m - 1]) > RANK_TOLERANCE * abs(R[0, 0]), "C", "rows that depend on each other", f"{m} independent outputs"
+        abs(R[-1, m - 1]) > RANK_TOLERANCE * abs(R[0, 0]),
+        "C",
+        "rows that depend on each other",
+        f"{m} independent outputs",
     )
     H = np.eye(n)[:, np.sort(pivots[m:])]
     inverse = np.asarray(np.linalg.inv(np.vstack([C, H.T])))
@@ -162,13 +201,22 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
         return ""
-    integrate = f": {', '.join(states)} integrate{'s' if len(states) == 1 else ''} the outputs" if states else ""
+    integrate = (
+        f": {', '.join(states)} integrate{'s' if len(states) == 1 else ''} the outputs"
+        if states
+        else ""
+    )
     where = f"{integrate} ({', '.join(names)})"
-    return f"Zeros at the origin are outside Assumption 3, an outer loop has to bound their states{where}."
+    return (
+        "Zeros at the origin are outside Assumption 3, an outer loop has to bound their "
+        f"states{where}."
+    )
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9); within ZERO_REAL_PART they are on the imaginary axis."""
+    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9); within ZERO_REAL_PART they are on
+    the imaginary axis.
+    """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:
         return ZeroDynamics.UNSTABLE
@@ -176,7 +224,8 @@ def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
 
 
 def controllable(A: FloatArray, B: FloatArray) -> bool:
-    """Assumption 1 by the test of Popov, Belevitch and Hautus: rank [A - s I, B] = n at every eigenvalue s of A.
+    """Assumption 1 by the test of Popov, Belevitch and Hautus: rank [A - s I, B] = n at every
+    eigenvalue s of A.
 
     Shapes: A (n, n), B (n, m).
     """

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of an allocation: T for the effectors of an airframe, and the loop that the law sees through T."""
+"""Design of an allocation: T for the effectors of an airframe, and the loop that the law sees
+through T.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,8 +16,10 @@ from rise_di_controller.params import AllocationConfig
 
 LAW_INPUT = "v_"  # begin of the name of an input of the law: v_q is that of the output q
 DIGITS = 10  # of T and effect in a file: their product is I to 1e-9
-SERVO = 0.01  # s, added to the lags in the weights: that of a fast servo, so that an ideal one is not alone
-SMALL = 1e-9  # part of the largest: an effector that gives less of an input of the law does not limit it
+# s, added to the lags in the weights: that of a fast servo, so that an ideal one is not alone
+SERVO = 0.01
+# part of the largest: an effector that gives less of an input of the law does not limit it
+SMALL = 1e-9
 
 
 class Effectors(NamedTuple):
@@ -40,31 +44,55 @@ class LawInputs(NamedTuple):
 def design_allocation(
     airframe: Airframe, effectors: Effectors, priority: Sequence[str] = ()
 ) -> tuple[AllocationConfig, LawInputs]:
-    """The allocation by the weighted pseudo-inverse of Omega = C B, (m, p), and the inputs of the law: C B T = I.
+    """The allocation by the weighted pseudo-inverse of Omega = C B, (m, p), and the inputs of the
+    law: C B T = I.
 
-        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),  effect = Omega
+        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),
+            effect = Omega
 
-    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of squares of
-    (lag_j + SERVO) u_j / range_j, range_j half the way between the stops: a slow effector helps a fast one little.
-    lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to first order.
-    `priority` are outputs, the one that keeps its input the longest first; the rest follow in their order.
+    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of
+    squares of (lag_j + SERVO) u_j / range_j, range_j half the way between the stops: a slow
+    effector helps a fast one little. lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to
+    first order. `priority` are outputs, the one that keeps its input the longest first; the rest
+    follow in their order.
 
-    Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent rows of Omega.
-    Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender, "Control allocation for over-actuated
-    systems", Proc. 14th Mediterranean Conference on Control and Automation, 2006.
+    Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
+    rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,
+    "Control allocation for over-actuated systems", Proc. 14th Mediterranean Conference on Control
+    and Automation, 2006.
     """
     Omega = airframe.matrix_c() @ airframe.matrix_b()
     m = len(airframe.outputs)
     names = tuple(airframe.inputs)
-    require(len(names) >= m, f"airframe {airframe.name}: inputs", ", ".join(names), f"{m} or more, as many as outputs or more")
-    for name, low, high in zip(names, effectors.lower.tolist(), effectors.upper.tolist(), strict=True):
+    require(
+        len(names) >= m,
+        f"airframe {airframe.name}: inputs",
+        ", ".join(names),
+        f"{m} or more, as many as outputs or more",
+    )
+    for name, low, high in zip(
+        names, effectors.lower.tolist(), effectors.upper.tolist(), strict=True
+    ):
         both = np.isfinite([low, high]).all() and low <= 0.0 <= high and low < high
-        require(bool(both), f"aircraft.actuators of {name}", f"{low:g} to {high:g}", "both end stops: they weigh the effectors")
+        require(
+            bool(both),
+            f"aircraft.actuators of {name}",
+            f"{low:g} to {high:g}",
+            "both end stops: they weigh the effectors",
+        )
     reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
     scaled = Omega * reach
     size = np.abs(scaled).max(axis=1, keepdims=True)
-    independent = bool((size > 0.0).all()) and np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6) == m
-    require(independent, f"airframe {airframe.name}: C B", "rows that depend on each other", "inputs that move each output")
+    independent = (
+        bool((size > 0.0).all())
+        and np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6) == m
+    )
+    require(
+        independent,
+        f"airframe {airframe.name}: C B",
+        "rows that depend on each other",
+        "inputs that move each output",
+    )
     T = reach[:, None] * np.linalg.pinv(scaled)
     law = tuple(f"{LAW_INPUT}{name}" for name in airframe.outputs)
     first = [f"{LAW_INPUT}{name}" for name in priority]
@@ -81,12 +109,17 @@ def design_allocation(
         "allocation",
     )
     lag = np.maximum((Omega * T.T) @ effectors.lag, 0.0)
-    lower, upper = (_alone(T, sides) for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper)))
+    lower, upper = (
+        _alone(T, sides)
+        for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper))
+    )
     return config, LawInputs(law, -lower, upper, _alone(T, (effectors.rate, effectors.rate)), lag)
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """The largest v_i >= 0 alone inside the ends; `sides`: the ends in the direction -T_ji and +T_ji, of either sign."""
+    """The largest v_i >= 0 alone inside the ends; `sides`: the ends in the direction -T_ji and
+    +T_ji, of either sign.
+    """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
     room = np.where(T > 0.0, along, against) / np.where(counts, np.abs(T), 1.0)
@@ -95,4 +128,7 @@ def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
 
 def _rounded(matrix: FloatArray) -> list[float]:
     small = SMALL * np.abs(matrix).max(axis=0)
-    return [float(f"{value:.{DIGITS}g}") for value in np.where(np.abs(matrix) > small, matrix, 0.0).ravel()]
+    return [
+        float(f"{value:.{DIGITS}g}")
+        for value in np.where(np.abs(matrix) > small, matrix, 0.0).ravel()
+    ]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains beside an extended state observer: an integrator for each output, known by its sign and size alone."""
+"""Gains beside an extended state observer: an integrator for each output, known by its sign and
+size alone.
+"""
 
 from collections.abc import Mapping
 
@@ -18,21 +20,28 @@ EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
     "r": (0.714, 0.0242, 0.098, 0.161),
     "V": (1.31, 0.0242, 0.184, 0.667),
 }
-"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of a search on the `osprey`,
-T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence together: no other aircraft was in it."""
+"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of
+a search on the `osprey`, T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence
+together: no other aircraft was in it."""
 
 
-DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]  # for an output that is not in EXTENDED_STATE_PRODUCTS
+DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS[
+    "p"
+]  # for an output that is not in EXTENDED_STATE_PRODUCTS
 
 
 def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
-    """Weights of an extended-state observer from the total lags of the loop, (m,), s, by EXTENDED_STATE_PRODUCTS."""
+    """Weights of an extended-state observer from the total lags of the loop, (m,), s, by
+    EXTENDED_STATE_PRODUCTS.
+    """
     products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
     return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
 
 
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
-    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag + delay + half a period."""
+    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag +
+    delay + half a period.
+    """
     return FeedforwardConfig(
         states=controller.outputs,
         A=(0.0,) * Omega.size,

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first scenario for an airframe: commands, actuators, noise, and gusts of a size that fits the aircraft."""
+"""A first scenario for an airframe: commands, actuators, noise, and gusts of a size that fits the
+aircraft.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,12 +23,20 @@ ENGINE_LAG = 0.3
 # rad, rad/s: 20 deg, 57 deg/s, assumed
 STOP = 0.35
 SURFACE_RATE = 1.0
-AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
+AUTHORITY = {
+    SPEED: 0.3 * GRAVITY,
+    ANGULAR_RATE: 2.0,
+}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
 USED = 0.4  # part of the authority that the edge of a command takes at most
 NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
 RATE = 200.0  # Hz, of y and y_m
-FASTEST = {"q": 3.0, "p": 4.0, "r": 2.0, "V": 1.2}  # rad/s, natural frequency of the reference model at most
+FASTEST = {
+    "q": 3.0,
+    "p": 4.0,
+    "r": 2.0,
+    "V": 1.2,
+}  # rad/s, natural frequency of the reference model at most
 LAG_PRODUCT = 0.18  # 1, natural frequency times the lag of the input at most
 
 SCENARIO_YAML = gain_yaml.yaml_template("""\
@@ -74,16 +84,23 @@ SCENARIO_YAML = gain_yaml.yaml_template("""\
 /**/recorder:
   ros__parameters: {rate: 100.0}
 
-{{ controller }}""")
+{{ controller }}""")  # noqa: E501 - a text as it is written
 
 
 def scenario_text(
-    airframe: Airframe, path: str, scenario: str, controller: str, lag: Sequence[float], size: float = 1.0
+    airframe: Airframe,
+    path: str,
+    scenario: str,
+    controller: str,
+    lag: Sequence[float],
+    size: float = 1.0,
 ) -> str:
-    """A scenario file for the airframe in `path`, with the text of the section controller; `size` multiplies the commands.
+    """A scenario file for the airframe in `path`, with the text of the section controller; `size`
+    multiplies the commands.
 
-    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge of a command would take
-    more than USED of the input's authority. Gusts have 3 % of the trim speed.
+    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge
+    of a command would take more than USED of the input's authority. Gusts have 3 % of the trim
+    speed.
     """
     inputs = list(airframe.inputs)
     outputs = list(airframe.outputs)
@@ -99,8 +116,13 @@ def scenario_text(
         response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
         authority = response * np.array(stops)[list(paired)]
         lag_of = {outputs[i]: lag[j] for i, j in enumerate(paired)}
-    fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
-    banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))  # a bank turns an aeroplane
+    fastest = {
+        output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3))
+        for output in outputs
+    }
+    banks = {"p", "r"} <= set(outputs) and bool(
+        {"beta", "v"} & set(airframe.states)
+    )  # a bank turns an aeroplane
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
     amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
     start = 2.0
@@ -111,7 +133,10 @@ def scenario_text(
         if output == "r" and turn:
             continue  # the turns command it
         length = 8.0 if output in {"V", "u"} else 2.0
-        pulses[output] = {"start": [start, start + 2.0 * length], "stop": [start + length, start + 3.0 * length]}
+        pulses[output] = {
+            "start": [start, start + 2.0 * length],
+            "stop": [start + length, start + 3.0 * length],
+        }
         pulses[output]["value"] = [value, -value] if length == 2.0 else [value, 0.0]
         if length == 8.0:
             pulses[output] = {"start": [start], "stop": [start + length], "value": [value]}
@@ -150,9 +175,16 @@ def _surfaces(airframe: Airframe) -> list[bool]:
 
 
 def _stops(airframe: Airframe) -> list[float]:
-    """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the output that it moves."""
+    """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the
+    output that it moves.
+    """
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
-    authorities = np.array([AUTHORITY.get(quantity(unit).dimension, 1.0) for unit in airframe.units_of_outputs().values()])
+    authorities = np.array(
+        [
+            AUTHORITY.get(quantity(unit).dimension, 1.0)
+            for unit in airframe.units_of_outputs().values()
+        ]
+    )
     moved = np.argmax(Omega / authorities[:, None], axis=0).tolist()
     if len(airframe.inputs) == len(airframe.outputs):
         for i, j in enumerate(pairing(airframe)):
@@ -164,13 +196,18 @@ def _stops(airframe: Airframe) -> list[float]:
 
 
 def _rates(airframe: Airframe) -> list[float]:
-    return [SURFACE_RATE if surface else stop for surface, stop in zip(_surfaces(airframe), _stops(airframe), strict=True)]
+    return [
+        SURFACE_RATE if surface else stop
+        for surface, stop in zip(_surfaces(airframe), _stops(airframe), strict=True)
+    ]
 
 
 def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationConfig, LawInputs]:
     """The allocation of an airframe with more inputs than outputs."""
     stops = np.array(_stops(airframe))
-    return design_allocation(airframe, Effectors(-stops, stops, np.array(_rates(airframe)), np.array(lag)))
+    return design_allocation(
+        airframe, Effectors(-stops, stops, np.array(_rates(airframe)), np.array(lag))
+    )
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
@@ -191,7 +228,12 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         paired = pairing(airframe)
         inputs = [list(airframe.inputs)[j] for j in paired]
         lags = [lag[j] for j in paired]
-    require(m > 1, "inputs", inputs[0], "two inputs or more: add a thrust with --thrust, or a second control")
+    require(
+        m > 1,
+        "inputs",
+        inputs[0],
+        "two inputs or more: add a thrust with --thrust, or a second control",
+    )
     values: Mapping[str, Any] = {
         "rate": 100.0,
         "outputs": list(airframe.outputs),

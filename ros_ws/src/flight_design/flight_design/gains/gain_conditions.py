@@ -1,17 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
-"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the conditions on both.
+"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the conditions on
+both.
 
-The theorem's conditions are sufficient, not necessary, and they contain no actuator. `theorem_gains` meets them all; behind
-servos its result is unstable. `engineering_gains` starts from the lag of the loop. `check` evaluates the theorem's conditions
-on a gain set, `check_loop` those of the loop. `rise_di_controller.linear_loop` has the linear loop and its delay margin.
+The theorem's conditions are sufficient, not necessary, and they contain no actuator.
+`theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
+from the lag of the loop. `check` evaluates the theorem's conditions on a gain set, `check_loop`
+those of the loop. `rise_di_controller.linear_loop` has the linear loop and its delay margin.
 
-The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the phase that the lag costs
-at the crossover: 57.3 degrees times the product. A loop that integrates then has a phase margin of 90 degrees minus that.
-With the lag taken as a pure delay its gain margin is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
+The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
+phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
+then has a phase margin of 90 degrees minus that. With the lag taken as a pure delay its gain margin
+is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
 
-All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), where abs(Omega_ii) is about 1.
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), where
+abs(Omega_ii) is about 1.
 """
 
 import math
@@ -28,20 +32,26 @@ from rise_di_controller.law import MIN_GAIN, LawParams, Sign
 from rise_di_controller.linear_loop import Loop
 
 MIN_K = 1.5
-"""1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller input scale: the same loop."""
+"""1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller
+input scale: the same loop."""
 
-K_G_MARGIN = 1.5  # factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay to step 3.
+# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay
+# to step 3.
+K_G_MARGIN = 1.5
 MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that all of step 3 uses, out of that third
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
-"""rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey` 0.63 (36 degrees) leaves a
-delay margin of 45 ms, and 0.91 (52 degrees) leaves 30 ms, which is less than the lag of the loop itself."""
+"""rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey`
+0.63 (36 degrees) leaves a delay margin of 45 ms, and 0.91 (52 degrees) leaves 30 ms, which is less
+than the lag of the loop itself."""
 
 MAX_LAMBDA_TO_BANDWIDTH = 0.5
-"""Upper bound of Lambda_i / bandwidth. At 0.5 the integral costs atan(0.5) = 27 degrees of phase at the crossover."""
+"""Upper bound of Lambda_i / bandwidth. At 0.5 the integral costs atan(0.5) = 27 degrees of phase at
+the crossover."""
 
 MAX_BETA_TO_RATE_LIMIT = 0.7
-"""Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit cycle, at 2/3 it had none."""
+"""Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit
+cycle, at 2/3 it had none."""
 
 BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, since files hold gains with six digits
 
@@ -63,14 +73,18 @@ class GainSet(NamedTuple):
 class Bounds(NamedTuple):
     """Bounds of the aircraft that Theorem 1 requires."""
 
-    U: FloatArray  # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two indices
+    # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two
+    # indices
+    U: FloatArray
     N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
     rho: float  # of (19), 1/s
     gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, nothing bounds it
 
 
 class Condition(NamedTuple):
-    """One condition on a gain set: value >= bound, value <= bound, or, if it is strict, value > bound."""
+    """One condition on a gain set: value >= bound, value <= bound, or, if it is strict, value >
+    bound.
+    """
 
     name: str
     channel: int | None  # None: all of them together
@@ -91,11 +105,15 @@ class Condition(NamedTuple):
         if self.strict:
             return self.value > self.bound
         slack = BOUND_TOLERANCE * abs(self.bound)
-        return self.value >= self.bound - slack if self.at_least else self.value <= self.bound + slack
+        return (
+            self.value >= self.bound - slack if self.at_least else self.value <= self.bound + slack
+        )
 
     @property
     def margin(self) -> float:
-        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it, NaN for a lower bound of 0."""
+        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it, NaN for a lower
+        bound of 0.
+        """
         if self.at_least:
             return self.value / self.bound if self.bound > 0.0 else math.nan
         if self.bound <= 0.0:
@@ -103,7 +121,9 @@ class Condition(NamedTuple):
         return self.bound / self.value if self.value > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
-        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
+        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1"; `channels` are
+        the names of y.
+        """
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
         return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
 
@@ -117,10 +137,11 @@ def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 
 
 def bound_U(Omegas: FloatArray) -> FloatArray:
-    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m, m).
+    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m,
+    m).
 
-    U is that of Omega = S D U (11). The result bounds the off-diagonal entries of D U D as well: their sizes are the same.
-    Raises DecompositionError for a sample without decomposition.
+    U is that of Omega = S D U (11). The result bounds the off-diagonal entries of D U D as well:
+    their sizes are the same. Raises DecompositionError for a sample without decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -128,9 +149,10 @@ def bound_U(Omegas: FloatArray) -> FloatArray:
 def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
     """Bound of norm(N~) / norm(z), (19), 1/s: the largest singular value of [I - G Lambda, G].
 
-    G = M (C A C^+ + Lambda) with M = S^-1; N~ = G (r - Lambda e) + e, the reference term of (18) moved to N_d. Arguments:
-    Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises DecompositionError if Omega has no S D U.
-    Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
+    G = M (C A C^+ + Lambda) with M = S^-1; N~ = G (r - Lambda e) + e, the reference term of (18)
+    moved to N_d. Arguments: Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises
+    DecompositionError if Omega has no S D U. Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu,
+    with the correction of docs/theory.md.
     """
     G = np.linalg.solve(decompose(Omega).S, CAC + np.diag(Lambda))
     return float(np.linalg.norm(np.hstack([np.eye(len(G)) - G * Lambda, G]), 2))
@@ -149,20 +171,23 @@ def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
 
 
 def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
-    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s: the norm over j > i of zeta_U,ij k_j. K (m,), U (m, m)."""
+    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s: the norm over j > i of zeta_U,ij k_j. K (m,),
+    U (m, m).
+    """
     return float(np.linalg.norm(U[i, i + 1 :] * K[i + 1 :]))
 
 
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
-    """Gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given, shape as in the fields.
+    """Gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given, shape
+    as in the fields.
 
         least = min(Lambda, 1), the decay of e and r before N~ and Phi
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
         k_d,i = zeta_Phi,i^2 / (4 part), part = 0.3 least / (m - 1)       step 3, i = m-1 .. 1
         beta  = `least_beta`                                              step 1
 
-    so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The factors 1.5 and 0.3 are this project's:
-    the paper only says "small". bounds.rho must be that of the same Lambda.
+    so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The factors 1.5 and
+    0.3 are this project's: the paper only says "small". bounds.rho must be that of the same Lambda.
     """
     m = len(Lambda)
     least = min(float(Lambda.min()), 1.0)
@@ -170,35 +195,54 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     k_d = np.zeros(m - 1)
     for i in reversed(range(m - 1)):
         part = MAX_STEP_3_FRACTION * least / (m - 1)
-        k_d[i] = max(zeta_Phi(i, np.asarray(law.gain(np.array(k_g), k_d)), bounds.U) ** 2 / (4.0 * part), MIN_GAIN)
+        k_d[i] = max(
+            zeta_Phi(i, np.asarray(law.gain(np.array(k_g), k_d)), bounds.U) ** 2 / (4.0 * part),
+            MIN_GAIN,
+        )
     return GainSet(k_g, k_d, Lambda, np.maximum(least_beta(Lambda, bounds), MIN_GAIN))
 
 
 def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
-    """Conditions of Theorem 1 on a gain set: (29), (30) from the last channel up, then steps 2 and 3.
+    """Conditions of Theorem 1 on a gain set: (29), (30) from the last channel up, then steps 2 and
+    3.
 
-        beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), beta_j those of the gain set
-        k_g >= rho^2 / (4 min(Lambda, 1))
+        beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), beta_j those
+        of the gain set k_g >= rho^2 / (4 min(Lambda, 1))
         sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
 
-    The last names the channel with the largest term. (22) needs no condition, since the gain set holds k_g and k_d.
-    Raises ParameterError if a gain is not positive.
+    The last names the channel with the largest term. (22) needs no condition, since the gain set
+    holds k_g and k_d. Raises ParameterError if a gain is not positive.
     """
     for key in GainSet._fields:
-        require(bool(np.all(np.asarray(getattr(gains, key)) > 0.0)), key, getattr(gains, key), "values above 0")
+        require(
+            bool(np.all(np.asarray(getattr(gains, key)) > 0.0)),
+            key,
+            getattr(gains, key),
+            "values above 0",
+        )
     m = len(gains.Lambda)
     smallest = (bounds.N_d + bounds.U @ gains.beta) * (1.0 + bounds.gamma_2 / gains.Lambda)
     conditions = [
-        Condition("beta (29)" if i == m - 1 else "beta (30)", i, float(gains.beta[i]), float(smallest[i]), estimate=True)
+        Condition(
+            "beta (29)" if i == m - 1 else "beta (30)",
+            i,
+            float(gains.beta[i]),
+            float(smallest[i]),
+            estimate=True,
+        )
         for i in reversed(range(m))
     ]
     least = min(float(gains.Lambda.min()), 1.0)
     conditions.append(Condition("k_g, step 2", None, gains.k_g, bounds.rho**2 / (4.0 * least)))
-    terms = np.array([zeta_Phi(i, gains.K, bounds.U) ** 2 / (4.0 * gains.k_d[i]) for i in range(m - 1)])
+    terms = np.array(
+        [zeta_Phi(i, gains.K, bounds.U) ** 2 / (4.0 * gains.k_d[i]) for i in range(m - 1)]
+    )
     if m > 1:
         remaining = least - bounds.rho**2 / (4.0 * gains.k_g)
         largest = int(np.argmax(terms))
-        conditions.append(Condition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False))
+        conditions.append(
+            Condition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False)
+        )
     return tuple(conditions)
 
 
@@ -206,72 +250,95 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
 
 
 def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
-    """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
+    """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape
+    (m,), rad/s.
 
-    A product of 0.63 rad costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 = 54 degrees. Source: this
-    project.
+    A product of 0.63 rad costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 =
+    54 degrees. Source: this project.
     """
     return np.asarray(crossover_lag_product / loop.total)
 
 
 def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
-    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22) requires it to be positive.
+    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22)
+    requires it to be positive.
 
     Raises ParameterError if the last K is not the smallest or not above 1: (22) has no such K.
     """
-    require(float(K[-1]) <= float(K.min()), "K", K.tolist(), "the smallest in the last channel, as (22) has it")
+    require(
+        float(K[-1]) <= float(K.min()),
+        "K",
+        K.tolist(),
+        "the smallest in the last channel, as (22) has it",
+    )
     require(float(K[-1]) > 1.0, f"K[{len(K) - 1}]", float(K[-1]), "above 1 1/s, as (22) has it")
     return float(K[-1]) - 1.0, np.maximum(K[:-1] - K[-1], MIN_GAIN)
 
 
 def engineering_gains(
-    bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray, slower: FloatArray | float = 1.0
+    bandwidth: FloatArray,
+    slew: FloatArray,
+    factor: float,
+    rate_limit: FloatArray,
+    slower: FloatArray | float = 1.0,
 ) -> tuple[GainSet, FloatArray]:
     """Gains for a loop with lag, from bandwidths (rad/s); all arguments shape (m,).
 
-    The second result is response_i, abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22).
+    The second result is response_i, abs(Omega_ii) in scaled inputs: 1, or less in a channel too
+    slow for (22).
 
         K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
-        Lambda_i = bandwidth_i / (4 slower_i)                             K_i response_i is the bandwidth
+        Lambda_i = bandwidth_i / (4 slower_i)  K_i response_i is the bandwidth
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
-    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite without one), both in
-    inputs of unit response, units of y / s^2. Raises ParameterError for a factor below 1.
-    Source: this project; beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
+    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite
+    without one), both in inputs of unit response, units of y / s^2. Raises ParameterError for a
+    factor below 1. Source: this project; beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))
     response = bandwidth / K
     k_g, k_d = split_gain(K)
-    beta = np.maximum(np.minimum(factor * slew, MAX_BETA_TO_RATE_LIMIT * rate_limit) / response, MIN_GAIN)
+    beta = np.maximum(
+        np.minimum(factor * slew, MAX_BETA_TO_RATE_LIMIT * rate_limit) / response, MIN_GAIN
+    )
     return GainSet(k_g, k_d, bandwidth / (4.0 * slower), beta), response
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
-    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot, shape of v_dot, (..., m), units of y / s^2.
+    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot, shape of v_dot, (..., m),
+    units of y / s^2.
 
-    From Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot), M Omega = D U.
-    Omega (m, m) in the inputs of v. Raises DecompositionError if it has no S D U.
+    From Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot),
+    M Omega = D U. Omega (m, m) in the inputs of v. Raises DecompositionError if it has no S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
 
 
 def check_loop(
-    params: LawParams, loop: Loop, response: FloatArray, largest: FloatArray, slew: FloatArray, rate_limit: FloatArray
+    params: LawParams,
+    loop: Loop,
+    response: FloatArray,
+    largest: FloatArray,
+    slew: FloatArray,
+    rate_limit: FloatArray,
 ) -> tuple[Condition, ...]:
     """Conditions of the loop on a gain set, channel by channel.
 
-        lag product:      K_i response_i total_i <= 0.8      rad: the lag costs at most 46 degrees of phase
+        lag product:      K_i response_i total_i <= 0.8
+            rad: the lag costs at most 46 degrees of phase
         Lambda below K:   Lambda_i <= 0.5 K_i response_i
         beta above slew:  beta_i >= slew_i                   shown in inputs of unit response
         beta below rate:  beta_i <= 0.7 rate_limit_i         if there is a limit; the same
-        softening:        eps_i K_i / beta_i >= total_i      softened sign: else the linear loop is unstable
+        softening:        eps_i K_i / beta_i >= total_i
+            softened sign: else the linear loop is unstable
         implicit: lag:    lag_i + delay <= period / 2        implicit sign: else it chatters
         implicit: omega:  omega_i >= largest_i               the same
 
-    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and `largest` its upper bound; slew and rate_limit
-    in those same inputs, units of y / s^2, infinite without a limit; all of shape (m,).
+    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and `largest` its upper
+    bound; slew and rate_limit in those same inputs, units of y / s^2, infinite without a limit; all
+    of shape (m,).
     """
     conditions: list[Condition] = []
     total = loop.total
@@ -281,13 +348,35 @@ def check_loop(
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
         conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
 
-    add("lag product", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
-    add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * params.K * response, at_least=False)
-    add("beta above slew", params.beta * response, slew * response, at_least=True)  # in the same inputs for every gain set
-    add("beta below rate", params.beta * response, MAX_BETA_TO_RATE_LIMIT * rate_limit * response, at_least=False)
+    add(
+        "lag product",
+        params.K * response * total,
+        np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT),
+        at_least=False,
+    )
+    add(
+        "Lambda below K",
+        params.Lambda,
+        MAX_LAMBDA_TO_BANDWIDTH * params.K * response,
+        at_least=False,
+    )
+    add(
+        "beta above slew", params.beta * response, slew * response, at_least=True
+    )  # in the same inputs for every gain set
+    add(
+        "beta below rate",
+        params.beta * response,
+        MAX_BETA_TO_RATE_LIMIT * rate_limit * response,
+        at_least=False,
+    )
     if params.sign is Sign.SOFT:
         add("softening", params.eps * params.K / params.beta, total, at_least=True)
     elif params.sign is Sign.IMPLICIT:
-        add("implicit: lag", loop.lag + loop.delay, np.full(len(total), loop.period / 2.0), at_least=False)
+        add(
+            "implicit: lag",
+            loop.lag + loop.delay,
+            np.full(len(total), loop.period / 2.0),
+            at_least=False,
+        )
         add("implicit: omega", params.omega, largest, at_least=True)
     return tuple(conditions)

@@ -26,17 +26,24 @@ from flight_design.gains.observer_selection import (
     model_for,
     with_aircraft_observer,
 )
-from flight_design.gains.requirement import OBSERVER_REQUIREMENT, PHASE_MARGIN, Requirement, requirement
+from flight_design.gains.requirement import (
+    OBSERVER_REQUIREMENT,
+    PHASE_MARGIN,
+    Requirement,
+    requirement,
+)
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 OBSERVER_LAWS = ("rise_observer", "pi_observer")
 OBJECTIVE = "gust_turbulence"
-"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
+"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a
+sign that is an integral."""
 SLOWER = 1.8
-"""Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`, searched with 38 ms in q, they
-have the margins with 55 ms and miss them with 65 and 75 ms. Those of the rule have them from 75 ms on."""
+"""Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`,
+searched with 38 ms in q, they have the margins with 55 ms and miss them with 65 and 75 ms. Those of
+the rule have them from 75 ms on."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
@@ -69,20 +76,25 @@ def select_gains(
     mixing: str = DIAGONAL,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Selection:
-    """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+    """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on
+    both.
 
-    The commands, the gusts and the loop are those of the scenario. `scenario.vary(controller=selection.chosen)`
-    flies the engineering gains; `gains_yaml` writes them as a section of a scenario file.
+    The commands, the gusts and the loop are those of the scenario.
+    `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml` writes
+    them as a section of a scenario file.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         rate: Rate of the law in Hz; None: that of the scenario.
-        y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three.
-        lag: Lags of the actuators in s, one or one an input in the airframe's order; None: those of the scenario.
+        y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale
+            after three.
+        lag: Lags of the actuators in s, one or one an input in the airframe's order; None: those of
+            the scenario.
         delay: Pure delay in s; None: that of the scenario.
-        inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty: the airframe's.
+        inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty:
+            the airframe's.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -90,16 +102,19 @@ def select_gains(
         observer: Whether they have a feedforward and an observer, and gains beside these.
         model: Airframe that the observer takes as its model; None: the airframe itself.
         margin: Least delay margin of the nominal loop with the observer, s.
-        speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A schedule flies the observer
-            from the one to the other. Empty: the observer holds at the trim speed alone.
-        phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a sensitivity of at most 2 and
-            a damping of 0.4; 35 deg with the observer.
+        speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A
+            schedule flies the observer from the one to the other. Empty: the observer holds at the
+            trim speed alone.
+        phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a
+            sensitivity of at most 2 and a damping of 0.4; 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
-        mixing: "diagonal": an input an output; "full": the law has inputs v of its own, an allocation u = T v by the
-            pseudo-inverse of the airframe's C B distributes them. More inputs than outputs always have an allocation.
+        mixing: "diagonal": an input an output; "full": the law has inputs v of its own, an
+            allocation u = T v by the pseudo-inverse of the airframe's C B distributes them. More
+            inputs than outputs always have an allocation.
         progress: Called with a sentence before a step of the search for the observer.
 
-    Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
+    Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with
+    its outputs.
     """
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe)
@@ -117,23 +132,38 @@ def select_gains(
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
     )
-    require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
+    require(
+        observer or model is None, "model", model, "observer beside it: it is the observer's model"
+    )
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
     pair = _two_speeds(speeds, observer=observer)
     known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
-    selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
+    selection = gain_selection.select_gains(
+        study(frame, chosen, uncertainty, samples, seed), setting
+    )
     if not observer:
         return selection
-    needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
-    controller, origin = observed(selection.chosen, chosen, known_model, margin, needed, speeds=pair, progress=progress)
+    needed = setting.requirement._replace(
+        phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase)
+    )
+    controller, origin = observed(
+        selection.chosen, chosen, known_model, margin, needed, speeds=pair, progress=progress
+    )
     return replace(selection, chosen=controller, origin=origin)
 
 
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
     """The two parts of the trim speed; None for none. Raises ParameterError."""
-    ratios = as_numbers(speeds, "speeds", expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4")
+    ratios = as_numbers(
+        speeds,
+        "speeds",
+        expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4",
+    )
     require(
-        observer or not ratios, "speeds", speeds, "observer beside them: the bare law follows the airspeed by schedule alone"
+        observer or not ratios,
+        "speeds",
+        speeds,
+        "observer beside them: the bare law follows the airspeed by schedule alone",
     )
     pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
     fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
@@ -150,18 +180,25 @@ def check_gains(
     samples: int = 100,
     seed: int = 1,
 ) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gains of a scenario under any law, and the margins of the loop; arguments as for `select_gains`.
+    """Every condition on the gains of a scenario under any law, and the margins of the loop;
+    arguments as for `select_gains`.
 
     Raises ParameterError.
     """
     chosen = find_scenario(scenario)
     frame = through_allocation(load_airframe(airframe), chosen.controller)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
-    return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)
+    return gain_selection.check_gains(
+        chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2
+    )
 
 
-def study(airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int) -> Study:
-    """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario. Raises ParameterError."""
+def study(
+    airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int
+) -> Study:
+    """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario.
+    Raises ParameterError.
+    """
     return ideal_control.study_airframe(
         airframe,
         ideal_control.manoeuvre(scenario, airframe),
@@ -179,9 +216,11 @@ def _loop(
     lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
-    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises ParameterError.
+    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises
+    ParameterError.
 
-    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are counted from its own rate.
+    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are
+    counted from its own rate.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -201,22 +240,31 @@ def _loop(
 
 
 def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
-    """The loop with limits of u within the end stops of the scenario's actuators; without limits for another aircraft."""
+    """The loop with limits of u within the end stops of the scenario's actuators; without limits
+    for another aircraft.
+    """
     aircraft = scenario.aircraft
     if aircraft.is_jsbsim or load_airframe(aircraft.airframe).name != airframe.name:
-        return loop._replace(base=loop.base.model_copy(update=dict.fromkeys(gain_selection.INPUT_LIMITS)))
+        return loop._replace(
+            base=loop.base.model_copy(update=dict.fromkeys(gain_selection.INPUT_LIMITS))
+        )
     limits = {}
     for key, tighter in (("lower", max), ("upper", min)):
         stops = getattr(aircraft.actuators, key)
         if stops:
             by_input = dict(zip(aircraft.channels().inputs, stops, strict=True))
             bounds = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
-            limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(bounds, loop.base.inputs, strict=True))
+            limits[key] = tuple(
+                tighter(value, by_input[name])
+                for value, name in zip(bounds, loop.base.inputs, strict=True)
+            )
     return loop._replace(base=loop.base.model_copy(update=limits))
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of the actuators."""
+    """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of
+    the actuators.
+    """
     if loop.base.allocation is None:
         return loop
     names = tuple(scenario.aircraft.channels().inputs)
@@ -226,16 +274,27 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
     return loop._replace(base=loop.base.model_copy(update=plain), lag=lag | dict(loop.lag))
 
 
-def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tuple[LoopSetting, Airframe]:
+def _allocated(
+    loop: LoopSetting, scenario: Scenario, airframe: Airframe
+) -> tuple[LoopSetting, Airframe]:
     """The loop and the airframe that the law sees through an allocation by the airframe's own C B.
 
-    Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops of the airframe's actuators.
+    Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops
+    of the airframe's actuators.
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
-    same_airframe = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
+    same_airframe = (
+        not scenario.aircraft.is_jsbsim
+        and load_airframe(scenario.aircraft.airframe).name == airframe.name
+    )
     stops = same_airframe and actuators.lower and actuators.upper
-    require(bool(stops), "scenario", scenario.name, f"a scenario of {airframe.name} with aircraft.actuators, lower and upper")
+    require(
+        bool(stops),
+        "scenario",
+        scenario.name,
+        f"a scenario of {airframe.name} with aircraft.actuators, lower and upper",
+    )
     lags = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True)) | dict(loop.lag)
     rate = np.array(actuators.rate or [np.inf] * len(names))
     lag = np.array([lags[name] for name in names])
@@ -266,7 +325,9 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tup
     T = np.reshape(allocation.T, (len(names), m))
     return (
         loop._replace(
-            base=RiseDiConfig.validate_mapping(scenario.rise_di().model_dump() | base, "controller"),
+            base=RiseDiConfig.validate_mapping(
+                scenario.rise_di().model_dump() | base, "controller"
+            ),
             lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
             rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
         ),
@@ -279,7 +340,12 @@ def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
     values = values * len(names) if len(values) == 1 else values
-    require(len(values) == len(names), "lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    require(
+        len(values) == len(names),
+        "lag",
+        f"{len(values)} values",
+        f"one for all or one for each of {', '.join(names)}",
+    )
     require(min(values) >= 0.0, "lag", lag, expected)
     return dict(zip(names, values, strict=True))
 
@@ -298,25 +364,33 @@ def observed(
 ) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
-    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
-    where the model has the same states and no channel has SLOWER times the total lag; else they follow from the lags by a rule.
-    Of several gain sets it is the one that the margins change least, then the one of the least cost. `uncertain` counts the
-    phase margin of uncertain aircraft too, `sketched` takes the gains for a model from a sketch, and `speeds` are two ratios to
-    the trim speed, with models there. `progress` as for `with_aircraft_observer`.
+    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships
+    with its airframe and lags, where the model has the same states and no channel has SLOWER times
+    the total lag; else they follow from the lags by a rule. Of several gain sets it is the one that
+    the margins change least, then the one of the least cost. `uncertain` counts the phase margin of
+    uncertain aircraft too, `sketched` takes the gains for a model from a sketch, and `speeds` are
+    two ratios to the trim speed, with models there. `progress` as for `with_aircraft_observer`.
     """
     channels = scenario.aircraft.channels().outputs
-    by_name = dict(zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True))
+    by_name = dict(
+        zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True)
+    )
     measured = [name for name in scenario.aircraft.vanes.channels if name in model.states]
     vanes: dict[str, float] = {name: by_name[name] or PERFECT_VANE for name in measured}
     perfect = (
         sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
     )  # noise in place of none, of a perfect sensor
-    noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
+    noise = np.array(
+        [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
+    )
     nominal = model_for(model, controller, noise)
     tuned = _tuned_scenario(scenario)
-    results = {} if sketched else {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    results = (
+        {} if sketched else {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    )
     searched = sorted(
-        ((result.cost, law, result) for law, result in results.items() if result is not None), key=lambda row: row[0]
+        ((result.cost, law, result) for law, result in results.items() if result is not None),
+        key=lambda row: row[0],
     )
     axes = tuple(model.gusts)
     origin = "gains by a rule from the lags, a start"
@@ -324,29 +398,63 @@ def observed(
     if sketched:
         candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
     tuned_lag = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
-    ratios = [lag / tuned_lag.get(name, np.inf) for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)]
-    if searched and max(ratios) < SLOWER and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
-        titles = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
-        searched_gains = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
+    ratios = [
+        lag / tuned_lag.get(name, np.inf)
+        for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)
+    ]
+    if (
+        searched
+        and max(ratios) < SLOWER
+        and tuple(scenario.aircraft.load()[0].states) == tuple(model.states)
+    ):
+        titles = (
+            f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched
+        )
+        searched_gains = (
+            gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched
+        )
         candidates = list(zip(searched_gains, titles, strict=True))
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
-        controller, model, sets, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds, progress=progress
+        controller,
+        model,
+        sets,
+        noise,
+        margin,
+        needed,
+        vanes,
+        uncertain=uncertain,
+        speeds=speeds,
+        progress=progress,
     )
     origin = origins[selected.place]
     factors = zip(selected.controller.outputs, selected.relaxation.tolist(), strict=True)
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
     lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
-    margins = f"delay margin {1e3 * selected.delay_margin:.0f} ms, phase margin {np.degrees(selected.phase_margin):.0f} deg"
+    margins = (
+        f"delay margin {1e3 * selected.delay_margin:.0f} ms, phase margin "
+        f"{np.degrees(selected.phase_margin):.0f} deg"
+    )
     vane_text = f" with vanes for {' and '.join(vanes)}" if vanes else ""
     return selected.controller, f"observer of {model.name}{vane_text}: {origin}{lowered}; {margins}"
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
-    """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
+    """The scenario itself if it has tuned gains, else one that ships with the same airframe and
+    actuators and has them.
+    """
     shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
     model = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
-    equal = (candidate for candidate in shipped if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == model)
+    equal = (
+        candidate
+        for candidate in shipped
+        if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == model
+    )
     return next(
-        (candidate for candidate in (scenario, *equal) if tuned_gains.load(tuned_gains.tuned_file(candidate))), scenario
+        (
+            candidate
+            for candidate in (scenario, *equal)
+            if tuned_gains.load(tuned_gains.tuned_file(candidate))
+        ),
+        scenario,
     )

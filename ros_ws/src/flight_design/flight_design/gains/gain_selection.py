@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gain selection for an airframe: its ideal control along a manoeuvre, two gain sets, and their assessment.
+"""Gain selection for an airframe: its ideal control along a manoeuvre, two gain sets, and their
+assessment.
 
-`study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain ones around it.
-`select_gains` derives two gain sets, of Theorem 1 and of the engineering procedure. `check_gains` assesses the gain set of a
-scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as the section of a scenario file.
+`study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain
+ones around it. `select_gains` derives two gain sets, of Theorem 1 and of the engineering procedure.
+`check_gains` assesses the gain set of a scenario: conditions, stability and delay margin. `as_yaml`
+writes a gain set as the section of a scenario file.
 """
 
 import math
@@ -47,10 +49,17 @@ from rise_di_controller.linear_loop import Loop, is_stable
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46, "climb": 0.46}
-"""Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search: 0.63 and 0.46 cost 36 and 26
-degrees of phase at the crossover. Yaw has a margin for the dutch roll, speed for the engine. The integral, Lambda and the slope
-of the softened sign, costs more: the search makes the integral slower, and lowers the bandwidth, until the margins meet the
+CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {
+    "q": 0.63,
+    "p": 0.63,
+    "r": 0.46,
+    "V": 0.46,
+    "climb": 0.46,
+}
+"""Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search:
+0.63 and 0.46 cost 36 and 26 degrees of phase at the crossover. Yaw has a margin for the dutch roll,
+speed for the engine. The integral, Lambda and the slope of the softened sign, costs more: the
+search makes the integral slower, and lowers the bandwidth, until the margins meet the
 requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
@@ -58,15 +67,20 @@ DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSO
 SOFTENING = 2.75  # 1, width of the softened sign in total lags at the begin of the search
 
 BETA_TO_SLEW = 1.25
-"""beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing on the `osprey`."""
+"""beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
+on the `osprey`."""
 
 MAX_COUPLING = 10.0
-"""Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the `osprey` with aileron and rudder
-swapped, 13.6 on the first edition's Aerosonde, which neither procedure stabilises behind servos, and at most 2.2 on the other
-airframes of the library."""
+"""Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the
+`osprey` with aileron and rudder swapped, 13.6 on the first edition's Aerosonde, which neither
+procedure stabilises behind servos, and at most 2.2 on the other airframes of the library."""
 
 
-INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
+INPUT_LIMITS = (
+    "lower",
+    "upper",
+    "slew",
+)  # limits of the controller, one an input. They are reordered with the inputs.
 
 
 # of the search for the speed up to which the delay margin lasts
@@ -87,8 +101,12 @@ class LoopSetting(NamedTuple):
     gamma_2: float = 0.0  # 1/s, an assumption: 0 gives the smallest bounds (29), (30)
     factor: float = BETA_TO_SLEW  # beta / slew of the ideal control
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
-    inputs: tuple[str, ...] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
-    feedforward: bool = False  # whether the result has the published airframe as model of a feedforward
+    inputs: tuple[
+        str, ...
+    ] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
+    feedforward: bool = (
+        False  # whether the result has the published airframe as model of a feedforward
+    )
     requirement: Requirement = Requirement()
 
 
@@ -104,23 +122,33 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def delay_margin(self) -> float | None:
-        """Delay margin of the nominal aircraft with the delay in all channels, s; None for the literal sign."""
+        """Delay margin of the nominal aircraft with the delay in all channels, s; None for the
+        literal sign.
+        """
         return None if self.margins is None else self.margins.delay
 
     @property
     def channel_margins(self) -> tuple[float, ...]:
-        """Delay margins of the nominal aircraft with the delay in one channel alone, s; none for the literal sign."""
+        """Delay margins of the nominal aircraft with the delay in one channel alone, s; none for
+        the literal sign.
+        """
         return () if self.margins is None else self.margins.channel_delay
 
     @property
     def has_requirement(self) -> bool:
-        """Whether margins are asked of the loop: not of an ideal loop with the implicit or the literal sign."""
+        """Whether margins are asked of the loop: not of an ideal loop with the implicit or the
+        literal sign.
+        """
         return any(condition.name in REQUIRED for condition in self.loop)
 
     @property
     def unmet(self) -> tuple[Condition, ...]:
         """The margins of the requirement that the loop does not have."""
-        return tuple(condition for condition in gain_conditions.failing(self.loop) if condition.name in REQUIRED)
+        return tuple(
+            condition
+            for condition in gain_conditions.failing(self.loop)
+            if condition.name in REQUIRED
+        )
 
     @property
     def failing(self) -> tuple[Condition, ...]:
@@ -130,7 +158,9 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 @dataclass(frozen=True)
 class Selection:
-    """Both gain sets for an airframe. A set is assessed on first use, for the margins of all samples cost most."""
+    """Both gain sets for an airframe. A set is assessed on first use, for the margins of all
+    samples cost most.
+    """
 
     study: Study
     setting: LoopSetting
@@ -156,13 +186,18 @@ class Selection:
 
 
 def require_channels(
-    Omega: FloatArray, channels: ChannelPairing, D: Sequence[int] | None = None, input_signs: Sequence[int] | None = None
+    Omega: FloatArray,
+    channels: ChannelPairing,
+    D: Sequence[int] | None = None,
+    input_signs: Sequence[int] | None = None,
 ) -> FloatArray:
-    """D of a pairing of channels, shape (m,). Raises ParameterError with the contradiction to Omega and a choice that fits.
+    """D of a pairing of channels, shape (m,). Raises ParameterError with the contradiction to Omega
+    and a choice that fits.
 
-    Omega = C B in the order of the channels, (m, m), with the airframe's signs of the inputs. `input_signs` are -1 for an input
-    whose sign is flipped between law and airframe; this flips D_k and nothing else. The checks, in this order: the pairing has
-    a D and max abs(U - I) at most 10; the input signs fit the D given; D fits.
+    Omega = C B in the order of the channels, (m, m), with the airframe's signs of the inputs.
+    `input_signs` are -1 for an input whose sign is flipped between law and airframe; this flips D_k
+    and nothing else. The checks, in this order: the pairing has a D and max abs(U - I) at most 10;
+    the input signs fit the D given; D fits.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
@@ -173,9 +208,15 @@ def require_channels(
         problem = f"no D, for leading minor {error.minor} is zero"
     if problem:
         named = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
-        fits = f"inputs that can be paired: {'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
+        fits = (
+            "inputs that can be paired: "
+            f"{'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
+        )
         if better := search(Omega, MAX_COUPLING):
-            pairs = (f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True))
+            pairs = (
+                f"{channels.outputs[i]}-{channels.inputs[j]}"
+                for i, j in zip(*better[:2], strict=True)
+            )
             fits = f"another pairing: {', '.join(pairs)}"
         raise ParameterError(f"controller.inputs: found {named} with {problem}, expected {fits}")
     actual = signs(Omega) * flips
@@ -185,7 +226,10 @@ def require_channels(
         fit = (flips * actual * stated).astype(int).tolist()
         expected = f"{fit} for D = {stated.astype(int).tolist()}: {', '.join(wrong)} the other way"
         require(not wrong, "input_signs", list(input_signs), expected)
-    expected = f"{actual.astype(int).tolist()}, the signs of the minors of C B; or flip {', '.join(wrong)} and keep D"
+    expected = (
+        f"{actual.astype(int).tolist()}, the signs of the minors of C B; or flip "
+        f"{', '.join(wrong)} and keep D"
+    )
     require(not wrong, "controller.D", stated.astype(int).tolist(), expected)
     return np.asarray(actual)
 
@@ -194,27 +238,41 @@ def require_channels(
 
 
 def select_gains(study: Study, setting: LoopSetting) -> Selection:
-    """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering procedure.
+    """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering
+    procedure.
 
-    Both have the same channels (the fastest first, so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii)
-    and D from the minors. The theorem's set is `theorem_gains` with Lambda = 1 1/s, which needs the smallest k_g. The other
-    one is `engineering_gains` with the slew of the nominal airframe; behind servos, `within_requirement` makes the integral
-    slower and the bandwidth lower until the margins meet the setting's requirement, on the samples too. `omega` is the largest
-    abs(Omega_ii) of the samples.
-    Raises ParameterError as `require_channels` does, and for parameters that the controller does not accept.
+    Both have the same channels (the fastest first, so that the last has the smallest K), inputs
+    scaled by 1 / abs(Omega_ii) and D from the minors. The theorem's set is `theorem_gains` with
+    Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the slew
+    of the nominal airframe; behind servos, `within_requirement` makes the integral slower and the
+    bandwidth lower until the margins meet the setting's requirement, on the samples too. `omega` is
+    the largest abs(Omega_ii) of the samples. Raises ParameterError as `require_channels` does, and
+    for parameters that the controller does not accept.
     """
     airframe = study.airframe
     inputs = list(airframe.inputs)
     pairing = ChannelPairing(airframe.outputs, setting.inputs or tuple(inputs))
-    require(sorted(pairing.inputs) == sorted(inputs), "inputs", ", ".join(pairing.inputs), f"{', '.join(inputs)} in any order")
+    require(
+        sorted(pairing.inputs) == sorted(inputs),
+        "inputs",
+        ", ".join(pairing.inputs),
+        f"{', '.join(inputs)} in any order",
+    )
     paired = [inputs.index(name) for name in pairing.inputs]
     Omega = study.Omega[:, paired]
     slew = study.slew[paired]
     require_channels(Omega, pairing)
-    products = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in pairing.outputs])
+    products = np.array(
+        [
+            setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT)
+            for name in pairing.outputs
+        ]
+    )
     loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
     bandwidth = gain_conditions.bandwidths(loop, products)
-    places = np.argsort(-bandwidth, kind="stable").tolist()  # the fastest first: (22) gives the last channel the smallest K
+    places = np.argsort(
+        -bandwidth, kind="stable"
+    ).tolist()  # the fastest first: (22) gives the last channel the smallest K
     channels = ChannelPairing(
         tuple(pairing.outputs[i] for i in places),
         tuple(pairing.inputs[i] for i in places),
@@ -230,24 +288,32 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
         limits = slew[places] / unit, setting.factor, rate_limit / unit
         selected = gain_conditions.engineering_gains(bandwidth[places] / lower, *limits, slower)
-        chosen = controller(*selected, slower * lower)  # both parts of the integral fall with the bandwidth
+        chosen = controller(
+            *selected, slower * lower
+        )  # both parts of the integral fall with the bandwidth
         return Candidate(chosen, linear_loop(chosen, airframe, study.A, study.B))
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
     sufficient = gain_conditions.theorem_gains(bounds, ones)
     first = engineering(ones, ones)
-    # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the f16 of JSBSim.
+    # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the
+    # f16 of JSBSim.
     accepted = GainSet(
         min(sufficient.k_g, LARGEST),
-        *(np.minimum(values, LARGEST) for values in (sufficient.k_d, sufficient.Lambda, sufficient.beta)),
+        *(
+            np.minimum(values, LARGEST)
+            for values in (sufficient.k_d, sufficient.Lambda, sufficient.beta)
+        ),
     )
     literal = controller(accepted, ones, ones).model_copy(
         update={"k_g": float(sufficient.k_g)}
         | {name: tuple(getattr(sufficient, name).tolist()) for name in ("k_d", "Lambda", "beta")}
     )
     behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
-    chosen = (within_requirement(engineering, setting.requirement) if behind_servos else first).controller
+    chosen = (
+        within_requirement(engineering, setting.requirement) if behind_servos else first
+    ).controller
     chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
     return Selection(study, setting, literal, chosen)
 
@@ -262,7 +328,9 @@ def _controller(
     response: FloatArray,
     slower: FloatArray,
 ) -> RiseDiConfig:
-    """The controller with gains; the integral is `slower`, and abs(Omega_ii) is `response` in the scaled inputs."""
+    """The controller with gains; the integral is `slower`, and abs(Omega_ii) is `response` in the
+    scaled inputs.
+    """
     scale = unit * response
     base_inputs = setting.base.inputs
     softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
@@ -290,19 +358,25 @@ def _controller(
         if row:
             values[key] = [row[base_inputs.index(name)] for name in channels.inputs]
     if setting.base.allocation is not None:
-        values["allocation"] = setting.base.allocation.ordered(base_inputs, channels.inputs).model_dump()
+        values["allocation"] = setting.base.allocation.ordered(
+            base_inputs, channels.inputs
+        ).model_dump()
     return RiseDiConfig.validate_mapping(values, "controller")
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """The same controller with the airframe as the nominal model of its feedforward, an extension of the paper.
+    """The same controller with the airframe as the nominal model of its feedforward, an extension
+    of the paper.
 
-    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be the
-    model, such as one with a zero in the right half plane.
+    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe
+    that cannot be the model, such as one with a zero in the right half plane.
     """
     for name in controller.outputs:
         require(
-            name in airframe.states, "feedforward", f"the output {name}, a row of C", "outputs that are states of its model"
+            name in airframe.states,
+            "feedforward",
+            f"the output {name}, a row of C",
+            "outputs that are states of its model",
         )
     _, columns = law_order(airframe, controller)
     gravity = airframe.matrix_gravity()
@@ -313,18 +387,29 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
         gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
         lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
     )
-    return type(controller).validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
+    return type(controller).validate_mapping(
+        controller.model_dump() | {"feedforward": model.model_dump()}, "controller"
+    )
 
 
-def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gain set of a scenario's controller, for an airframe studied along the scenario's manoeuvre.
+def check_gains(
+    scenario: Scenario, study: Study, gamma_2: float = 0.0
+) -> GainAssessment[ControllerConfig]:
+    """Every condition on the gain set of a scenario's controller, for an airframe studied along the
+    scenario's manoeuvre.
 
-    Raises ParameterError for other outputs than those of the airframe, and if D or the pairing contradict the airframe.
+    Raises ParameterError for other outputs than those of the airframe, and if D or the pairing
+    contradict the airframe.
     """
     known = scenario.controller.outputs
     frame = study.airframe
     fits = f"the outputs {', '.join(known)}"
-    require(sorted(known) == sorted(frame.outputs), f"airframe {frame.name}", ", ".join(frame.outputs), fits)
+    require(
+        sorted(known) == sorted(frame.outputs),
+        f"airframe {frame.name}",
+        ", ".join(frame.outputs),
+        fits,
+    )
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
 
@@ -339,20 +424,27 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
         controller.rate,
         dict(zip(controller.inputs, controller.lag, strict=True)),
         controller.delay,
-        {name: min(slew.get(name, math.inf), limits.get(name, math.inf)) for name in controller.inputs},
+        {
+            name: min(slew.get(name, math.inf), limits.get(name, math.inf))
+            for name in controller.inputs
+        },
         gamma_2,
     )
 
 
-def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> GainAssessment[Controller]:
-    """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
+def assess_gains(
+    study: Study, controller: Controller, setting: LoopSetting
+) -> GainAssessment[Controller]:
+    """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate
+    limits are the setting's.
 
-    Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for which the linear loop is
-    stable, and its delay margin on the nominal airframe, which should be at least one period, a missed tick, or what an
-    observer requires beyond the delay, and the margins of the setting's requirement, 35 degrees of phase with an observer.
-    With the implicit sign the linear loop is the one inside the width of the sign,
-    dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period. A law other than RISE-DI
-    has the conditions of the linear loop alone.
+    Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for
+    which the linear loop is stable, and its delay margin on the nominal airframe, which should be
+    at least one period, a missed tick, or what an observer requires beyond the delay, and the
+    margins of the setting's requirement, 35 degrees of phase with an observer. With the implicit
+    sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is
+    then the delay at which chatter begins, and at most half a period. A law other than RISE-DI has
+    the conditions of the linear loop alone.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -372,8 +464,15 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
         observer = controller.observer
         needed = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
-        needed = needed if observer is None else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
-        loop_conditions += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))
+        needed = (
+            needed
+            if observer is None
+            else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+        )
+        loop_conditions += (
+            Condition("delay margin", None, margins.delay, least),
+            *conditions(margins, needed),
+        )
     return GainAssessment(controller, theorem, loop_conditions, bounds, margins, study)
 
 
@@ -382,47 +481,61 @@ def _rise_di_conditions(
 ) -> tuple[tuple[Condition, ...], tuple[Condition, ...], Bounds]:
     """The conditions of Theorem 1, those of `check_loop`, and the bounds of the theorem.
 
-    "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and 3 are
-    the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over these
-    samples; steps 2 and 3 are sufficient for Q > 0.
+    "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of
+    (29), (30), steps 2 and 3 are the largest over the samples for which both hold. "V2_dot" is the
+    smallest eigenvalue of Q in V2_dot = -z'Qz over these samples; steps 2 and 3 are sufficient for
+    Q > 0.
     """
     rows, columns = law_order(study.airframe, controller)
     params = controller.law_params()
-    bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
+    bounds, holds, counts = _bounds(
+        study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2
+    )
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C = study.C[rows]
     Bs = study.B[:, :, columns]
     known = [
-        KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x) for A, B in zip(study.A[counts], Bs[counts], strict=True)
+        KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
+        for A, B in zip(study.A[counts], Bs[counts], strict=True)
     ]
-    decay_rate = min(float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in known)
+    decay_rate = min(
+        float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in known
+    )
     theorem = (
         Condition("D (11)", None, float(np.mean(holds)), 1.0),
         Condition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
         *gain_conditions.check(gains, bounds),
         Condition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
-    if controller.observer is not None:  # the engineering rules are those of a law that has no other feedback beside it
+    if (
+        controller.observer is not None
+    ):  # the engineering rules are those of a law that has no other feedback beside it
         return theorem, (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)
     limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
-    conditions = gain_conditions.check_loop(params, loop_of(controller), responses[0], responses.max(axis=0), *limits)
+    conditions = gain_conditions.check_loop(
+        params, loop_of(controller), responses[0], responses.max(axis=0), *limits
+    )
     return theorem, conditions, bounds
 
 
 def response(study: Study, controller: ControllerConfig) -> FloatArray:
-    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,): 1, or less in a channel too slow for (22)."""
+    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,): 1, or less in a
+    channel too slow for (22).
+    """
     rows, columns = law_order(study.airframe, controller)
     scale = getattr(controller, "input_scale", 1.0)
     return np.asarray(np.abs(study.Omega[rows, columns]) * scale)
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
-    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without one at trim.
+    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without
+    one at trim.
 
-    The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
-    SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
+    The response to every input but that of V grows with V^2, all else is that of the trim. The
+    answer is rounded down to SPEED_STEP, and infinite where the linear loop is stable up to
+    MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
     loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
     steps = round(1.0 / SPEED_STEP)
@@ -430,15 +543,25 @@ def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     no_delay = np.zeros(len(loop.inputs))
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
         response = np.where(surfaces, (step / steps) ** 2, 1.0)
-        if not is_stable(loop.nominal._replace(B=loop.nominal.B * response), loop.law, loop.loop, no_delay):
+        if not is_stable(
+            loop.nominal._replace(B=loop.nominal.B * response), loop.law, loop.loop, no_delay
+        ):
             return (step - 1) / steps if step > steps else 0.0
     return math.inf
 
 
 def _bounds(
-    study: Study, rows: list[int], columns: list[int], scale: FloatArray, D: FloatArray, Lambda: FloatArray, gamma_2: float
+    study: Study,
+    rows: list[int],
+    columns: list[int],
+    scale: FloatArray,
+    D: FloatArray,
+    Lambda: FloatArray,
+    gamma_2: float,
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of them have stable zeros too."""
+    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of
+    them have stable zeros too.
+    """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale
     holds = np.array([_has_signs(Omega, D) for Omega in Omegas])
@@ -448,7 +571,13 @@ def _bounds(
     CAC = C @ study.A[counts] @ C.T
     bounds = Bounds(
         U=gain_conditions.bound_U(Omegas),
-        N_d=np.max([np.abs(gain_conditions.N_d(*pair)).max(axis=0) for pair in zip(Omegas, v_dot, strict=True)], axis=0),
+        N_d=np.max(
+            [
+                np.abs(gain_conditions.N_d(*pair)).max(axis=0)
+                for pair in zip(Omegas, v_dot, strict=True)
+            ],
+            axis=0,
+        ),
         rho=max(gain_conditions.rho(*pair, Lambda) for pair in zip(Omegas, CAC, strict=True)),
         gamma_2=np.full(len(rows), gamma_2),
     )

@@ -21,24 +21,40 @@ from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_selection import Selection, response
 from rise_di_controller.law import Sign
-from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
+from rise_di_controller.params import (
+    AllocationConfig,
+    ControllerConfig,
+    FeedforwardConfig,
+    ObserverConfig,
+    VanesConfig,
+)
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")  # a string that needs no quotes, unless it is a word such as true
+PLAIN = re.compile(
+    r"[A-Za-z/][A-Za-z0-9_./:-]*"
+)  # a string that needs no quotes, unless it is a word such as true
 
 
 def yaml_flow(value: Any, precision: int = 6) -> str:
-    """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
+    """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1
+    requires of a float.
+    """
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {yaml_flow(entry, precision)}" for key, entry in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{key}: {yaml_flow(entry, precision)}" for key, entry in value.items())
+            + "}"
+        )
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
         digits, mark, exponent = f"{value:.{precision}g}".partition("e")
         return (digits if "." in digits else digits + ".0") + mark + exponent
-    if isinstance(value, str) and not (PLAIN.fullmatch(value) and parse_yaml(value, "", "") == value):
+    if isinstance(value, str) and not (
+        PLAIN.fullmatch(value) and parse_yaml(value, "", "") == value
+    ):
         return json.dumps(value, ensure_ascii=False)  # which is YAML too
     return str(value)
 
@@ -46,9 +62,15 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
 def yaml_template(text: str) -> Template:
     """A template of a YAML file.
 
-    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits, "| line" a text without a line end.
+    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits, "| line" a text
+    without a line end.
     """
-    environment = Environment(trim_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined, autoescape=False)  # noqa: S701 - no HTML
+    environment = Environment(
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+        autoescape=False,  # noqa: S701 - no HTML
+    )
     environment.filters["flow"] = yaml_flow
     environment.filters["line"] = printable
     environment.filters["digits"] = lambda value, count: f"{value:.{count}g}"
@@ -82,7 +104,7 @@ CONTROLLER_YAML = yaml_template("""\
     {{ name }}:  # an extension of the paper: {{ comment }}
 {{ listed(keys, 6) }}
 {%- endfor %}
-""")
+""")  # noqa: E501 - a text as it is written
 
 
 def _listed(values: FloatArray) -> str:
@@ -90,7 +112,8 @@ def _listed(values: FloatArray) -> str:
 
 
 def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments.
+    """The engineering gain set as the section `/**/controller` of a scenario file, with units and
+    reasons in comments.
 
     With `theorem` the gain set of Theorem 1 in place of the engineering gains.
     """
@@ -111,10 +134,13 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
         "k_g": f"1/s; K = ({K}) by (22), bandwidths ({bandwidth}) rad/s",
         "k_d": "1/s",
         "Lambda": "1/s, a quarter of the bandwidths, or less for the phase margin",
-        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
+        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew "
+        f"({slew}), within 0.7 x rate limit",
         "D": "signs of the leading minors of C B",
-        "input_scale": f"units of u s / units of y: {_shown_response(responses)} / abs(Omega_ii), Omega = C B",
-        "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * study.uncertainty:g} %",
+        "input_scale": f"units of u s / units of y: {_shown_response(responses)} / "
+        "abs(Omega_ii), Omega = C B",
+        "omega": "abs(Omega_ii) in scaled inputs, the largest within "
+        f"+-{100 * study.uncertainty:g} %",
         "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
         "lag": "s, actuators",
         "delay": "s, beyond sampling",
@@ -122,7 +148,9 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     }
     if theorem:
         comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
-    has_observer = controller.observer is not None and controller.observer.part > 0.0  # else the observer of a learner, later
+    has_observer = (
+        controller.observer is not None and controller.observer.part > 0.0
+    )  # else the observer of a learner, later
     if has_observer:
         unscaled = "units of u s / units of y; for a K of (22) that is above 1"
         comments |= {
@@ -131,18 +159,31 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
             "omega": "abs(Omega_ii) in scaled inputs",
             "input_scale": unscaled,
         }
-    origin = "by Theorem 1" if theorem else "beside an observer" if has_observer else "by the engineering procedure"
+    origin = (
+        "by Theorem 1"
+        if theorem
+        else "beside an observer"
+        if has_observer
+        else "by the engineering procedure"
+    )
     return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
 
 
 def section_yaml(
-    controller: ControllerConfig, airframe: Airframe, margins: LoopMargins | None, origin: str, comments: Mapping[str, str]
+    controller: ControllerConfig,
+    airframe: Airframe,
+    margins: LoopMargins | None,
+    origin: str,
+    comments: Mapping[str, str],
 ) -> str:
-    """A controller as the section `/**/controller` of a scenario file; the description of a parameter without a comment."""
+    """A controller as the section `/**/controller` of a scenario file; the description of a
+    parameter without a comment.
+    """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(
-            exclude_defaults=True, exclude={"allocation", "feedforward", "observer", "schedule", "learn"}
+            exclude_defaults=True,
+            exclude={"allocation", "feedforward", "observer", "schedule", "learn"},
         ).items()
     ]
     return CONTROLLER_YAML.render(
@@ -156,29 +197,51 @@ def section_yaml(
 
 
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """The margins of a loop in a sentence: nominal and worst phase margins; "" without a softened sign, or unstable."""
-    implicit = isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
+    """The margins of a loop in a sentence: nominal and worst phase margins; "" without a softened
+    sign, or unstable.
+    """
+    implicit = (
+        isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
+    )
     if margins is None or implicit or not margins.nominal.stable:
         return ""
     each = zip(margins.inputs, np.degrees(margins.nominal.phase).tolist(), strict=True)
     phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
     largest = float(margins.nominal.sensitivity.max())
     damping = float(margins.nominal.damping)
-    worst = "" if margins.worst is None else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
-    return f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping {damping:.2f}."
+    worst = (
+        ""
+        if margins.worst is None
+        else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
+    )
+    return (
+        f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping "
+        f"{damping:.2f}."
+    )
 
 
 def _shown_response(responses: FloatArray) -> str:
-    """The factors of 1 / abs(Omega_ii): 1, or less in a channel that is too slow for a K of (22)."""
+    """The factors of 1 / abs(Omega_ii): 1, or less in a channel that is too slow for a K of
+    (22).
+    """
     factors = [f"{value:.3g}" for value in responses]
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
 
 
-def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, Any]]]:
-    """The sections allocation, feedforward and observer, if any: a comment, and each parameter in flow style."""
+def _sections(
+    controller: ControllerConfig, airframe: Airframe
+) -> dict[str, tuple[str, dict[str, Any]]]:
+    """The sections allocation, feedforward and observer, if any: a comment, and each parameter in
+    flow style.
+    """
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
-    corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
-    distributes = "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
+    corrects = (
+        "estimates correct the trim; SI, a line an estimate, of F a line an input; "
+        "within, fade, margin in s"
+    )
+    distributes = (
+        "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
+    )
     comments = {"allocation": distributes, "feedforward": along, "observer": corrects}
     sections = {
         name: (comment, _matrix_rows(section, len(controller.inputs)))
@@ -186,20 +249,34 @@ def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tup
         if (section := getattr(controller, name)) is not None
     }
     if isinstance(controller, RiseDiConfig) and (schedule := controller.schedule) is not None:
-        rows: dict[str, str | list[str]] = {"speed": yaml_flow(schedule.speed), "time": yaml_flow(schedule.time)}
+        rows: dict[str, str | list[str]] = {
+            "speed": yaml_flow(schedule.speed),
+            "time": yaml_flow(schedule.time),
+        }
         for name, model in (("slow", schedule.slow), ("fast", schedule.fast)):
             if model is not None:
-                values = (f"{key}: {yaml_flow(value, 10)}" for key, value in model.model_dump(exclude_none=True).items())
+                values = (
+                    f"{key}: {yaml_flow(value, 10)}"
+                    for key, value in model.model_dump(exclude_none=True).items()
+                )
                 rows[name] = "{" + ",\n             ".join(values) + "}"
-        sections["schedule"] = ("input_scale, and the models of the sections above, follow the airspeed; m/s, s", rows)
+        sections["schedule"] = (
+            "input_scale, and the models of the sections above, follow the airspeed; m/s, s",
+            rows,
+        )
     if isinstance(controller, RiseDiConfig) and controller.learn is not None:
         settings = controller.learn.model_dump(exclude_none=True)
         rows = {key: yaml_flow(value) for key, value in settings.items()}
-        sections["learn"] = ("A and B are identified in flight, and feedforward and observer designed again; s", rows)
+        sections["learn"] = (
+            "A and B are identified in flight, and feedforward and observer designed again; s",
+            rows,
+        )
     return sections
 
 
-def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, int]:
+def _columns_of(
+    section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
+) -> dict[str, int]:
     """The columns of each matrix of a section."""
     if isinstance(section, VanesConfig):
         return {"H": len(section.H) // len(section.channels), "L": m + 1}
@@ -211,8 +288,12 @@ def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig |
     return {"Phi": n, "Gamma": m, "L": m, "F": n}
 
 
-def _matrix_rows(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, Any]:
-    """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an observer."""
+def _matrix_rows(
+    section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
+) -> dict[str, Any]:
+    """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an
+    observer.
+    """
     rows: dict[str, Any] = {}
     columns_of = _columns_of(section, m)
     for key, value in section.model_dump(exclude_none=True).items():
@@ -224,5 +305,7 @@ def _matrix_rows(section: AllocationConfig | FeedforwardConfig | ObserverConfig 
             continue
         columns = columns_of.get(key, len(value))
         digits = 6 if isinstance(section, FeedforwardConfig) else 10
-        rows[key] = [yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)]
+        rows[key] = [
+            yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)
+        ]
     return rows

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe along a manoeuvre: the ideal control of the published airframe and of uncertain ones."""
+"""An airframe along a manoeuvre: the ideal control of the published airframe and of uncertain
+ones.
+"""
 
 import math
 from collections.abc import Mapping
@@ -26,7 +28,8 @@ from reference_model.params import ReferenceModelConfig
 from rise_di_controller.feedforward import ZERO_REAL_PART
 
 STEP = 0.01
-"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to 1e-6 of their size."""
+"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
+1e-6 of their size."""
 
 
 class Manoeuvre(NamedTuple):
@@ -45,7 +48,9 @@ class ChannelPairing(NamedTuple):
 
 
 class Study(NamedTuple):
-    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's order, SI."""
+    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's
+    order, SI.
+    """
 
     airframe: Airframe
     A: FloatArray  # (N, n, n)
@@ -67,8 +72,8 @@ class Study(NamedTuple):
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     """The commands and gusts of a scenario for the channels and gust axes that an airframe has.
 
-    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed. Raises ParameterError for an
-    output without command in the scenario.
+    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed.
+    Raises ParameterError for an output without command in the scenario.
     """
     commands = scenario.reference_model
     for name in airframe.outputs:
@@ -80,41 +85,66 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
         )
     values = commands.model_dump(exclude_none=True)
     if set(airframe.outputs) != set(commands.outputs):
-        require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
+        require(
+            "second_order" in values,
+            f"{scenario.name}: reference_model",
+            "linear",
+            "second_order to leave channels out",
+        )
         rows = [commands.outputs.index(name) for name in airframe.outputs]
         values["outputs"] = airframe.outputs
         for key, row in values["second_order"].items():
             values["second_order"][key] = [row[i] for i in rows]
         for key in ("pulses", "sines"):
-            values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
+            values[key] = {
+                name: signal for name, signal in values[key].items() if name in airframe.outputs
+            }
     turn = commands.coordinated_turn
     if turn is not None:
         present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs) and airframe.speed > 0.0
-        values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
+        values["coordinated_turn"] = (
+            turn.model_dump() | {"speed": airframe.speed} if present else None
+        )
     gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
     reference = ReferenceModelConfig.validate_mapping(values, "reference_model")
     return Manoeuvre(reference, gusts, scenario.flight.duration)
 
 
 def study_airframe(
-    airframe: Airframe, manoeuvre: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1
+    airframe: Airframe,
+    manoeuvre: Manoeuvre,
+    uncertainty: float = 0.3,
+    samples: int = 100,
+    seed: int = 1,
 ) -> Study:
-    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
+    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain
+    ones.
 
-    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs (`output_coordinates`):
+    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs
+    (`output_coordinates`):
 
-        eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
+        eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot
+            the zero dynamics, eta(0) = 0
         u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
-    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are differences, central and over
-    1e-5 s. f is that of the nominal airframe. Raises ParameterError if Omega is singular or if the nominal airframe has a zero
-    in the right half plane: then Assumption 3 does not hold.
+    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are
+    differences, central and over 1e-5 s. f is that of the nominal airframe. Raises ParameterError
+    if Omega is singular or if the nominal airframe has a zero in the right half plane: then
+    Assumption 3 does not hold.
     """
     A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
-    zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
+    zeros = [
+        invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf)
+        for pair in zip(A, B, strict=True)
+    ]
     stable = np.array(zeros) <= ZERO_REAL_PART
-    require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
+    require(
+        bool(stable[0]),
+        f"airframe {airframe.name}",
+        f"a zero at {zeros[0]:.3g} 1/s",
+        "none in the right half plane",
+    )
     # The last column is the nominal airframe without gusts: their speed is 0 there.
     A = np.concatenate([A, A[:1]])
     B = np.concatenate([B, B[:1]])
@@ -124,7 +154,12 @@ def study_airframe(
     m = len(airframe.outputs)
     P, N, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
-    require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
+    require(
+        float(np.abs(np.linalg.det(Omega)).min()) > 0.0,
+        "Omega",
+        "a singular C B",
+        "inputs that move all outputs",
+    )
     inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
     project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
     follow = H.T @ B @ inverse
@@ -159,11 +194,26 @@ def study_airframe(
         if k < steps and n > m:
             eta = rk4(eta_dot, t, eta, None, None, STEP)
     undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
-    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)
+    return Study(
+        airframe,
+        A[:-1],
+        B[:-1],
+        C,
+        airframe.matrix_gravity(),
+        u_dot[:, :-1],
+        slew,
+        undisturbed,
+        stable,
+        uncertainty,
+    )
 
 
-def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
+def _references(
+    manoeuvre: Manoeuvre, airframe: Airframe
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order,
+    each (2 T - 1, m).
+    """
     matrices = manoeuvre.reference.model()
     profile = manoeuvre.reference.profile()
     near = 1e-5
@@ -183,9 +233,13 @@ def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, F
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """The aircraft with f for states in columns, shape (n, columns), the last column without gusts."""
+    """The aircraft with f for states in columns, shape (n, columns), the last column without
+    gusts.
+    """
     gust_on = np.append(np.ones(columns - 1), 0.0)
-    profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(-1, 3)
+    profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(
+        -1, 3
+    )
     start, speed, length = np.split(profiles, 3, axis=1)
     directions = [airframe.gust_direction(name) for name in gusts]
     return Aircraft(

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Lyapunov functions along a flight of a known plant: evidence for the theorem, not part of the law.
+"""The paper's Lyapunov functions along a flight of a known plant: evidence for the theorem, not
+part of the law.
 
-All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with Omega = C B in these inputs.
-Time derivatives are central differences over the samples of a flight. At a sample, y_dot jumps with u; the difference is then
-the mean of both sides. They are exact up to terms that vanish with the sampling period.
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
+Omega = C B in these inputs. Time derivatives are central differences over the samples of a flight.
+At a sample, y_dot jumps with u; the difference is then the mean of both sides. They are exact up to
+terms that vanish with the sampling period.
 """
 
 from collections.abc import Callable
@@ -23,7 +25,9 @@ from rise_di_controller.law import LawParams, Sign, engage, step
 
 
 class KnownPlant(NamedTuple):
-    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x, with outputs and scaled inputs v in the law's order."""
+    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x, with outputs and scaled inputs v in the
+    law's order.
+    """
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m), per scaled input
@@ -32,7 +36,9 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`; the first tick is the engagement."""
+    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`; the first tick is the
+    engagement.
+    """
 
     t: FloatArray  # (N,) s
     x: FloatArray  # (N, n)
@@ -56,17 +62,20 @@ class Evidence(NamedTuple):
 
 
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
-    """Plant and samples of a scenario's tape at the ticks of the law, in its channel order and scaled inputs.
+    """Plant and samples of a scenario's tape at the ticks of the law, in its channel order and
+    scaled inputs.
 
-    Raises ValueError if a tick has no sample of `truth` or `y_m` with its stamp. The tape is that of a simulation in
-    one process or of a bag with an exact clock.
+    Raises ValueError if a tick has no sample of `truth` or `y_m` with its stamp. The tape is that
+    of a simulation in one process or of a bag with an exact clock.
     """
     airframe, aircraft = scenario.aircraft.load()
     controller = scenario.controller
     outputs = [airframe.outputs.index(name) for name in controller.outputs]
     inputs = [list(airframe.inputs).index(name) for name in controller.inputs]
     stamps = tape["internals"].stamp_ns
-    ticks = {name: np.flatnonzero(np.isin(tape[name].stamp_ns, stamps)) for name in ("truth", "y_m")}
+    ticks = {
+        name: np.flatnonzero(np.isin(tape[name].stamp_ns, stamps)) for name in ("truth", "y_m")
+    }
     for name, indices in ticks.items():
         if len(indices) != len(stamps):
             raise ValueError(f"{name}: samples at {len(indices)} of {len(stamps)} ticks of the law")
@@ -83,11 +92,14 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
     return plant, FlightSamples(tape.time("internals"), x, f, y_m, internals.group("Pi").values)
 
 
-def fly(plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray) -> FlightSamples:
-    """The plant under the law from x_0, engaged at t = 0: one tick and one Runge-Kutta step per dt, v held between ticks.
+def fly(
+    plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray
+) -> FlightSamples:
+    """The plant under the law from x_0, engaged at t = 0: one tick and one Runge-Kutta step per dt,
+    v held between ticks.
 
-    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B acts on v;
-    `x_0` shape (n,).
+    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale
+    1, since B acts on v; `x_0` shape (n,).
     """
 
     def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
@@ -108,18 +120,21 @@ def fly(plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: F
     return FlightSamples(t, np.array(xs), np.array(f), y_m, np.array(Pis))
 
 
-def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b: float = 0.0) -> Evidence:
+def evidence(
+    plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b: float = 0.0
+) -> Evidence:
     """The signals of the proof along a flight, with Omega = C B = S D U (11) and M = S^-1.
 
         e = C x - y_m (3),  r = e_dot + Lambda e (4)
-        N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)            (17), with the reference term of (18)
+        N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)
+            (17), with the reference term of (18)
         V1 = (e'e + r'M r) / 2                                            (31)
-        L = r' (N_d - D U D Pi_dot)                                       (46), beta Sgn(e) being Pi_dot by (21)
+        L = r' (N_d - D U D Pi_dot)  (46), beta Sgn(e) being Pi_dot by (21)
         P = zeta_b - integral_0^t L  (trapezoid),  V2 = V1 + P            (47), (48)
 
-    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2 claims P >= 0 for the zeta_b of
-    `lemma_2`; with the default 0, P and V2 are known up to a constant. Shapes as in the fields. Raises DecompositionError if
-    Omega has no such decomposition.
+    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2 claims
+    P >= 0 for the zeta_b of `lemma_2`; with the default 0, P and V2 are known up to a constant.
+    Shapes as in the fields. Raises DecompositionError if Omega has no such decomposition.
     """
     S, D, U = decompose(plant.C @ plant.B)
     M = np.linalg.inv(S)
@@ -141,26 +156,33 @@ def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b
 
 
 def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
-    """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape (2m, 2m).
+    """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape
+    (2m, 2m).
 
-    z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Q contains
-    neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0: k_g is large against N~, and k_d against the
-    off-diagonal entries of U. Source: (24), (31), (32), (46)-(48).
+    z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ +
+    Lambda). Q contains neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0:
+    k_g is large against N~, and k_d against the off-diagonal entries of U. Source: (24), (31),
+    (32), (46)-(48).
     """
     S, D, U = decompose(plant.C @ plant.B)
     m = len(D)
     G = np.linalg.inv(S) @ (plant.C @ plant.A @ np.linalg.pinv(plant.C) + np.diag(params.Lambda))
-    rows = [[np.diag(params.Lambda), np.zeros((m, m))], [G * params.Lambda - np.eye(m), (D[:, None] * U * D) * params.K - G]]
+    rows = [
+        [np.diag(params.Lambda), np.zeros((m, m))],
+        [G * params.Lambda - np.eye(m), (D[:, None] * U * D) * params.K - G],
+    ]
     Q = np.block(rows)
     return np.asarray((Q + Q.T) / 2.0)
 
 
 def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
-    """The constant zeta_b of (47) that Lemma 2 gives for a flight: P >= 0 then follows from (29), (30).
+    """The constant zeta_b of (47) that Lemma 2 gives for a flight: P >= 0 then follows from (29),
+    (30).
 
-        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j            lower bound of beta_i in (29), (30)
-        gamma_2,i = Lambda_i (beta_i / zeta_i - 1)                        the largest that (29), (30) allow
-        gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))    the smallest for (40)
+        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j  lower bound of beta_i in (29), (30)
+        gamma_2,i = Lambda_i (beta_i / zeta_i - 1)  the largest that (29), (30) allow
+        gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))
+            the smallest for (40)
         zeta_b = sum_i beta_i abs(e_i(0)) + gamma_1,i zeta_i
 
     Raises ValueError with the channel if beta_i < zeta_i: then no gamma_2 >= 0 meets (29), (30).
@@ -169,7 +191,9 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
     zeta = np.max(np.abs(signals.N_d), axis=0) + np.triu(np.abs(U), 1) @ params.beta
     for i, (beta, bound) in enumerate(zip(params.beta, zeta, strict=True)):
         if beta < bound:
-            raise ValueError(f"beta[{i}]: found {beta:.3g}, expected at least {bound:.3g} for (29), (30)")
+            raise ValueError(
+                f"beta[{i}]: found {beta:.3g}, expected at least {bound:.3g} for (29), (30)"
+            )
     gamma_2 = params.Lambda * (params.beta / zeta - 1.0)
     size = np.abs(signals.e)
     slack = integral(np.abs(signals.e_dot), signals.t) - gamma_2 * integral(size, signals.t) - size
@@ -177,12 +201,16 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
 
 
 def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
-    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample, shape of the signal: (N,) or (N, m)."""
+    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample, shape of the
+    signal: (N,) or (N, m).
+    """
     return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
 
 
 def largest_rise(signal: FloatArray) -> float:
-    """Largest rise of a signal of shape (N,) above an earlier value: max_(j<k) (s_k - s_j), 0 if it never rises."""
+    """Largest rise of a signal of shape (N,) above an earlier value: max_(j<k) (s_k - s_j), 0 if it
+    never rises.
+    """
     return float(np.max(signal - np.minimum.accumulate(signal)))
 
 
@@ -196,15 +224,24 @@ class Example(NamedTuple):
 
 
 def example(dt: float, duration: float) -> Example:
-    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a persistent disturbance and reference.
+    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a persistent
+    disturbance and reference.
 
-    It is well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this
-    flight: `decay_matrix` is positive definite and `lemma_2` finds a constant. Times in s.
+    It is well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02). Its gains meet the
+    conditions of Theorem 1 on this flight: `decay_matrix` is positive definite and `lemma_2` finds
+    a constant. Times in s.
     """
     D = np.array([1.0, -1.0])
     U = np.array([[1.0, 0.4], [0.0, 1.0]])
     S = np.array([[1.2, 0.2], [0.2, 0.9]])
-    A = np.array([[-1.0, 0.3, 0.5, -0.2], [0.2, -0.8, 0.3, 0.4], [0.4, -0.3, -1.5, 0.2], [0.1, 0.5, -0.2, -1.0]])
+    A = np.array(
+        [
+            [-1.0, 0.3, 0.5, -0.2],
+            [0.2, -0.8, 0.3, 0.4],
+            [0.4, -0.3, -1.5, 0.2],
+            [0.1, 0.5, -0.2, -1.0],
+        ]
+    )
     B = np.vstack([S * D @ U, 0.1 * np.eye(2)])
 
     def f(t: float, x: FloatArray) -> FloatArray:
@@ -217,5 +254,14 @@ def example(dt: float, duration: float) -> Example:
     beta = np.array([5.0, 3.0])
     ones = np.ones(2)
     eps = beta / K * 3.0 * 1.5 * dt
-    params = LawParams(K=K, Lambda=ones, beta=beta, D=D, input_scale=ones, omega=2.0 * ones, eps=eps, sign=Sign.IMPLICIT)
+    params = LawParams(
+        K=K,
+        Lambda=ones,
+        beta=beta,
+        D=D,
+        input_scale=ones,
+        omega=2.0 * ones,
+        eps=eps,
+        sign=Sign.IMPLICIT,
+    )
     return Example(KnownPlant(A, B, np.eye(2, 4), f), y_m, params, np.array([0.5, 0.0, 0.0, 0.0]))

@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer selection: the sections feedforward and observer of a controller, and the gains of the law beside it.
+"""Observer selection: the sections feedforward and observer of a controller, and the gains of the
+law beside it.
 
-`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and the lags alone. Both give a
-controller whose nominal linear loop has a delay margin and meets a requirement on phase, gain, sensitivity and damping. Until
-then `effort` is raised, and K and the integral are lowered, in the channel in which that gains most, and the disturbances of
-the extended-state observer are taken as slower.
+`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and
+the lags alone. Both give a controller whose nominal linear loop has a delay margin and meets a
+requirement on phase, gain, sensitivity and damping. Until then `effort` is raised, and K and the
+integral are lowered, in the channel in which that gains most, and the disturbances of the
+extended-state observer are taken as slower.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -49,14 +51,27 @@ from flight_design.gains.requirement import (
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import MIN_GAIN, gain
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law, spectral_radius
+from rise_di_controller.linear_loop import (
+    LinearLaw,
+    LinearPlant,
+    Loop,
+    delay_margin,
+    linear_law,
+    spectral_radius,
+)
 from rise_di_controller.margins import loop_margins, phase_margins
 from rise_di_controller.observer import without_frozen
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
+from rise_di_controller.params import (
+    ControllerConfig,
+    FeedforwardConfig,
+    ObserverConfig,
+    VanesConfig,
+)
 from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
 
 RELAXATION = 1.05
-"""Factor by which `effort` rises, and K and the integral fall, in a step of the search for the margins."""
+"""Factor by which `effort` rises, and K and the integral fall, in a step of the search for the
+margins."""
 
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
@@ -64,7 +79,10 @@ MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
 # the search ends after so many steps in which the margins do not grow by this factor
 PATIENCE = 20
 PROGRESS = 1.01
-MEND = "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without an observer"
+MEND = (
+    "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without "
+    "an observer"
+)
 DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 
 # uncertain aircraft whose least phase margin counts
@@ -72,14 +90,17 @@ WORST_OF = 50
 WORST_UNCERTAINTY = 0.3
 WORST_SEED = 1
 
-GUST_WITH_VANE = 2.0  # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
+# factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
+GUST_WITH_VANE = 2.0
 STILL = 1.4  # of the noise of a vane: a motion of less counts as none
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
 
 
 class ObserverGains(NamedTuple):
-    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer; the law's order."""
+    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer; the
+    law's order.
+    """
 
     K: FloatArray  # (m,) 1/s
     Lambda: FloatArray  # (m,) 1/s
@@ -89,7 +110,8 @@ class ObserverGains(NamedTuple):
 
 
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
-    """Gains from the lags of the loop, as a start: they were found on the `osprey` and scale with the total lag T.
+    """Gains from the lags of the loop, as a start: they were found on the `osprey` and scale with
+    the total lag T.
 
         effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
         wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
@@ -110,43 +132,58 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
 
 
 BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
-"""Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the 737 of JSBSim: the law of
-the rates keeps two thirds of its bandwidth, because a sketch leaves out more than a model does."""
+"""Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the
+737 of JSBSim: the law of the rates keeps two thirds of its bandwidth, because a sketch leaves out
+more than a model does."""
 
 
-def gains_beside_sketch(model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float) -> ObserverGains:
+def gains_beside_sketch(
+    model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
+) -> ObserverGains:
     """Gains from the lags for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
     by_rule = gains_by_rule(model, axes, speed)
     airspeed = [name == "V" for name in outputs]
     effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
     weights = by_rule.weights._replace(effort=effort * by_rule.weights.effort)
-    return by_rule._replace(K=K * by_rule.K, Lambda=K * by_rule.Lambda, beta=K * by_rule.beta, weights=weights)
+    return by_rule._replace(
+        K=K * by_rule.K, Lambda=K * by_rule.Lambda, beta=K * by_rule.beta, weights=weights
+    )
 
 
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
-    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the total lag, (m,), s.
+    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the
+    total lag, (m,), s.
 
-    PI with K and Lambda is RISE-DI inside its softened sign with the same K, SHARE Lambda, and 1 / (softening T) of the rest.
+    PI with K and Lambda is RISE-DI inside its softened sign with the same K, SHARE Lambda, and 1 /
+    (softening T) of the rest.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})
     K = values["K"]
     Lambda = values["Lambda"]
     if "beta" in values:
-        return ObserverGains(K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights)
+        return ObserverGains(
+            K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights
+        )
     return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
 
 
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
-    """The model of an airframe for a controller, in the law's order. `noise` of the measured outputs, (m,), rms per sample."""
-    model = nominal_model(airframe, controller.outputs, controller.inputs, noise, loop_of(controller))
+    """The model of an airframe for a controller, in the law's order. `noise` of the measured
+    outputs, (m,), rms per sample.
+    """
+    model = nominal_model(
+        airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
+    )
     return _limited(model, controller)
 
 
 def _limited(model: NominalModel, controller: ControllerConfig) -> NominalModel:
     """A model with the limits and D of a controller."""
     limits = controller.guard().limits
-    return model._replace(D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper)
+    return model._replace(
+        D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper
+    )
 
 
 class SelectedObserver(NamedTuple):
@@ -156,7 +193,8 @@ class SelectedObserver(NamedTuple):
     delay_margin: float  # s, of the nominal linear loop, the declared delay included
     phase_margin: float  # rad, the least of the nominal linear loop
     fraction: float  # the least of what is found over what is needed
-    relaxation: FloatArray  # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
+    # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
+    relaxation: FloatArray
     place: int = 0  # of its gain set
 
 
@@ -173,26 +211,41 @@ def with_aircraft_observer(
     speeds: tuple[float, float] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
+    """The controller with the feedforward and the observer of an airframe, and the gains of the law
+    beside it.
 
-    Of several gain sets the margins choose: the least product of the factors of `relaxation`, then the first.
-    `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
-    WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
-    a schedule then, and the margins at these speeds too. `progress` gets a sentence before a step of the search. Raises
-    ParameterError for an airframe with another D or without a wind, one that a feedforward refuses, and for margins that no
-    relaxation reaches.
+    Of several gain sets the margins choose: the least product of the factors of `relaxation`, then
+    the first. `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or
+    beta. The phase margin is also that of WORST_OF uncertain aircraft where the airframe is
+    `uncertain`. `speeds` are two ratios to the trim speed: the controller has a schedule then, and
+    the margins at these speeds too. `progress` gets a sentence before a step of the search. Raises
+    ParameterError for an airframe with another D or without a wind, one that a feedforward refuses,
+    and for margins that no relaxation reaches.
     """
-    require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
+    require(
+        bool(airframe.gusts),
+        f"airframe {airframe.name}",
+        "no gusts",
+        "the effect of wind: the observer estimates it",
+    )
     rows, columns = law_order(airframe, controller)
     Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
     _require_signs(Omega, controller, f"airframe {airframe.name}")
-    base = with_feedforward(controller.model_copy(update={"observer": None, "schedule": None}), airframe)
-    names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
+    base = with_feedforward(
+        controller.model_copy(update={"observer": None, "schedule": None}), airframe
+    )
+    names = Names(
+        tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts)
+    )
 
-    def designer(model: NominalModel, gains: ObserverGains) -> Callable[[FloatArray], ObserverDesign]:
+    def designer(
+        model: NominalModel, gains: ObserverGains
+    ) -> Callable[[FloatArray], ObserverDesign]:
         observer = aircraft_observer(model, names, gains.weights)
         sampled = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
-        return lambda slower: observer._replace(F=feedback_gain(sampled, model, slower * gains.weights.effort))
+        return lambda slower: observer._replace(
+            F=feedback_gain(sampled, model, slower * gains.weights.effort)
+        )
 
     def model_at(ratio: float, gains: ObserverGains) -> AtSpeed:
         frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
@@ -205,8 +258,18 @@ def with_aircraft_observer(
 
     model = model_for(airframe, controller, noise)
     if speeds is not None:
-        require(not vanes, "speeds", f"the vanes {', '.join(vanes)}", "none: they read the model of the trim speed")
-        require("V" in controller.outputs, "speeds", f"the outputs {', '.join(controller.outputs)}", "V among them")
+        require(
+            not vanes,
+            "speeds",
+            f"the vanes {', '.join(vanes)}",
+            "none: they read the model of the trim speed",
+        )
+        require(
+            "V" in controller.outputs,
+            "speeds",
+            f"the outputs {', '.join(controller.outputs)}",
+            "V among them",
+        )
     A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF * uncertain, WORST_SEED)
     states = np.array(list(airframe.states))
     vane_rows = [(states == name).astype(np.float64) for name in vanes]
@@ -219,7 +282,9 @@ def with_aircraft_observer(
         others.append(elsewhere)
         section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
         design = designer(model, gains)
-        searches.append(_within_margin(base, model, plant, gains, design, margin, needed, section, elsewhere))
+        searches.append(
+            _within_margin(base, model, plant, gains, design, margin, needed, section, elsewhere)
+        )
     selected = _least_relaxed(searches, progress)
     if speeds is None:
         return selected
@@ -227,11 +292,19 @@ def with_aircraft_observer(
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
         schedule["time"] = controller.schedule.time
-    scheduled = RiseDiConfig.validate_mapping(selected.controller.model_dump() | {"schedule": schedule}, "controller")
+    scheduled = RiseDiConfig.validate_mapping(
+        selected.controller.model_dump() | {"schedule": schedule}, "controller"
+    )
     return selected._replace(controller=scheduled)
 
 
-def _vanes(airframe: Airframe, model: NominalModel, names: Names, weights: Weights, vanes: Mapping[str, float]) -> VanesConfig:
+def _vanes(
+    airframe: Airframe,
+    model: NominalModel,
+    names: Names,
+    weights: Weights,
+    vanes: Mapping[str, float],
+) -> VanesConfig:
     """The section of the vanes: alpha and beta less the wind along their axes over V0."""
     sampled = aircraft_model(model, names, weights.wind_time)
     H = []
@@ -259,7 +332,9 @@ class AtSpeed(NamedTuple):
     def model(self, slower: FloatArray) -> SpeedConfig:
         """The models of feedforward and observer."""
         design = self.design(slower)
-        matrices = {key: tuple(getattr(design, key).ravel().tolist()) for key in ("Phi", "Gamma", "L", "F")}
+        matrices = {
+            key: tuple(getattr(design, key).ravel().tolist()) for key in ("Phi", "Gamma", "L", "F")
+        }
         nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
         return SpeedConfig(ratio=self.ratio, **nominal, **matrices)
 
@@ -284,15 +359,20 @@ def with_extended_state_observer(
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains stay, but for the margin.
+    """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains
+    stay, but for the margin.
 
-    The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u: with all of Omega the elevator
-    would correct V, and turn the aircraft for it. Arguments: Omega (m, m) in the law's order; `noise` of the outputs, (m,),
-    rms per sample; `size` (m,), their units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
+    The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u:
+    with all of Omega the elevator would correct V, and turn the aircraft for it. Arguments: Omega
+    (m, m) in the law's order; `noise` of the outputs, (m,), rms per sample; `size` (m,), their
+    units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
     """
     m = len(controller.outputs)
     _require_signs(Omega, controller, "Omega")
-    values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
+    values = controller.model_dump() | {
+        "observer": None,
+        "feedforward": integrator_model(controller, Omega).model_dump(),
+    }
     base = RiseDiConfig.validate_mapping(values, "controller")
     none = np.zeros((m, m))
     eye = np.eye(m)
@@ -320,7 +400,9 @@ def with_extended_state_observer(
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
     law = controller.law_params()
     weights = extended_state_weights(controller.outputs, model.total_lag)
-    response = np.abs(effects) * law.input_scale  # y_dot by a unit of scaled input: the gains are those for a unit response
+    response = (
+        np.abs(effects) * law.input_scale
+    )  # y_dot by a unit of scaled input: the gains are those for a unit response
     unused = Weights(weights.effort, weights.drift, np.zeros(0), np.zeros(0), np.zeros(1))
     softening = np.broadcast_to(controller.softening, (m,))
     gains = ObserverGains(law.K * response, law.Lambda, law.beta * response, softening, unused)
@@ -328,11 +410,23 @@ def with_extended_state_observer(
     def design(slower: FloatArray) -> ObserverDesign:
         drift = weights.drift / slower
         rate_drift = weights.rate_drift / slower**2
-        changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
+        changed = weights._replace(
+            effort=slower * weights.effort, drift=drift, rate_drift=rate_drift
+        )
         return extended_state_observer(model, names, changed)
 
     return _least_relaxed(
-        [_within_margin(base, model, LinearPlant(none[None], Omega[None], eye), gains, design, margin, needed)]
+        [
+            _within_margin(
+                base,
+                model,
+                LinearPlant(none[None], Omega[None], eye),
+                gains,
+                design,
+                margin,
+                needed,
+            )
+        ]
     )
 
 
@@ -340,14 +434,23 @@ def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) 
     try:
         D = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
-        raise ParameterError(f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}") from None
-    require(list(controller.D) == D, where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
+        raise ParameterError(
+            f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}"
+        ) from None
+    require(
+        list(controller.D) == D,
+        where,
+        f"a C B with D = {D}",
+        f"D = {list(controller.D)}, that of the controller",
+    )
 
 
 def _least_relaxed(
-    searches: Sequence[Generator[SelectedObserver, None, SelectedObserver]], progress: Callable[[str], None] = lambda _: None
+    searches: Sequence[Generator[SelectedObserver, None, SelectedObserver]],
+    progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """The result of the search with the least relaxation: the least relaxed search takes the next step.
+    """The result of the search with the least relaxation: the least relaxed search takes the next
+    step.
 
     Raises the ParameterError of the last search where none has a result.
     """
@@ -366,9 +469,14 @@ def _least_relaxed(
         else:
             reached[place] = float(np.prod(now.relaxation))
             reached_text = (
-                f"least margin {now.fraction:.0%} of the needed" if now.fraction < 1.0 else "margins met, uncertain aircraft"
+                f"least margin {now.fraction:.0%} of the needed"
+                if now.fraction < 1.0
+                else "margins met, uncertain aircraft"
             )
-            progress(f"observer: {reached_text}, K and integral / {', '.join(f'{factor:.2f}' for factor in now.relaxation)}")
+            progress(
+                f"observer: {reached_text}, K and integral / "
+                f"{', '.join(f'{factor:.2f}' for factor in now.relaxation)}"
+            )
     raise refusal
 
 
@@ -383,11 +491,13 @@ def _within_margin(
     vanes: VanesConfig | None = None,
     others: Sequence[AtSpeed] = (),
 ) -> Generator[SelectedObserver, None, SelectedObserver]:
-    """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
+    """The first relaxation with the margins: steps in the channel that gains most, or in all where
+    none gains.
 
-    Yields the state of the search before a step, and at the end. Raises ParameterError for margins out of reach.
-    The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
-    The damping asked for is at most the damping of the zeros of the aircraft: no feedback moves a zero.
+    Yields the state of the search before a step, and at the end. Raises ParameterError for margins
+    out of reach. The plant is the nominal aircraft, then uncertain aircraft, if any: the channel
+    with the least phase margin there is next. The damping asked for is at most the damping of the
+    zeros of the aircraft: no feedback moves a zero.
     """
     loop = Loop(model.lag, 0.0, model.period)  # the delay margin counts the declared delay too
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
@@ -401,10 +511,16 @@ def _within_margin(
     def delay_fraction(delay: float) -> float:
         return delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
 
-    def margin_fraction(controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant) -> tuple[float, float]:
-        """The least phase margin, and the least of what is found over what is needed beside the delay margin."""
+    def margin_fraction(
+        controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant
+    ) -> tuple[float, float]:
+        """The least phase margin, and the least of what is found over what is needed beside the
+        delay margin.
+        """
         each = [loop_margins(plant, law, loop_of(controller), together=False) for law in laws]
-        return min(float(margins.phase.min()) for margins in each), min(least_fraction(margins, needed) for margins in each)
+        return min(float(margins.phase.min()) for margins in each), min(
+            least_fraction(margins, needed) for margins in each
+        )
 
     def assessed(speed_model: AtSpeed, controller: RiseDiConfig, relaxation: FloatArray) -> float:
         flown = speed_model.flown(controller, relaxation)
@@ -412,22 +528,37 @@ def _within_margin(
         return min(delay_fraction(delay), margin_fraction(flown, laws, speed_model.plant)[1])
 
     def best(relaxations: FloatArray) -> SelectedObserver:
-        """The first with the largest fraction; loop margins only where the delay margin leaves a chance."""
-        controllers = [_parameters(base, model, gains, design(relaxation), relaxation, vanes) for relaxation in relaxations]
-        each, candidates = [delayed(controller, nominal) for controller in controllers], dict[int, SelectedObserver]()
+        """The first with the largest fraction; loop margins only where the delay margin leaves a
+        chance.
+        """
+        controllers = [
+            _parameters(base, model, gains, design(relaxation), relaxation, vanes)
+            for relaxation in relaxations
+        ]
+        each, candidates = (
+            [delayed(controller, nominal) for controller in controllers],
+            dict[int, SelectedObserver](),
+        )
         for k in sorted(range(len(each)), key=lambda k: -delay_fraction(each[k][1])):
             (laws, delay), controller, relaxation = each[k], controllers[k], relaxations[k]
-            if candidates and delay_fraction(delay) < max(candidate.fraction for candidate in candidates.values()):
+            if candidates and delay_fraction(delay) < max(
+                candidate.fraction for candidate in candidates.values()
+            ):
                 break
             phase, fraction = margin_fraction(controller, laws, nominal)
             elsewhere = (assessed(speed_model, controller, relaxation) for speed_model in others)
             fraction = min([delay_fraction(delay), fraction, *elsewhere])
             candidates[k] = SelectedObserver(controller, delay, phase, fraction, relaxation)
-        return max((candidates[k] for k in sorted(candidates)), key=lambda candidate: candidate.fraction)
+        return max(
+            (candidates[k] for k in sorted(candidates)), key=lambda candidate: candidate.fraction
+        )
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
-        each = [phase_margins(uncertain, law, loop_of(controller)).min(axis=0) for law in _laws(controller)]
+        each = [
+            phase_margins(uncertain, law, loop_of(controller)).min(axis=0)
+            for law in _laws(controller)
+        ]
         return np.asarray(np.min(each, axis=0))
 
     steps = RELAXATION ** np.eye(m)
@@ -435,16 +566,32 @@ def _within_margin(
     fractions = [selected.fraction]
     while True:
         yield selected
-        ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
+        ended = (
+            len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
+        )
         if selected.relaxation.max() > MAX_RELAXATION or ended:
             lacking = _lacking(selected, nominal, loop, margin, needed)
-            elsewhere = "speeds: found less than the margins at another speed, expected speeds nearer to that of the trim"
-            raise ParameterError(elsewhere if others and not lacking else f"--margin: {lacking or _phases(needed)}; {MEND}")
+            elsewhere = (
+                "speeds: found less than the margins at another speed, expected speeds "
+                "nearer to that of the trim"
+            )
+            raise ParameterError(
+                elsewhere
+                if others and not lacking
+                else f"--margin: {lacking or _phases(needed)}; {MEND}"
+            )
         if selected.fraction < 1.0:
             stepped = best(selected.relaxation * steps)
-            selected = stepped if stepped.fraction > selected.fraction else best(selected.relaxation[None] * RELAXATION)
+            selected = (
+                stepped
+                if stepped.fraction > selected.fraction
+                else best(selected.relaxation[None] * RELAXATION)
+            )
             fractions.append(selected.fraction)
-        elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.uncertain_phase:
+        elif (
+            len(plant.A) > 1
+            and (worst := worst_phases(selected.controller)).min() < needed.uncertain_phase
+        ):
             selected, fractions = best(selected.relaxation * steps[[int(np.argmin(worst))]]), []
         else:
             break
@@ -462,16 +609,25 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
     (law, params), period = controller.tuned_law(), 1.0 / controller.rate
     sets = product((False, True), repeat=len(controller.vanes))
     flown = (without_frozen(params, frozen) for frozen in sets)
-    return [linear_law(TunedLaw(law, law_params), len(controller.outputs), period) for law_params in flown]
+    return [
+        linear_law(TunedLaw(law, law_params), len(controller.outputs), period)
+        for law_params in flown
+    ]
 
 
-def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
-    """The margins missing around the nominal aircraft at the last step of the search, in sentences."""
+def _lacking(
+    selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement
+) -> str:
+    """The margins missing around the nominal aircraft at the last step of the search, in
+    sentences.
+    """
     controller = selected.controller
     lacking = []
     for law in _laws(controller):
         margins = loop_margins(nominal, law, loop_of(controller), together=False)
-        delay = Condition("delay margin (ms)", None, 1e3 * delay_margin(nominal, law, loop), 1e3 * margin)
+        delay = Condition(
+            "delay margin (ms)", None, 1e3 * delay_margin(nominal, law, loop), 1e3 * margin
+        )
         failed = failing((delay, *nominal_conditions(margins, needed)))
         lacking += [condition.sentence(controller.outputs) for condition in failed]
     return "; ".join(dict.fromkeys(lacking))
@@ -479,7 +635,10 @@ def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margi
 
 def _phases(needed: Requirement) -> str:
     phase = np.degrees(needed.uncertain_phase)
-    return f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
+    return (
+        f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, "
+        "expected at least this"
+    )
 
 
 def _parameters(
@@ -490,15 +649,33 @@ def _parameters(
     relaxation: FloatArray,
     vanes: VanesConfig | None,
 ) -> RiseDiConfig:
-    """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale: the same loop."""
+    """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale:
+    the same loop.
+    """
     K = gains.K / relaxation
     permitted = np.maximum(K, MIN_K + MIN_GAIN)
     permitted[-1] = MIN_K
     share = K / permitted
     k_g = MIN_K - 1.0
-    Phi, Gamma, L, F = (tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F))
-    require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
-    observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0, vanes=vanes)
+    Phi, Gamma, L, F = (
+        tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F)
+    )
+    require(
+        spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0,
+        "observer.F",
+        "an unstable feedback",
+        "a stable one",
+    )
+    observer = ObserverConfig(
+        rate=base.rate,
+        states=design.states,
+        Phi=Phi,
+        Gamma=Gamma,
+        L=L,
+        F=F,
+        margin=0.0,
+        vanes=vanes,
+    )
     changes: dict[str, Any] = {
         "k_g": k_g,
         "k_d": tuple((permitted[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The margins that a loop has to have, as conditions, and the search for gains whose measured margins meet the requirement.
+"""The margins that a loop has to have, as conditions, and the search for gains whose measured
+margins meet the requirement.
 
-The margins are those of the sampled loop with actuators, delay and hold (`rise_di_controller.margins`). 45 degrees and 6 dB are
-those of MIL-F-9490D, 3.1.3.6.1, for an aerodynamic surface, a sensitivity of at most 2 that of K. J. Astrom, R. M. Murray,
-"Feedback Systems", 12.3.
+The margins are those of the sampled loop with actuators, delay and hold
+(`rise_di_controller.margins`). 45 degrees and 6 dB are those of MIL-F-9490D, 3.1.3.6.1, for an
+aerodynamic surface, a sensitivity of at most 2 that of K. J. Astrom, R. M. Murray, "Feedback
+Systems", 12.3.
 """
 
 import math
@@ -28,12 +30,17 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 PHASE_MARGIN = 45.0  # deg, the default
 ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this has to be accepted by name
-PHASE_MARGINS = (5.0, 80.0)  # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
+PHASE_MARGINS = (
+    5.0,
+    80.0,
+)  # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
 
 STEP = 1.05  # factor of the integral, and of the bandwidth, in a step of the search
 MAX_SLOWER = 4.0  # largest factors of the search
 MAX_LOWER = 18.0  # by which the integral and the bandwidth fall
-WORST_STEP = math.radians(2.5)  # by which the nominal phase margin rises while the worst aircraft has too little
+WORST_STEP = math.radians(
+    2.5
+)  # by which the nominal phase margin rises while the worst aircraft has too little
 MAX_WORST_STEPS = 8
 
 OF_ZERO = 0.98  # of the damping of a zero that is asked for; 1/s
@@ -51,7 +58,9 @@ class Requirement(NamedTuple):
 
     @property
     def uncertain_phase(self) -> float:
-        """Phase margin of the worst uncertain aircraft, rad: never above what is asked of the nominal aircraft."""
+        """Phase margin of the worst uncertain aircraft, rad: never above what is asked of the
+        nominal aircraft.
+        """
         return min(self.worst_phase, self.phase)
 
 
@@ -67,11 +76,14 @@ NAMES = (
 REQUIREMENT = Requirement()
 
 OBSERVER_REQUIREMENT = Requirement(phase=math.radians(35.0))
-"""Of a loop with an observer, beside the delay margin: the observer is a filter in the loop, and costs phase."""
+"""Of a loop with an observer, beside the delay margin: the observer is a filter in the loop, and
+costs phase."""
 
 
 def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
-    """The requirement with a phase margin in deg. Raises ParameterError for less than 40 deg without `accept`."""
+    """The requirement with a phase margin in deg. Raises ParameterError for less than 40 deg
+    without `accept`.
+    """
     phase_margin = as_number(phase_margin, "phase_margin", *PHASE_MARGINS, "deg")
     expected = f"at least {ACCEPTED_PHASE_MARGIN:g} deg, or accept beside it"
     require(accept or phase_margin >= ACCEPTED_PHASE_MARGIN, "phase_margin", phase_margin, expected)
@@ -79,7 +91,8 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 
 
 def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
-    """A requirement with a damping within reach of a loop around an aircraft: at most about the damping of the zeros.
+    """A requirement with a damping within reach of a loop around an aircraft: at most about the
+    damping of the zeros.
 
     No feedback moves a zero, and a loop with small errors has modes near the zeros.
     """
@@ -90,9 +103,11 @@ def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
 
 
 def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is found over what is needed, at least 1 where the requirement holds, for m inputs, (..., m), (..., m), (...).
+    """What is found over what is needed, at least 1 where the requirement holds, for m inputs,
+    (..., m), (..., m), (...).
 
-    The first is the lesser of phase and sensitivity, the second that of the gain, in dB, the third that of the damping.
+    The first is the lesser of phase and sensitivity, the second that of the gain, in dB, the third
+    that of the damping.
     """
     with np.errstate(divide="ignore"):
         phase = np.minimum(margins.phase / needed.phase, needed.sensitivity / margins.sensitivity)
@@ -100,7 +115,9 @@ def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatA
 
 
 def least_fractions(margins: Margins, needed: Requirement) -> FloatArray:
-    """The least of `fractions` of each loop, (...): at least 1 where the requirement holds, 0 for an unstable loop."""
+    """The least of `fractions` of each loop, (...): at least 1 where the requirement holds, 0 for
+    an unstable loop.
+    """
     phase, gain, damping = fractions(margins, needed)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
     return np.asarray(np.where(margins.stable, least, 0.0))
@@ -131,13 +148,17 @@ def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition
     ]
     by_input: list[Condition] = []
     for name, values, bound, at_least in rows:
-        by_input += [Condition(name, i, float(value), bound, at_least) for i, value in enumerate(values)]
+        by_input += [
+            Condition(name, i, float(value), bound, at_least) for i, value in enumerate(values)
+        ]
     return (*by_input, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
 
 
 def unmet(margins: LoopMargins, needed: Requirement, outputs: Sequence[str]) -> str:
     """What a loop lacks, in sentences; "" for nothing. `outputs` of the law."""
-    return "; ".join(condition.sentence(outputs) for condition in failing(conditions(margins, needed)))
+    return "; ".join(
+        condition.sentence(outputs) for condition in failing(conditions(margins, needed))
+    )
 
 
 class Candidate(NamedTuple, Generic[Controller]):
@@ -152,12 +173,13 @@ def within_requirement(
 ) -> Candidate[Controller]:
     """The first candidate whose measured margins meet a requirement; the nearest where none does.
 
-    `build(slower, lower)` gives a controller with the integral slower by both factors, the bandwidth lower by the second, a
-    factor a channel, (m,).
-    A channel with too little phase margin or too large a sensitivity gets a slower integral by steps of 5 %, down to a fourth;
-    one with too little gain margin, or with the slowest integral, a lower bandwidth. Too little damping counts for the channel
-    with the smallest phase margin. While the worst uncertain aircraft has less than `worst_phase`, the nominal loop has to
-    have 2.5 degrees more.
+    `build(slower, lower)` gives a controller with the integral slower by both factors, the
+    bandwidth lower by the second, a factor a channel, (m,).
+    A channel with too little phase margin or too large a sensitivity gets a slower integral by
+    steps of 5 %, down to a fourth; one with too little gain margin, or with the slowest integral, a
+    lower bandwidth. Too little damping counts for the channel with the smallest phase margin. While
+    the worst uncertain aircraft has less than `worst_phase`, the nominal loop has to have 2.5
+    degrees more.
     """
     target = needed
     best = _nominal_search(build, target)
@@ -190,7 +212,9 @@ def _nominal_search(
     best: _Reached[Controller] | None = None
     while True:
         candidate = build(slower, lower)
-        margins = loop_margins(candidate.loop.nominal, candidate.loop.law, candidate.loop.loop, together=False)
+        margins = loop_margins(
+            candidate.loop.nominal, candidate.loop.law, candidate.loop.loop, together=False
+        )
         fraction = least_fraction(margins, needed)
         if best is None or fraction > best.fraction:
             best = _Reached(candidate, slower, lower, fraction)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a phase margin costs: the error of the linear loop along a manoeuvre, for gains selected by several requirements."""
+"""What a phase margin costs: the error of the linear loop along a manoeuvre, for gains selected by
+several requirements.
+"""
 
 import math
 from collections.abc import Sequence
@@ -23,11 +25,16 @@ class TradeRow(NamedTuple):
     phase_margin: float  # deg, the requirement
     reached: float  # deg, the least of the loop
     delay_margin: float  # s
-    rms: FloatArray  # (m,) of the error of the linear loop along the manoeuvre, SI, by output of the law
+    # (m,) of the error of the linear loop along the manoeuvre, SI, by output of the law
+    rms: FloatArray
 
 
-def trade(selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS) -> tuple[TradeRow, ...]:
-    """The engineering gains of a selection for other phase margins, deg, and their errors on the nominal aircraft."""
+def trade(
+    selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS
+) -> tuple[TradeRow, ...]:
+    """The engineering gains of a selection for other phase margins, deg, and their errors on the
+    nominal aircraft.
+    """
     nominal = _nominal(selection.study)
     rows = []
     for phase_margin in phase_margins:
@@ -45,17 +52,21 @@ def trade(selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MA
 
 def _nominal(study: Study) -> Study:
     """The study of the nominal airframe alone."""
-    return study._replace(A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1])
+    return study._replace(
+        A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1]
+    )
 
 
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
     """Rms of e of the nominal linear loop that has to give the ideal control u*, (m,), SI.
 
-    u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the aircraft, from trim on.
-    `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
+    u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the
+    aircraft, from trim on. `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
     """
     period = loop.loop.period
-    u = np.concatenate([np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)])
+    u = np.concatenate(
+        [np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)]
+    )
     t = period * (np.arange(int((len(u) - 1) * STEP / period)) + 0.5)
     held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
     step = closed_loop(loop.nominal, loop.law, loop.loop, np.zeros(u.shape[1]))

@@ -31,7 +31,10 @@ class _Dumper(yaml.SafeDumper):
 
 
 _Dumper.add_representer(
-    TuningResult, lambda dumper, result: dumper.represent_mapping("tag:yaml.org,2002:map", result._asdict(), flow_style=True)
+    TuningResult,
+    lambda dumper, result: dumper.represent_mapping(
+        "tag:yaml.org,2002:map", result._asdict(), flow_style=True
+    ),
 )
 
 
@@ -41,7 +44,9 @@ def tuned_file(scenario: Scenario) -> Path:
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for an unreadable file."""
+    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for an
+    unreadable file.
+    """
     if not path.exists():
         return {}
     content = read_yaml(path, path.name, "a file of tuned gains")
@@ -51,17 +56,24 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
         for law, sets in laws:
             tuned[law] = {objective: TuningResult(**entry) for objective, entry in sets.items()}
     except (TypeError, KeyError, AttributeError) as error:
-        raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by objective") from None
+        raise ParameterError(
+            f"{path.name}: found {error}, expected laws, each with gains by objective"
+        ) from None
     return tuned
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
-    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for an unreadable file."""
+    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for an
+    unreadable file.
+    """
     return load(tuned_file(scenario)).get(law, {}).get(objective)
 
 
-def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str) -> None:
-    """Write tuned gains, costs and the tuning command; laws as in the catalogue first, objectives as given.
+def save(
+    path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str
+) -> None:
+    """Write tuned gains, costs and the tuning command; laws as in the catalogue first, objectives
+    as given.
 
     Raises ParameterError where the file cannot be written.
     """
@@ -69,14 +81,17 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
     objectives = [name for name in order if name in known]
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
-        "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
+        "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, "
+        "seed, evaluations of a search.\n"
         + comment([f"Made by: {command} --tuning {','.join(objectives)}"])
     )
     names = [*(law for law in LAWS if law in tuned), *(law for law in tuned if law not in LAWS)]
     laws = {}
     for law in names:
         laws[law] = {name: tuned[law][name] for name in objectives if name in tuned[law]}
-    text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
+    text = yaml.dump(
+        {"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160
+    )
     with writing("", path, "a file of tuned gains that can"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, head + text)

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model: the scenario of an experiment, and a scenario for the aircraft.
+"""From a channel map to gains without a model: the scenario of an experiment, and a scenario for
+the aircraft.
 
-The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and delays from the log. The
-airframe of the scenarios is y_dot = Omega u: nothing further is known of the aircraft.
+The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
+delays from the log. The airframe of the scenarios is y_dot = Omega u: nothing further is known of
+the aircraft.
 """
 
 import math
@@ -29,11 +31,23 @@ from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.gain_conditions import bandwidths
 from flight_design.gains.gain_selection import LoopSetting
 from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre
-from flight_design.gains.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
+from flight_design.gains.requirement import (
+    REQUIREMENT,
+    Candidate,
+    Requirement,
+    unmet,
+    within_requirement,
+)
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import MIN_RATIO, Response, Spans
 from flight_design.identification.sign_check import motion_as_channel_grows, output_signs
-from flight_design.identification.step_identification import DAMPING, NATURAL_FREQUENCY, PULSE_P, PULSE_V, reference_parameters
+from flight_design.identification.step_identification import (
+    DAMPING,
+    NATURAL_FREQUENCY,
+    PULSE_P,
+    PULSE_V,
+    reference_parameters,
+)
 from flight_log.engagements import Engagement
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.law import Sign
@@ -56,19 +70,33 @@ class Excitation(NamedTuple):
 
 EXCITATIONS: Mapping[str, Excitation] = {
     "V": Excitation(1.0, 12.0, 0.1, 0.8),  # engines take longer
-    "climb": Excitation(0.8, 10.0, 0.1, 1.5),  # the climb is an integral: slow commands move it more than its noise
+    "climb": Excitation(
+        0.8, 10.0, 0.1, 1.5
+    ),  # the climb is an integral: slow commands move it more than its noise
 }
 """By the motion that the input causes; another input turns the aircraft."""
 PAUSE = 1.5  # s, between the inputs
 
-REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
-HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V or climb needs in the end; the rest is for disturbances
-HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
-FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+REFERENCE_BANDWIDTH = (
+    0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
+)
+# of the limit of thrust, which the command of V or climb needs in the end; the rest is for
+# disturbances
+HELD_FRACTION = 0.5
+HOVER = {
+    "q": PULSE_P,
+    "p": PULSE_P,
+    "r": PULSE_P,
+}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
+FULL_RANGE_TIME = (
+    1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+)
 # of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
 SAMPLES = 20
-MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+MAX_SENSITIVITY = (
+    2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+)
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
 AGE = 1.5  # failsafe of the controller: its age limit per largest one of the bridge
 HOLD = 0.5  # which acts first; s
@@ -89,10 +117,22 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
         require(driver[0] == name, f"map {channel_map.name}: inputs", both, "one of them")
     moved = motions(channel_map)
     for (name, motion), sign in zip(moved.items(), output_signs(channel_map), strict=True):
-        require(motion in driven, f"map {channel_map.name}: inputs", f"none that moves {name}", "one input for each output")
-        require(sign > 0.0, f"map {channel_map.name}: outputs.{name}", "the opposite sign", "the stack's signs")
+        require(
+            motion in driven,
+            f"map {channel_map.name}: inputs",
+            f"none that moves {name}",
+            "one input for each output",
+        )
+        require(
+            sign > 0.0,
+            f"map {channel_map.name}: outputs.{name}",
+            "the opposite sign",
+            "the stack's signs",
+        )
     inputs = tuple(driven[motion][0] for motion in moved.values())
-    return ChannelPairing(tuple(moved), inputs), np.array([float(driven[motion][1]) for motion in moved.values()])
+    return ChannelPairing(tuple(moved), inputs), np.array(
+        [float(driven[motion][1]) for motion in moved.values()]
+    )
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:
@@ -106,13 +146,20 @@ def has_airspeed(channel_map: ChannelMap) -> bool:
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude: nothing further guards."""
+    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude:
+    nothing further guards.
+    """
     needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
     missing = [name for name in needed if name not in channel_map.envelope]
     limits = ", ".join(needed)
     unlimited = f"none of {', '.join(missing)}"
-    require(not missing, f"map {channel_map.name}: envelope", unlimited, f"limits of {limits}: an experiment is open loop")
+    require(
+        not missing,
+        f"map {channel_map.name}: envelope",
+        unlimited,
+        f"limits of {limits}: an experiment is open loop",
+    )
 
 
 class Experiment(NamedTuple):
@@ -124,9 +171,15 @@ class Experiment(NamedTuple):
 
 
 def experiment(
-    channel_map: ChannelMap, speed: float | None, amplitude: float, airframe_file: str, wait: float = WAIT
+    channel_map: ChannelMap,
+    speed: float | None,
+    amplitude: float,
+    airframe_file: str,
+    wait: float = WAIT,
 ) -> Experiment:
-    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s, None in hover."""
+    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in
+    trim, m/s, None in hover.
+    """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     m = len(rows)
@@ -142,15 +195,33 @@ def experiment(
             "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
             "pause": PAUSE,
         }
-        | {key: list(values) for key, values in zip(Excitation._fields, zip(*chosen, strict=True), strict=True)},
+        | {
+            key: list(values)
+            for key, values in zip(Excitation._fields, zip(*chosen, strict=True), strict=True)
+        },
         "controller",
     )
     none = {"rate": RATE, "outputs": list(pairing.outputs), "rise": 0.1}
     none["second_order"] = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
-    heading = f"Experiment on the aircraft behind the map {channel_map.name}: each input is excited by itself, open loop."
+    heading = (
+        f"Experiment on the aircraft behind the map {channel_map.name}: each input is "
+        "excited by itself, open loop."
+    )
     return Experiment(
-        airframe_yaml(channel_map, pairing, signs_alone(sign), speed, "signs of the channel map; sizes not known"),
-        scenario_text(heading, airframe_file, wait + controller.duration, none, controller.model_dump(exclude_defaults=True)),
+        airframe_yaml(
+            channel_map,
+            pairing,
+            signs_alone(sign),
+            speed,
+            "signs of the channel map; sizes not known",
+        ),
+        scenario_text(
+            heading,
+            airframe_file,
+            wait + controller.duration,
+            none,
+            controller.model_dump(exclude_defaults=True),
+        ),
         controller,
     )
 
@@ -159,36 +230,56 @@ WHOLE = 0.95  # of the planned duration: reports of the engagement are late by l
 
 
 def cut_short(flown: Sequence[Engagement], duration: float) -> str:
-    """When and why the bridge released before the end of an experiment, as a sentence; empty for a whole one.
+    """When and why the bridge released before the end of an experiment, as a sentence; empty for a
+    whole one.
 
     Arguments: the engagements of the log; the planned duration, s.
     """
-    lengths = [math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS for part in flown]
+    lengths = [
+        math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS
+        for part in flown
+    ]
     engaged = max(lengths)
     if engaged > WHOLE * duration:
         return ""
-    return f"the bridge released after {engaged:.0f} of {duration:.0f} s: {flown[lengths.index(engaged)].reason}"
+    return (
+        f"the bridge released after {engaged:.0f} of {duration:.0f} s: "
+        f"{flown[lengths.index(engaged)].reason}"
+    )
 
 
-def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None) -> list[ChannelModel | None]:
-    """The models of the channels of a map from the log of an experiment, engaged in `spans`; None for no model.
+def channel_models(
+    channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None
+) -> list[ChannelModel | None]:
+    """The models of the channels of a map from the log of an experiment, engaged in `spans`; None
+    for no model.
 
-    Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the phugoid, which thrust excites
-    too, would be taken for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield, "Helicopter Flight
-    Dynamics", 2007, 4.3 (heave).
+    Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the
+    phugoid, which thrust excites too, would be taken for a response to thrust. A climb in hover is
+    of first order. Source: G. D. Padfield, "Helicopter Flight Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
     y = tape["y"].within(spans)
     u = tape["u"].within(spans)
-    gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
+    gravity = (
+        gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
+    )
     moved = motions(channel_map)
     return [
         None
         if moved[output] == "V" and gravity is None
         else fit_channel(
-            y, u, output, name, direction, gravity if moved[output] == "V" else None, first_order=moved[output] == "climb"
+            y,
+            u,
+            output,
+            name,
+            direction,
+            gravity if moved[output] == "V" else None,
+            first_order=moved[output] == "climb",
         )
-        for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
+        for output, name, direction in zip(
+            pairing.outputs, pairing.inputs, sign.tolist(), strict=True
+        )
     ]
 
 
@@ -197,7 +288,11 @@ def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
     if "climb" not in pose.names:
         return None
     known = np.isfinite(pose["climb"])
-    return Signal(pose.stamp_ns[known], ("V",), -GRAVITY / speed * pose["climb"][known, None]) if known.any() else None
+    return (
+        Signal(pose.stamp_ns[known], ("V",), -GRAVITY / speed * pose["climb"][known, None])
+        if known.any()
+        else None
+    )
 
 
 class Channels(NamedTuple):
@@ -210,18 +305,24 @@ class Channels(NamedTuple):
     damping: FloatArray  # (m,) 1/s; 0 where none is known
     stiffness: FloatArray  # (m,) 1/s^2
     zero: FloatArray  # (m,) 1/s, slow / Omega
-    misfit: FloatArray  # (m,) rms of the output error / rms of y; NaN where the step response alone is known
+    # (m,) rms of the output error / rms of y; NaN where the step response alone is known
+    misfit: FloatArray
 
 
-def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]) -> Channels:
+def join(
+    channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]
+) -> Channels:
     """The models of the channels with a model, the step responses of the rest.
 
-    Raises ParameterError for a channel without a certain result, and for signs in contradiction to the map or among themselves.
+    Raises ParameterError for a channel without a certain result, and for signs in contradiction to
+    the map or among themselves.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)
     m = len(sign)
-    Omega = np.where(np.abs(Omega) > MIN_RATIO * np.nan_to_num(response.Omega_deviation, nan=np.inf), Omega, 0.0)
+    Omega = np.where(
+        np.abs(Omega) > MIN_RATIO * np.nan_to_num(response.Omega_deviation, nan=np.inf), Omega, 0.0
+    )
     deviation = np.diag(response.Omega_deviation).copy()
     lag = response.lag.copy()
     delay = response.delay.copy()
@@ -230,7 +331,9 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
     zero = np.zeros(m)
     misfit = np.full(m, np.nan)
     refused = []
-    for i, (name, output, model) in enumerate(zip(pairing.inputs, pairing.outputs, models, strict=True)):
+    for i, (name, output, model) in enumerate(
+        zip(pairing.inputs, pairing.outputs, models, strict=True)
+    ):
         if model is not None and model.usable:
             Omega[i, i] = model.Omega
             deviation[i] = np.sqrt(model.covariance[2, 2])
@@ -246,7 +349,12 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
         else:
             Omega[i, i] = response.Omega[i, i]
         opposite = f"{output}_dot that {'falls' if Omega[i, i] < 0.0 else 'rises'} with {name}"
-        require(Omega[i, i] * sign[i] > 0.0, f"map {channel_map.name}: inputs.{name}", opposite, "the opposite: change `sign`")
+        require(
+            Omega[i, i] * sign[i] > 0.0,
+            f"map {channel_map.name}: inputs.{name}",
+            opposite,
+            "the opposite: change `sign`",
+        )
     if refused:
         raise ParameterError("; ".join(refused))
     return Channels(Omega, deviation, lag, delay, damping, stiffness, zero, misfit)
@@ -256,32 +364,49 @@ class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for a flight."""
 
     controller: RiseDiConfig
-    delay_margin: float | None  # s, of the identified channels with the lags and the delay; None without a softened sign
+    delay_margin: (
+        float | None
+    )  # s, of the identified channels with the lags and the delay; None without a softened sign
     lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
 
 def flying_scenario(
-    channel_map: ChannelMap, channels: Channels, speed: float | None, airframe_file: str, needed: Requirement = REQUIREMENT
+    channel_map: ChannelMap,
+    channels: Channels,
+    speed: float | None,
+    airframe_file: str,
+    needed: Requirement = REQUIREMENT,
 ) -> Flyable:
     """Gains for identified channels, and the texts of airframe and scenario.
 
-    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. The integrals follow
-    from damping and stiffness. Integrals and bandwidths fall until the loop around the identified channels has the margins
-    `needed`. The feedforward has the airframe as model, in coordinated turns without sideslip.
+    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega
+    u. The integrals follow from damping and stiffness. Integrals and bandwidths fall until the loop
+    around the identified channels has the margins `needed`. The feedforward has the airframe as
+    model, in coordinated turns without sideslip.
     """
     pairing, _ = channel_pairs(channel_map)
     delay = float(np.min(channels.delay))
     # The controller has one delay: what a channel has beyond it counts as its lag.
     later = channels.lag + channels.delay - delay
     moved = motions(channel_map)
-    products = {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved.items()}
+    products = {
+        name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved.items()
+    }
     loop = Loop(later, delay, 1.0 / RATE)
-    bandwidth = dict(zip(pairing.outputs, bandwidths(loop, np.array(list(products.values()))).tolist(), strict=True))
+    bandwidth = dict(
+        zip(
+            pairing.outputs,
+            bandwidths(loop, np.array(list(products.values()))).tolist(),
+            strict=True,
+        )
+    )
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
     range_ = np.array([min(-row.lower, row.upper) for row in rows.values()])
-    authority = dict(zip(pairing.outputs, (np.abs(np.diag(channels.Omega)) * range_).tolist(), strict=True))
+    authority = dict(
+        zip(pairing.outputs, (np.abs(np.diag(channels.Omega)) * range_).tolist(), strict=True)
+    )
     held = {
         name: HELD_FRACTION * authority[name] / max(damping, 1e-3)
         for name, damping in zip(pairing.outputs, channels.damping.tolist(), strict=True)
@@ -292,32 +417,60 @@ def flying_scenario(
     base = RiseDiConfig.validate_mapping(
         _controller(channel_map, pairing)
         | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
-        | {"k_g": 1.0, "k_d": ones[1:], "D": [1] * len(ones), "sign": "auto", "softening": gain_selection.SOFTENING}
+        | {
+            "k_g": 1.0,
+            "k_d": ones[1:],
+            "D": [1] * len(ones),
+            "sign": "auto",
+            "softening": gain_selection.SOFTENING,
+        }
         | {"lag": list(lag.values()), "delay": delay},
         "controller",
     )
-    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
+    manoeuvre = Manoeuvre(
+        ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0
+    )
     range_rate = range_ / FULL_RANGE_TIME
 
     airframe = airframe_yaml(channel_map, pairing, channels, speed, "identified in flight")
     frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
     slew = ideal_control.study_airframe(frame, manoeuvre, samples=1).slew
-    none = channels._replace(damping=0.0 * channels.damping, stiffness=0.0 * channels.stiffness, zero=0.0 * channels.zero)
+    none = channels._replace(
+        damping=0.0 * channels.damping, stiffness=0.0 * channels.stiffness, zero=0.0 * channels.zero
+    )
     integrators = Airframe.validate_mapping(
         yaml.safe_load(airframe_yaml(channel_map, pairing, none, speed, "none")), "airframe"
     )
     # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
     studied = ideal_control.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
-    setting = LoopSetting(base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed)
+    setting = LoopSetting(
+        base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed
+    )
     selection = gain_selection.select_gains(studied, setting)
-    flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, channels, loop), frame, needed)
-    turning = channels if commands["coordinated_turn"] is None else _without_sideslip(channels, pairing)
-    model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
-    flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
-    heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
+    flown, margins = _within_margins(
+        _with_integrals(selection.chosen, pairing, channels, loop), frame, needed
+    )
+    turning = (
+        channels if commands["coordinated_turn"] is None else _without_sideslip(channels, pairing)
+    )
+    model = airframe_yaml(
+        channel_map, pairing, turning, speed, "identified in flight, without sideslip"
+    )
+    flown = gain_selection.with_feedforward(
+        flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe")
+    )
+    heading = (
+        f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
+    )
     heading += f"\n# {gain_yaml.margins_sentence(flown, margins)}"
-    text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
+    text = scenario_text(
+        heading,
+        airframe_file,
+        manoeuvre.duration,
+        commands,
+        flown.model_dump(exclude_defaults=True),
+    )
     lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
     return Flyable(flown, None if margins is None else margins.delay, lacking, airframe, text)
 
@@ -325,7 +478,8 @@ def flying_scenario(
 def _within_margins(
     controller: RiseDiConfig, airframe: Airframe, needed: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """The controller with slower integrals and lower bandwidths where the loop around an airframe lacks margins; the margins.
+    """The controller with slower integrals and lower bandwidths where the loop around an airframe
+    lacks margins; the margins.
 
     A bandwidth falls with the input scale: K of (22) stays.
     """
@@ -351,23 +505,30 @@ def _within_margins(
 
 
 def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
-    """Channels of r with damping alone: the stiffness of a straight flight would skid in a coordinated turn.
+    """Channels of r with damping alone: the stiffness of a straight flight would skid in a
+    coordinated turn.
 
-    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the stiffness would skid.
+    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the
+    stiffness would skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, channels.damping - channels.zero, channels.damping)
     return channels._replace(
-        damping=damping, stiffness=np.where(turns, 0.0, channels.stiffness), zero=np.where(turns, 0.0, channels.zero)
+        damping=damping,
+        stiffness=np.where(turns, 0.0, channels.stiffness),
+        zero=np.where(turns, 0.0, channels.zero),
     )
 
 
-def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, channels: Channels, loop: Loop) -> RiseDiConfig:
+def _with_integrals(
+    controller: RiseDiConfig, pairing: ChannelPairing, channels: Channels, loop: Loop
+) -> RiseDiConfig:
     """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
 
-    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
-    order the integral is the damping, and the loop is K / s. A stiff channel answers u with a rate and needs a larger integral,
-    but a lower integral where the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s
+    + integral) / s. For first order the integral is the damping, and the loop is K / s. A stiff
+    channel answers u with a rate and needs a larger integral, but a lower integral where the
+    sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
     Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
@@ -382,13 +543,19 @@ def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, channels:
 
 
 def _integral(channels: Channels, i: int, crossover: float, total_lag: float) -> float:
-    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the largest safe integral below."""
+    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the
+    largest safe integral below.
+    """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
         """Of K times the model, without the delay."""
         s = 1j * omega
-        return crossover * (s + channels.zero[i]) / (s**2 + channels.damping[i] * s + channels.stiffness[i])
+        return (
+            crossover
+            * (s + channels.zero[i])
+            / (s**2 + channels.damping[i] * s + channels.stiffness[i])
+        )
 
     wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
     delayed = response(omega) * np.exp(-1j * omega * total_lag)
@@ -400,17 +567,34 @@ def _integral(channels: Channels, i: int, crossover: float, total_lag: float) ->
     return float(next(safe, 0.0))
 
 
-def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int) -> dict[str, float]:
-    """The commands in trim by input, from what the bridge sent in the pause after an engagement, when u was 0; SI."""
+def measured_trims(
+    channel_map: ChannelMap, would_send: Signal, engaged_ns: int
+) -> dict[str, float]:
+    """The commands in trim by input, from what the bridge sent in the pause after an engagement,
+    when u was 0; SI.
+    """
     stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
     still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
-    require(bool(still.any()), "bridge/would_send", "no sample after the engagement", "a log of the experiment")
+    require(
+        bool(still.any()),
+        "bridge/would_send",
+        "no sample after the engagement",
+        "a log of the experiment",
+    )
     rows = channel_map.inputs.items()
-    return {name: to_channel(float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line) for name, row in rows}
+    return {
+        name: to_channel(
+            float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line
+        )
+        for name, row in rows
+    }
 
 
-def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[ChannelMap, list[str]]:
-    """A map whose limits around trims stay in the ranges of the fields, and a sentence for each narrower one.
+def within_range(
+    channel_map: ChannelMap, trims: Mapping[str, float]
+) -> tuple[ChannelMap, list[str]]:
+    """A map whose limits around trims stay in the ranges of the fields, and a sentence for each
+    narrower one.
 
     Raises ParameterError for a trim at a stop.
     """
@@ -421,17 +605,32 @@ def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[C
         low, high = sorted(to_channel(raw, row.line) for raw in row.range)
         key = f"map {channel_map.name}: inputs.{name}"
         way_on = "fly slower, or trim the aircraft otherwise"
-        require(low < trim < high, key, f"a trim of {trim:.4g} at its stop", f"room on both sides: {way_on}")
-        for side, limit, room in (("lower", row.lower, low - trim), ("upper", row.upper, high - trim)):
+        require(
+            low < trim < high,
+            key,
+            f"a trim of {trim:.4g} at its stop",
+            f"room on both sides: {way_on}",
+        )
+        for side, limit, room in (
+            ("lower", row.lower, low - trim),
+            ("upper", row.upper, high - trim),
+        ):
             if abs(limit) > abs(room):
-                values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")  # the trim is rounded too
-                narrower = f"{name}: its trim is {trim:.3g}, so that the {side} limit is {room:.3g} in place of {limit:.3g}"
+                values["inputs"][name][side] = float(
+                    f"{room * (1.0 - 1e-4):.5g}"
+                )  # the trim is rounded too
+                narrower = (
+                    f"{name}: its trim is {trim:.3g}, so that the {side} limit is "
+                    f"{room:.3g} in place of {limit:.3g}"
+                )
                 sentences.append(f"{narrower}: {way_on}")
     return ChannelMap.validate_mapping(values, f"map {channel_map.name}"), sentences
 
 
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
-    """The text of a channel map with measured trims. A captured trim is measured again at every engagement."""
+    """The text of a channel map with measured trims. A captured trim is measured again at every
+    engagement.
+    """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
     for name, trim in trims.items():
@@ -463,21 +662,28 @@ def _commands(
     authority: Mapping[str, float],
     held: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held` m/s.
+    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held`
+    m/s.
 
-    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel after another and a climb.
-    Arguments, by output: the motion, the bandwidth, rad/s, the authority, y_dot, and the speed that half of it holds.
+    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel
+    after another and a climb. Arguments, by output: the motion, the bandwidth, rad/s, the
+    authority, y_dot, and the speed that half of it holds.
     """
     motion_of = {motion: name for name, motion in moved.items()}
     cruise = None if speed is None else reference_parameters(speed, authority.get("V", 1.0))
     fastest = {"climb": NATURAL_FREQUENCY["V"], **NATURAL_FREQUENCY}
     if cruise is not None:
-        fastest |= dict(zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True))
+        fastest |= dict(
+            zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True)
+        )
     limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
     pulses = {}
     for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items():
         if motion in motion_of:
-            edges = {"start": [WAIT + t for t in pulse["start"]], "stop": [WAIT + t for t in pulse["stop"]]}
+            edges = {
+                "start": [WAIT + t for t in pulse["start"]],
+                "stop": [WAIT + t for t in pulse["stop"]],
+            }
             pulses[motion_of[motion]] = pulse | edges
     for name, pulse in pulses.items():
         if UNITS[moved[name]] == "m/s":
@@ -487,7 +693,9 @@ def _commands(
         "rate": RATE,
         "outputs": list(moved),
         "second_order": {
-            "natural_frequency": [round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()],
+            "natural_frequency": [
+                round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()
+            ],
             "damping": [DAMPING.get(motion, DAMPING["V"]) for motion in moved.values()],
         },
         "rise": 0.5,
@@ -500,7 +708,11 @@ def _hover_pulses() -> dict[str, dict[str, list[float]]]:
     """By motion: doublets of 1 s of the rates, back to the attitude before, then a climb of 8 s."""
     starts = zip(HOVER, (2.0, 8.0, 14.0), strict=True)
     pulses = {
-        motion: {"start": [t, t + 2.0], "stop": [t + 1.0, t + 3.0], "value": [HOVER[motion], -HOVER[motion]]}
+        motion: {
+            "start": [t, t + 2.0],
+            "stop": [t + 1.0, t + 3.0],
+            "value": [HOVER[motion], -HOVER[motion]],
+        }
         for motion, t in starts
     }
     return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}
@@ -512,14 +724,19 @@ def _rounded(row: FloatArray) -> list[float]:
 
 
 def airframe_yaml(
-    channel_map: ChannelMap, pairing: ChannelPairing, channels: Channels, speed: float | None, source: str
+    channel_map: ChannelMap,
+    pairing: ChannelPairing,
+    channels: Channels,
+    speed: float | None,
+    source: str,
 ) -> str:
     """The text of the airframe of identified channels, in units of the map's channels.
 
     With z_i of the dimension of y_i dt:
 
-    y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i + sum_j Omega_ij u_j
-    z_i_dot = y_i - zero_i z_i                                             only where stiffness or zero are not 0
+    y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i + sum_j
+    Omega_ij u_j
+    z_i_dot = y_i - zero_i z_i  only where stiffness or zero are not 0
     """
     m = len(pairing.outputs)
     second = [i for i in range(m) if channels.stiffness[i] or channels.zero[i]]
@@ -527,7 +744,9 @@ def airframe_yaml(
     for i in range(m):
         A[i, i] = channels.zero[i] - channels.damping[i]
     for place, i in enumerate(second, m):
-        A[i, place] = channels.damping[i] * channels.zero[i] - channels.stiffness[i] - channels.zero[i] ** 2
+        A[i, place] = (
+            channels.damping[i] * channels.zero[i] - channels.stiffness[i] - channels.zero[i] ** 2
+        )
         A[place, i] = 1.0
         A[place, place] = -channels.zero[i]
     B = np.vstack([channels.Omega, np.zeros((len(second), m))])
@@ -539,7 +758,8 @@ def airframe_yaml(
         **({} if speed is None else {"speed": float(speed)}),
         "states": states,
         "inputs": {
-            name: {"unit": "1", "positive": motion_as_channel_grows(channel_map.inputs[name])} for name in pairing.inputs
+            name: {"unit": "1", "positive": motion_as_channel_grows(channel_map.inputs[name])}
+            for name in pairing.inputs
         },
         "outputs": list(pairing.outputs),
         "A": [_rounded(row) for row in A],
@@ -556,7 +776,11 @@ def signs_alone(sign: FloatArray) -> Channels:
 
 
 def scenario_text(
-    heading: str, airframe_file: str, duration: float, commands: Mapping[str, Any], controller: Mapping[str, Any]
+    heading: str,
+    airframe_file: str,
+    duration: float,
+    commands: Mapping[str, Any],
+    controller: Mapping[str, Any],
 ) -> str:
     """The text of a scenario."""
     sections = {

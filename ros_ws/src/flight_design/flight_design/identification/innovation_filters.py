@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of many models side by side."""
+"""The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of
+many models side by side.
+"""
 
 from collections.abc import Sequence
 from itertools import product
@@ -24,11 +26,14 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import nominal_model, sizes
 from rise_di_controller.linear_loop import Loop
 
-TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count: the filter starts from y alone
+# s at the begin of a recording whose innovations do not count: the filter starts from y alone
+TRANSIENT = 0.5
 MOST_GAPS = 10.0  # span of a log, times that of the samples of u: the gaps are filled
 DRIFT = 0.003  # noises of the filter beside the wind
 LOOSE = 1.5e-4  # as `observer_design.Weights` has them: small
-MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
+# 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a
+# perfect sensor
+MIN_NOISE = 1e-2
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
 HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
 # s, decay of the rate of a gust, and of the change of that rate
@@ -39,9 +44,10 @@ LEVELS = np.array(
     [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
     + [(0.03, strength) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
 )
-"""Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of moderate turbulence, and
-noise of the change of its rate, m/s^3 per root s. A gust is smooth: with noise of the wind, or of its rate, the model has
-gusts as fast as the inputs, and the effects of the inputs come out too weak."""
+"""Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of
+moderate turbulence, and noise of the change of its rate, m/s^3 per root s. A gust is smooth: with
+noise of the wind, or of its rate, the model has gusts as fast as the inputs, and the effects of the
+inputs come out too weak."""
 
 
 class Recording(NamedTuple):
@@ -56,7 +62,10 @@ class Recording(NamedTuple):
 def coarser(recorded: Recording, factor: int) -> Recording:
     """The means over `factor` periods; u between the middles of two means of y."""
     count = len(recorded.t) // factor
-    ahead = [np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)]) for k in ((factor - 1) // 2, factor // 2)]
+    ahead = [
+        np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)])
+        for k in ((factor - 1) // 2, factor // 2)
+    ]
     t, y, u = (
         values[: count * factor].reshape(count, factor, *values.shape[1:]).mean(axis=1)
         for values in (recorded.t, recorded.y, (ahead[0] + ahead[1]) / 2.0)
@@ -74,35 +83,63 @@ class Actuation(NamedTuple):
 def recording(tape: Tape, airframe: Airframe) -> Recording:
     """Y and u of a tape at the rate of u, from the first u on.
 
-    y is the sample nearest to the instant, within half a period; u is the last one. Raises ParameterError for a log without
-    the channels of the airframe, or one shorter than ten times the transient, with gaps beyond MOST_GAPS, or with an output
-    that never changes.
+    y is the sample nearest to the instant, within half a period; u is the last one. Raises
+    ParameterError for a log without the channels of the airframe, or one shorter than ten times the
+    transient, with gaps beyond MOST_GAPS, or with an output that never changes.
     """
     y = tape["y"]
     u = tape["u"]
-    for topic, names, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
-        require_channels(f"topic {topic}", names, expected, f"the channels of the airframe {airframe.name}")
-    require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
+    for topic, names, expected in (
+        ("y", y.names, airframe.outputs),
+        ("u", u.names, tuple(airframe.inputs)),
+    ):
+        require_channels(
+            f"topic {topic}", names, expected, f"the channels of the airframe {airframe.name}"
+        )
+    require(
+        len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1,
+        "the log",
+        f"{len(u.stamp_ns)} samples of u",
+        "a flight",
+    )
     period_ns = round(float(np.median(np.diff(u.stamp_ns))))
     require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")
     end_ns = min(u.stamp_ns[-1], y.stamp_ns[-1])
     seconds = (end_ns - u.stamp_ns[0]) / NANOSECONDS
     held = len(u.stamp_ns) * period_ns / NANOSECONDS
-    require(seconds < MOST_GAPS * held, "the log", f"{held:.3g} s of u in {seconds:.3g} s", "a log without long gaps")
+    require(
+        seconds < MOST_GAPS * held,
+        "the log",
+        f"{held:.3g} s of u in {seconds:.3g} s",
+        "a log without long gaps",
+    )
     instants = np.arange(u.stamp_ns[0], end_ns + 1, period_ns)
     seconds = len(instants) * period_ns / NANOSECONDS
-    require(seconds > 10.0 * TRANSIENT, "the log", f"{seconds:.3g} s with y and u", f"more than {10.0 * TRANSIENT:g} s")
+    require(
+        seconds > 10.0 * TRANSIENT,
+        "the log",
+        f"{seconds:.3g} s with y and u",
+        f"more than {10.0 * TRANSIENT:g} s",
+    )
     after = np.clip(np.searchsorted(y.stamp_ns, instants), 1, len(y.stamp_ns) - 1)
     nearest = after - (instants - y.stamp_ns[after - 1] <= y.stamp_ns[after] - instants)
     lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
     measured = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
     measured[lost] = np.nan
-    moves = np.ptp(measured[~lost], axis=0) > 0.0 if not lost.all() else np.zeros(len(airframe.outputs), dtype=bool)
-    still = ", ".join(name for name, moved in zip(airframe.outputs, moves, strict=True) if not moved)
+    moves = (
+        np.ptp(measured[~lost], axis=0) > 0.0
+        if not lost.all()
+        else np.zeros(len(airframe.outputs), dtype=bool)
+    )
+    still = ", ".join(
+        name for name, moved in zip(airframe.outputs, moves, strict=True) if not moved
+    )
     require(not still, "the log", f"no change of {still}", "a flight that excites each output")
     places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
     commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
-    return Recording(period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded)
+    return Recording(
+        period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded
+    )
 
 
 def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) -> NominalModel:
@@ -121,7 +158,8 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 
 
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
-    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m): their variance is 20 times that of y.
+    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m): their
+    variance is 20 times that of y.
 
     At least MIN_NOISE of `size`, the unit of the channel.
     """
@@ -142,14 +180,21 @@ class FilterBank(NamedTuple):
     def by_level(self) -> "FilterBank":
         """The first model at the levels, as a model a level."""
         levels = self.L.shape[1]
-        Phi, Gamma = (np.repeat(matrix[:1], levels, axis=0) for matrix in (self.sampled.Phi, self.sampled.Gamma))
+        Phi, Gamma = (
+            np.repeat(matrix[:1], levels, axis=0)
+            for matrix in (self.sampled.Phi, self.sampled.Gamma)
+        )
         sampled = self.sampled._replace(Phi=Phi, Gamma=Gamma)
         return self._replace(
-            sampled=sampled, L=np.swapaxes(self.L[:1], 0, 1), covariance=np.swapaxes(self.covariance[:1], 0, 1)
+            sampled=sampled,
+            L=np.swapaxes(self.L[:1], 0, 1),
+            covariance=np.swapaxes(self.covariance[:1], 0, 1),
         )
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
-        """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then sin(x) - x, to r and z."""
+        """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then
+        sin(x) - x, to r and z.
+        """
         H = self.sampled.H
         Phi = self.sampled.Phi[:, 0]
         Gamma = self.sampled.Gamma[:, 0]
@@ -173,11 +218,14 @@ class Passage:
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    with no update where y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x is held over a block, so the
-    blocks are linear: with the same level and the same lost samples they have the same matrix.
+    with no update where y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x
+    is held over a block, so the blocks are linear: with the same level and the same lost samples
+    they have the same matrix.
     """
 
-    def __init__(self, bank: FilterBank, y: FloatArray, u: FloatArray, level: NDArray[np.int64]) -> None:
+    def __init__(
+        self, bank: FilterBank, y: FloatArray, u: FloatArray, level: NDArray[np.int64]
+    ) -> None:
         (T, m), (N, _, s, _), blocks = y.shape, bank.L.shape, len(level)
         self._angles = np.flatnonzero(bank.gravity.any(axis=0))
         # the last block is filled with lost samples
@@ -195,20 +243,31 @@ class Passage:
         for kind in kinds.tolist():
             seen = [bool(kind >> j & 1) for j in range(HOLD)]
             lifted.append(bank.lifted(kind >> HOLD, seen))
-        self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
+        self._forced, self._states = (
+            np.empty((N, HOLD * m, blocks)),
+            np.zeros((blocks + 1, N, s + len(self._angles), 1)),
+        )
         state_columns = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
         driven = slice(s, s + 2 * HOLD * m)
-        following = HOLD * m + np.append(np.arange(s), self._angles)  # z, and again its angles, in place of sin(x) - x
+        following = HOLD * m + np.append(
+            np.arange(s), self._angles
+        )  # z, and again its angles, in place of sin(x) - x
         for k, matrix in enumerate(lifted):
             columns = np.flatnonzero(self._kind == k)
             forced = matrix[..., driven] @ inputs[..., columns]
             self._forced[..., columns] = forced[:, :-s]
             self._states[columns + 1, ..., 0] = np.moveaxis(forced[:, following], -1, 0)
-        self._steps = [np.ascontiguousarray(matrix[:, following][..., state_columns]) for matrix in lifted]
+        self._steps = [
+            np.ascontiguousarray(matrix[:, following][..., state_columns]) for matrix in lifted
+        ]
         self._outputs = [np.ascontiguousarray(matrix[:, :-s, state_columns]) for matrix in lifted]
 
-    def run(self, z: FloatArray, first: int = 0, last: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and z after them."""
+    def run(
+        self, z: FloatArray, first: int = 0, last: int | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and
+        z after them.
+        """
         (N, m, s), steps = self._shape, self._steps
         kind = self._kind[first:last]
         states = self._states[first : first + len(kind) + 1]
@@ -216,7 +275,9 @@ class Passage:
         sine = np.empty(states[0, :, s:].shape)
         moved = np.empty(states[0].shape)
         # the loop is half of a search: no array is made in it
-        for k, now, turned, following in zip(kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True):
+        for k, now, turned, following in zip(
+            kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True
+        ):
             np.subtract(np.sin(turned, sine), turned, turned)
             np.add(following, np.matmul(steps[k], now, moved), following)
         r = self._forced[..., first : first + len(kind)].copy()
@@ -230,10 +291,12 @@ class Passage:
 
 
 def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArray]:
-    """Time constants, s, and noises, m/s per root s, of winds of first order like Dryden's moderate turbulence, (G,) each.
+    """Time constants, s, and noises, m/s per root s, of winds of first order like Dryden's moderate
+    turbulence, (G,) each.
 
-    They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the
-    flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. Arguments: `speed` V0, m/s.
+    They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1
+    + (T omega)^2) along the flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across
+    it. Arguments: `speed` V0, m/s.
     """
     spectrum = dryden(**MODERATE, sigma=0.0)
     places = np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
@@ -253,12 +316,14 @@ def filter_bank(
     *,
     near: bool = False,
 ) -> FilterBank:
-    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, v, a, ..].
+    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0,
+    m/s, z = [x, w, v, a, ..].
 
-        w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,  a_dot = -a / RATE_TIME + noise
+        w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
+            a_dot = -a / RATE_TIME + noise
 
-    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`. Models `near` the
-    first one have gains exact to first order.
+    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in
+    `observer_design.Weights`. Models `near` the first one have gains exact to first order.
     """
     wind_time, noise = wind_model(names.winds, speed)
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
@@ -284,16 +349,27 @@ def filter_bank(
         kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(3 * G)]),
         size=np.concatenate([model.size, np.ones(3 * G)]),
     )
-    wind_states = tuple(f"{kind}.{axis}" for kind, axis in product(("wind", "rate", "change"), names.winds))
-    sampled = observer_design.aircraft_model(each, names._replace(states=names.states + wind_states, winds=()), np.zeros(0))
-    gust, change = (
-        strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
+    wind_states = tuple(
+        f"{kind}.{axis}" for kind, axis in product(("wind", "rate", "change"), names.winds)
     )
-    loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, 0.0 * gust, change + LEAST_RATE], axis=-1)
+    sampled = observer_design.aircraft_model(
+        each, names._replace(states=names.states + wind_states, winds=()), np.zeros(0)
+    )
+    gust, change = (
+        strength[:, None] * LEVELS[levels, None, k] * factor
+        for k, factor in enumerate((noise, noise / np.max(noise)))
+    )
+    loose = np.concatenate(
+        [np.full((*gust.shape[:2], n), LOOSE), gust, 0.0 * gust, change + LEAST_RATE], axis=-1
+    )
     weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
-    L = observer_design.aircraft_correction(sampled, each, weights, corrections_near if near else correction_of)
+    L = observer_design.aircraft_correction(
+        sampled, each, weights, corrections_near if near else correction_of
+    )
     # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
-    covariance = np.linalg.solve(np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m)))
+    covariance = np.linalg.solve(
+        np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))
+    )
     return FilterBank(sampled, L, np.asarray(covariance), gravity, model.period)
 
 
@@ -335,7 +411,9 @@ def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
 
 
 def blocks(model: NominalModel) -> list[Block]:
-    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple; one where a part is not square."""
+    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple; one where a part
+    is not square.
+    """
     (n, m), G = model.B.shape, model.wind.shape[1]
     coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))
     coupled[:n] = np.hstack([model.A + model.gravity, model.B, model.C.T, model.wind]) != 0.0

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The likelihood of A and B over one block of a flight: innovations of the observer's filter at the levels of the wind."""
+"""The likelihood of A and B over one block of a flight: innovations of the observer's filter at the
+levels of the wind.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -31,16 +33,24 @@ from flight_design.identification.innovation_filters import (
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
 MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
-MAX_DELAY_ERROR = 4.0  # standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
-MAX_FACTOR = 2.5  # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either way
-COUPLING = 0.34  # of the largest effect on a row, unit of an entry that is 0: a deviation of 10 % before the flight
+MAX_DELAY_ERROR = (
+    4.0  # standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
+)
+# 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either
+# way
+MAX_FACTOR = 2.5
+# of the largest effect on a row, unit of an entry that is 0: a deviation of 10 % before the flight
+COUPLING = 0.34
 # of the steps that are tried side by side
 CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
-UNEXPLAINED = 5.0  # 1, mean square of the innovations of a span in parts of the median one: no level explains it
+# 1, mean square of the innovations of a span in parts of the median one: no level explains it
+UNEXPLAINED = 5.0
 FEW = 0.25  # of the spans: so few gusts do not count, for a gust is no noise
 RECOVERY = 2  # spans after such a one that do not count either: the estimates recover
 SPAN = 1.0  # s, within which the level is constant
-HELD_OUT = 3  # Every third span is held out: each command and gust is then in both parts. A last third has no command.
+# Every third span is held out: each command and gust is then in both parts. A last third has no
+# command.
+HELD_OUT = 3
 
 
 def span_length(recorded: Recording) -> int:
@@ -54,7 +64,9 @@ def held_out(periods: int, span: int) -> NDArray[np.bool_]:
 
 
 class Innovations(NamedTuple):
-    """Innovations of one model over a recording, each span at the level of the wind that predicts it best."""
+    """Innovations of one model over a recording, each span at the level of the wind that predicts
+    it best.
+    """
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
     normalised: FloatArray  # (T, m) of covariance I where the model is right
@@ -70,7 +82,9 @@ class Normalised(NamedTuple):
 
 
 def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
-    """Innovations r, (N, T, m), with covariances (N, levels, m, m); `place` is the level of a sample among these, (T,)."""
+    """Innovations r, (N, T, m), with covariances (N, levels, m, m); `place` is the level of a
+    sample among these, (T,).
+    """
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
     half_log_det = np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
@@ -90,7 +104,9 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what else is identified, 0: known; of B; and the noise of the disturbances."""
+    """Standard deviations of what else is identified, 0: known; of B; and the noise of the
+    disturbances.
+    """
 
     delay: float = 0.0  # s, of u
     angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
@@ -105,8 +121,9 @@ class Fit(NamedTuple):
     """The most probable theta of a block."""
 
     theta: FloatArray
-    """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of the winds; where they are
-    identified, the angles at the begin and the error of the delay, in units of their deviations."""
+    """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
+    the winds; where they are identified, the angles at the begin and the error of the delay, in
+    units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
@@ -114,17 +131,20 @@ class Fit(NamedTuple):
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Units of the errors of A and B, SI, 0 for an entry that is known: nominal values, and 0 in the rows of angles.
+    """Units of the errors of A and B, SI, 0 for an entry that is known: nominal values, and 0 in
+    the rows of angles.
 
-    If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in units of motion; the columns of
-    angles stay 0.
+    If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in
+    units of motion; the columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     turned = model.kinematic == 0.0
     units_A = np.where(free, model.A, 0.0)
     units_B = np.where(free, model.B, 0.0)
     if coupled:
-        largest_A = np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * turned
+        largest_A = (
+            np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * turned
+        )
         largest_B = np.max(np.abs(units_B), axis=1, keepdims=True)
         units_A, units_B = (
             np.where((part == 0.0) & free, COUPLING * largest, part)
@@ -155,17 +175,31 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """The prior of each error of A is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known.
+        """The prior of each error of A is PRIOR; `believe` replaces it. The delay of u is `delay`,
+        s, where it is known.
 
-        The starts of the search take means of `factor` periods, by default of the shortest lag. If `coupled`, the entries that
-        are 0 are identified too.
+        The starts of the search take means of `factor` periods, by default of the shortest lag. If
+        `coupled`, the entries that are 0 are identified too.
         """
-        factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1) if factor is None else factor
+        factor = (
+            max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
+            if factor is None
+            else factor
+        )
         self.coarse = self
         if factor > 1:
-            slow = model._replace(noise=model.noise / np.sqrt(factor), period=factor * recorded.period)
+            slow = model._replace(
+                noise=model.noise / np.sqrt(factor), period=factor * recorded.period
+            )
             self.coarse = type(self)(
-                coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1, coupled=coupled
+                coarser(recorded, factor),
+                slow,
+                block,
+                airframe,
+                delay,
+                unknown,
+                factor=1,
+                coupled=coupled,
             )
         self._period = recorded.period
         self._delay = delay / recorded.period
@@ -177,8 +211,16 @@ class Likelihood:
         self._model = block.restricted(model)
         self._block = block
         self._airframe = airframe
-        named = (tuple(airframe.states), tuple(airframe.inputs), airframe.outputs, tuple(airframe.gusts))
-        parts = [tuple(map(names.__getitem__, places)) for names, places in zip(named, block, strict=True)]
+        named = (
+            tuple(airframe.states),
+            tuple(airframe.inputs),
+            airframe.outputs,
+            tuple(airframe.gusts),
+        )
+        parts = [
+            tuple(map(names.__getitem__, places))
+            for names, places in zip(named, block, strict=True)
+        ]
         self.names = Names(*parts)
         self._y = recorded.y[:, block.outputs]
         self._u = recorded.u[:, block.inputs]
@@ -186,7 +228,9 @@ class Likelihood:
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
         count_A, count_B = map(np.count_nonzero, self._units)
-        self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None  # theta, levels and innovations of `levels`
+        self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = (
+            None  # theta, levels and innovations of `levels`
+        )
         self.count = int(count_A + count_B)  # of the entries that are identified
         self.believe(np.repeat([PRIOR, unknown.effect], [count_A, count_B]))
 
@@ -196,11 +240,15 @@ class Likelihood:
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
             self.coarse.believe(deviation)
-        self.prior = np.concatenate([deviation, wind_prior, np.ones(len(self._angles)), delay_prior])
+        self.prior = np.concatenate(
+            [deviation, wind_prior, np.ones(len(self._angles)), delay_prior]
+        )
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
         self._lower = -self._upper
-        self._upper[self._errors] = deviation / PRIOR * [largest_error(entry) for entry in self.nominal_entries()]
+        self._upper[self._errors] = (
+            deviation / PRIOR * [largest_error(entry) for entry in self.nominal_entries()]
+        )
         if len(delay_prior):  # no u acts before it is sent
             self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
             self._upper[-1] = MAX_DELAY_ERROR
@@ -208,10 +256,14 @@ class Likelihood:
         self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that acts by the model's own A."""
+        """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that
+        acts by the model's own A.
+        """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
-        for matrix, unit, part in zip((self._model.A, self._model.B), self._units, parts, strict=True):
+        for matrix, unit, part in zip(
+            (self._model.A, self._model.B), self._units, parts, strict=True
+        ):
             changed = np.tile(matrix, (len(thetas), 1, 1))
             changed[:, unit != 0.0] += unit[unit != 0.0] * part
             matrices.append(changed)
@@ -221,13 +273,19 @@ class Likelihood:
         wind = gust_directions(self._airframe, A, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
-    def models(self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False) -> Models:
-        """The filters of theta, (N, p), at the winds of some levels; all may be `near` the first theta."""
+    def models(
+        self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False
+    ) -> Models:
+        """The filters of theta, (N, p), at the winds of some levels; all may be `near` the first
+        theta.
+        """
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
         airframe = self._airframe
         drift = self._drift
-        bank = filter_bank(self.with_errors(thetas), self.names, airframe.speed, strength, levels, drift, near=near)
+        bank = filter_bank(
+            self.with_errors(thetas), self.names, airframe.speed, strength, levels, drift, near=near
+        )
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
@@ -239,13 +297,15 @@ class Likelihood:
 
     def delay(self, fit: Fit) -> float:
         """The delay of u, periods."""
-        return self._delay + self._delay_deviation * (float(fit.theta[-1]) if self._delay_deviation else 0.0)
+        return self._delay + self._delay_deviation * (
+            float(fit.theta[-1]) if self._delay_deviation else 0.0
+        )
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """The level of the wind in each span, (spans,), for theta, (p,).
 
-        Every level predicts the span from the estimates at its begin. The calmest one is taken whose log-likelihood is within
-        CHANGE of the best.
+        Every level predicts the span from the estimates at its begin. The calmest one is taken
+        whose log-likelihood is within CHANGE of the best.
         """
         models = self.models(theta[None], np.arange(len(LEVELS)))
         bank = models.bank.by_level()
@@ -259,11 +319,18 @@ class Likelihood:
         r_found = list[FloatArray]()
         for k in range(len(self._spans)):
             r, after = flight.run(z, k * length, (k + 1) * length)
-            gain = -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1) / 2.0
+            gain = (
+                -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1)
+                / 2.0
+            )
             calmest.append(int(np.argmax(gain >= gain.max() - CHANGE)))
             r_found.append(r[calmest[-1]])
             z = np.repeat(after[calmest[-1]][None], len(LEVELS), axis=0)
-        passed = normalised(np.concatenate(r_found)[None, : len(self._y)], models.bank.covariance, self._of_span(calmest))
+        passed = normalised(
+            np.concatenate(r_found)[None, : len(self._y)],
+            models.bank.covariance,
+            self._of_span(calmest),
+        )
         self._passed = theta.tobytes(), np.array(calmest), passed
         return np.array(calmest)
 
@@ -274,12 +341,20 @@ class Likelihood:
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
         """Innovations of N models at given levels."""
         place = self._of_span(np.searchsorted(models.levels, levels))
-        r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][:, : len(self._y)]
+        r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][
+            :, : len(self._y)
+        ]
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Innovations of a theta, (p,), at given levels, without a new passage after `levels` of this theta."""
-        if self._passed is not None and self._passed[0] == theta.tobytes() and np.array_equal(self._passed[1], levels):
+        """Innovations of a theta, (p,), at given levels, without a new passage after `levels` of
+        this theta.
+        """
+        if (
+            self._passed is not None
+            and self._passed[0] == theta.tobytes()
+            and np.array_equal(self._passed[1], levels)
+        ):
             return self._passed[2]
         return self.innovations(self.models(theta[None], levels), levels)
 
@@ -297,29 +372,50 @@ class Likelihood:
     def nominal_entries(self) -> list[Entry]:
         """The entries of A and B that are identified, before the flight."""
         places = []
-        for matrix, unit, columns in zip("AB", self._units, (self.names.states, self.names.inputs), strict=True):
+        for matrix, unit, columns in zip(
+            "AB", self._units, (self.names.states, self.names.inputs), strict=True
+        ):
             values = self._model.A if matrix == "A" else self._model.B
             places += [
-                Entry(matrix, self.names.states[i], columns[j], float(values[i, j]), 0.0, 0.0, float(unit[i, j]))
+                Entry(
+                    matrix,
+                    self.names.states[i],
+                    columns[j],
+                    float(values[i, j]),
+                    0.0,
+                    0.0,
+                    float(unit[i, j]),
+                )
                 for i, j in np.argwhere(unit)
             ]
-        return [place._replace(deviation=deviation) for place, deviation in zip(places, self.prior.tolist(), strict=False)]
+        return [
+            place._replace(deviation=deviation)
+            for place, deviation in zip(places, self.prior.tolist(), strict=False)
+        ]
 
     def named(self) -> list[str]:
-        """Names of the parameters theta, (p,): those of the entries, the winds, the angles, the delay."""
+        """Names of the parameters theta, (p,): those of the entries, the winds, the angles, the
+        delay.
+        """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
         return names + [*self.names.winds, *angles, "delay"][: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the bounds."""
+        """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the
+        bounds.
+        """
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
         theta = np.zeros(len(self.prior))
         for k, entry in enumerate(self.nominal_entries()):
             row = airframe.index(entry.row)
-            value = A[row, airframe.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
+            value = (
+                A[row, airframe.index(entry.column)]
+                if entry.matrix == "A"
+                else B[row, inputs.index(entry.column)]
+            )
             theta[k] = (value - entry.nominal) / entry.unit
         return np.clip(theta, self._lower, self._upper)
 
@@ -328,24 +424,33 @@ class Likelihood:
         errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
         )  # winds follow the entries
-        return [entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors]
+        return [
+            entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors
+        ]
 
     def known(self) -> NDArray[np.bool_]:
         """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
-        return np.isfinite(self._y).all(axis=1) & (np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5)
+        return np.isfinite(self._y).all(axis=1) & (
+            np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5
+        )
 
     def fitted(self) -> NDArray[np.bool_]:
         """Mask of the samples that fit the model, (T,)."""
         return self.known() & ~held_out(len(self._y), self._spans[0].stop)
 
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples to count, (T,): not of spans without a level to explain them, nor of gusts if these are FEW.
+        """Mask of the samples to count, (T,): not of spans without a level to explain them, nor of
+        gusts if these are FEW.
 
         RECOVERY spans afterwards do not count either.
         """
         _, (e,), _ = self.passed(theta, levels)
-        square = np.array([np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans])
-        largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf  # 0 at rest, without noise
+        square = np.array(
+            [np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans]
+        )
+        largest = (
+            UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
+        )  # 0 at rest, without noise
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
             for spans in (square > largest, LEVELS[levels, 1] > 0.0)
@@ -356,7 +461,9 @@ class Likelihood:
     def _costs(
         self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
+        """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log
+        det S / 2.
+        """
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total

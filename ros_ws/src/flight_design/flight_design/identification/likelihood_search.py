@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search of the most probable A and B of one block: Gauss-Newton with damping, from several starts."""
+"""The search of the most probable A and B of one block: Gauss-Newton with damping, from several
+starts.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -11,10 +13,16 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Likelihood
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
-GOOD = 0.7  # of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
+# of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
+GOOD = 0.7
 DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
 FRACTIONS = (0.5, 0.25)
-STARTS = (0, 3, 4, 9)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
+STARTS = (
+    0,
+    3,
+    4,
+    9,
+)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
 # at most, of each start, and of the search from one of the best
 START_STEPS = 8
 STEPS = 12
@@ -40,14 +48,16 @@ class Search(Likelihood):
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
-        """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2 where `used`, (T,).
+        """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2
+        / 2 where `used`, (T,).
 
-        r are the normalised innovations, S their covariance, N the number of samples. The cost has further minima: a wrong
-        wind explains a wrong model. So the search begins several times, with a level of `starts` in a span, on means over
-        the shortest lag. From the REFINED best starts, or 0, the search goes on with the level of a span by theta, or with
-        `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
-        a few gusts. A theta to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a
-        further start.
+        r are the normalised innovations, S their covariance, N the number of samples. The cost has
+        further minima: a wrong wind explains a wrong model. So the search begins several times,
+        with a level of `starts` in a span, on means over the shortest lag. From the REFINED best
+        starts, or 0, the search goes on with the level of a span by theta, or with `levels`, and
+        the strengths of the winds are free. At last spans without a level to explain them do not
+        count, nor a few gusts. A theta to `begin` at, (p,), is the only start. The theta of the
+        model that has `flown` is a further start.
         """
         if begin is None:
             ends = self._ends(starts, flown, used, levels, progress)
@@ -77,23 +87,37 @@ class Search(Likelihood):
         fixed[self._winds] = False
         candidates = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
         for level in starts:
-            theta = self._started(np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress)
+            theta = self._started(
+                np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress
+            )
             candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
             theta = self._started(flown, None, np.ones(len(flown), dtype=bool), progress)
             candidates.append((coarse.cost(theta, fitted), theta))
         best = sorted(candidates, key=lambda start: start[0])[:REFINED]
-        return [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
+        return [
+            self._refined(theta, levels, used, progress)
+            for cost, theta in best
+            if cost < best[0][0] + CLOSE
+        ]
 
     def _started(
-        self, theta: FloatArray, levels: NDArray[np.int64] | None, free: NDArray[np.bool_], progress: Callable[[], None]
+        self,
+        theta: FloatArray,
+        levels: NDArray[np.int64] | None,
+        free: NDArray[np.bool_],
+        progress: Callable[[], None],
     ) -> FloatArray:
-        """Theta, (p,), after steps on means over the shortest lag, with the level of a span by theta or with `levels`."""
+        """Theta, (p,), after steps on means over the shortest lag, with the level of a span by
+        theta or with `levels`.
+        """
         coarse = self.coarse
         fitted = coarse.fitted()
         for _ in range(START_STEPS):
             progress()
-            theta, _, progressed = coarse._step(theta, coarse.levels(theta) if levels is None else levels, fitted, free)
+            theta, _, progressed = coarse._step(
+                theta, coarse.levels(theta) if levels is None else levels, fitted, free
+            )
             if progressed < START_PROGRESS:
                 break
         return theta
@@ -110,22 +134,34 @@ class Search(Likelihood):
             progress()
             flown = self.levels(theta) if levels is None else levels
             counted = used & self._counted(theta, flown) if iteration > 1 else used
-            theta, hessian, progressed = self._step(theta, flown, counted, np.ones(len(theta), dtype=bool))
+            theta, hessian, progressed = self._step(
+                theta, flown, counted, np.ones(len(theta), dtype=bool)
+            )
             if iteration > 1 and progressed < PROGRESS:
                 break
         return self.cost(theta, used), theta, hessian
 
     def _step(
-        self, theta: FloatArray, levels: NDArray[np.int64], used: NDArray[np.bool_], free: NDArray[np.bool_]
+        self,
+        theta: FloatArray,
+        levels: NDArray[np.int64],
+        used: NDArray[np.bool_],
+        free: NDArray[np.bool_],
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Theta after a step of Gauss-Newton with damping, the Hessian before, and by how much the cost is less.
+        """Theta after a step of Gauss-Newton with damping, the Hessian before, and by how much the
+        cost is less.
 
-        The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2, with J the
-        derivatives of the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
+        The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2,
+        with J the derivatives of the innovations over their rms. Source: L. Ljung, "System
+        Identification", 7.4 and 10.2.
         """
         size = len(theta)
         moving = np.flatnonzero(free)
-        models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels, near=True)
+        models = self.models(
+            theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]),
+            levels,
+            near=True,
+        )
         costs, e, half_log_det = self._costs(self.innovations(models, levels), used, theta[None])
         rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
         J = np.zeros((size, e[0].size))
@@ -133,10 +169,16 @@ class Search(Likelihood):
         hessian = J @ J.T + np.diag(self.prior**-2)
         slope = J @ (e[0] / rms).ravel() + theta / self.prior**2
         slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
-        tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free), self._lower, self._upper)
+        tried = np.clip(
+            theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),
+            self._lower,
+            self._upper,
+        )
         expected = -float(slope @ (tried[0] - theta)) / 2.0
         for several in (tried[:1], tried[1:]):
-            lower, _, _ = self._costs(self.innovations(self.models(several, levels), levels), used, several)
+            lower, _, _ = self._costs(
+                self.innovations(self.models(several, levels), levels), used, several
+            )
             progressed = float(costs[0] - lower.min())
             if progressed >= GOOD * expected:
                 break
@@ -149,7 +191,9 @@ class Search(Likelihood):
         """
         known: dict[str, list[float]] = {}
         for part, fit in parts:
-            for name, value in list(zip(part.named(), fit.theta.tolist(), strict=True))[part.count :]:
+            for name, value in list(zip(part.named(), fit.theta.tolist(), strict=True))[
+                part.count :
+            ]:
                 known.setdefault(name, []).append(value)
         return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
 
@@ -162,9 +206,11 @@ def damped_steps(
     upper: FloatArray,
     free: NDArray[np.bool_],
 ) -> FloatArray:
-    """Steps -(hessian + d diag hessian)^-1 slope for every damping d, and fractions of the first, (k, p).
+    """Steps -(hessian + d diag hessian)^-1 slope for every damping d, and fractions of the first,
+    (k, p).
 
-    Only the free parameters move, mask (p,), and none outwards at its bound. Source: D. W. Marquardt, J. SIAM 11(2), 1963.
+    Only the free parameters move, mask (p,), and none outwards at its bound. Source: D. W.
+    Marquardt, J. SIAM 11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:
@@ -172,7 +218,9 @@ def damped_steps(
         damped = part + np.array(DAMPINGS)[:, None, None] * np.diag(np.diag(part))
         steps[:] = 0.0
         steps[:, free] = -np.linalg.solve(damped, slope[free, None])[..., 0]
-        outwards = free & (((theta >= upper) & (steps[0] > 0.0)) | ((theta <= lower) & (steps[0] < 0.0)))
+        outwards = free & (
+            ((theta >= upper) & (steps[0] > 0.0)) | ((theta <= lower) & (steps[0] < 0.0))
+        )
         if not outwards.any():
             return np.vstack([steps, np.outer(FRACTIONS, steps[0])])
         free = free & ~outwards

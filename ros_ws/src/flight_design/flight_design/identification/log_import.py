@@ -31,8 +31,11 @@ from flight_log.tape_reader import RecordedRun
 from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
-AIRBORNE = 0.5  # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
-TYPICAL = 90.0  # percentile of either in a log, which may have more time on the ground than in the air
+# of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
+AIRBORNE = 0.5
+TYPICAL = (
+    90.0  # percentile of either in a log, which may have more time on the ground than in the air
+)
 LEAST = 2.0  # s of flight that are worth a bag
 
 FLOWN_AS = Source("vehicle_status", "vehicle_type")
@@ -44,14 +47,18 @@ Stamps = NDArray[np.int64]
 
 
 class Window(NamedTuple):
-    """What is taken of a log, s since its first sample of the output `instant`; None: the flight that is found."""
+    """What is taken of a log, s since its first sample of the output `instant`; None: the flight
+    that is found.
+    """
 
     start: float | None
     stop: float | None
 
 
 class Imported(NamedTuple):
-    """The tape of a log, the parameters of the autopilot at the first sample, and sentences on what stays unknown."""
+    """The tape of a log, the parameters of the autopilot at the first sample, and sentences on what
+    stays unknown.
+    """
 
     tape: Tape
     parameters: Mapping[str, float]
@@ -64,23 +71,40 @@ def kind_of_map(channel_map: ChannelMap) -> str:
 
 
 def imported(
-    channel_map: ChannelMap, log: VehicleLog, window: Window, show: Callable[[list[Agreement]], None], *, servos: bool
+    channel_map: ChannelMap,
+    log: VehicleLog,
+    window: Window,
+    show: Callable[[list[Agreement]], None],
+    *,
+    servos: bool,
 ) -> Imported:
     """y, u, `commands` and the pose of a log, as the bridge would have published them.
 
-    y and the pose hold the newest values at the stamps of the map's `instant` and of the first channel of the pose. u is the
-    command less its median: the setpoint of the map (PX4) or of the rate controllers (ArduCopter), else the stick in MANUAL, or
-    with `servos` the servo's position, scaled as the stick. Without a window the longest stretch in the air is taken, for
-    sticks in MANUAL. `show` gets the comparison of the log with the map before each check of the comparison. Raises
-    ParameterError for a channel that the log does not have, for another vehicle, without such a stretch, and for parameters of
-    the log that differ from the map or change between the samples.
+    y and the pose hold the newest values at the stamps of the map's `instant` and of the first
+    channel of the pose. u is the command less its median: the setpoint of the map (PX4) or of the
+    rate controllers (ArduCopter), else the stick in MANUAL, or with `servos` the servo's position,
+    scaled as the stick. Without a window the longest stretch in the air is taken, for sticks in
+    MANUAL. `show` gets the comparison of the log with the map before each check of the comparison.
+    Raises ParameterError for a channel that the log does not have, for another vehicle, without
+    such a stretch, and for parameters of the log that differ from the map or change between the
+    samples.
     """
     kind = kind_of_map(channel_map)
     logged_kind = log.vehicle
     log = log._replace(vehicle=logged_kind or kind)
-    require(log.vehicle in {PLANE, COPTER}, "the log", f"one of a {log.vehicle}", "one of a plane or a multicopter")
+    require(
+        log.vehicle in {PLANE, COPTER},
+        "the log",
+        f"one of a {log.vehicle}",
+        "one of a plane or a multicopter",
+    )
     fits = log.vehicle == kind
-    require(fits, "the log", f"one of a {log.vehicle}", f"one of a {kind} as in the map {channel_map.name}, or another --map")
+    require(
+        fits,
+        "the log",
+        f"one of a {log.vehicle}",
+        f"one of a {kind} as in the map {channel_map.name}, or another --map",
+    )
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
@@ -91,12 +115,24 @@ def imported(
     notes = changes(log.parameters, int(stamps[0]), first, last)
     if speed is not None and (lost := ~np.isfinite(speed) & (stamps >= first)).any():
         instant = seconds(int(stamps[lost.argmax()] - stamps[0]))
-        notes.append(f"no airspeed or thrust at {lost.sum()} of {len(stamps)} samples, from {instant:.1f} s of the log on")
+        notes.append(
+            f"no airspeed or thrust at {lost.sum()} of {len(stamps)} samples, from "
+            f"{instant:.1f} s of the log on"
+        )
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
     rows_compared = compared(sticks, log.parameters, parameters)
-    show([Agreement("vehicle", logged_kind, kind), *(Agreement(*row, "") for row in log.taken), *rows_compared])
+    show(
+        [
+            Agreement("vehicle", logged_kind, kind),
+            *(Agreement(*row, "") for row in log.taken),
+            *rows_compared,
+        ]
+    )
     try:
-        readers = {name: _commands(channel_map, log, name, servos, parameters) for name in channel_map.inputs}
+        readers = {
+            name: _commands(channel_map, log, name, servos, parameters)
+            for name in channel_map.inputs
+        }
         notes.append(require_agreement(channel_map.name, rows_compared))
     except ParameterError as error:
         raise ParameterError("; ".join([str(error), *notes])) from None
@@ -105,15 +141,23 @@ def imported(
 
 
 def _speed(
-    channel_map: ChannelMap, log: VehicleLog, sources: Mapping[str, Source], stamps: Stamps, servos: bool
+    channel_map: ChannelMap,
+    log: VehicleLog,
+    sources: Mapping[str, Source],
+    stamps: Stamps,
+    servos: bool,
 ) -> FloatArray | None:
-    """The airspeed, or a multicopter's thrust, as evidence of flight; None where the map has neither."""
+    """The airspeed, or a multicopter's thrust, as evidence of flight; None where the map has
+    neither.
+    """
     for name, row in channel_map.outputs.items():
         if row.motion[0] == "V":
             return log.at(sources[name], stamps)
     for name, lift in channel_map.inputs.items():
         if lift.motion[0] == "climb":
-            return lift.motion[1] * _commands(channel_map, log, name, servos, {}).commands_at(stamps)
+            return lift.motion[1] * _commands(channel_map, log, name, servos, {}).commands_at(
+                stamps
+            )
     return None
 
 
@@ -129,14 +173,18 @@ def _tape(
     rows = channel_map.outputs
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
     y_stamps = stamps[(stamps >= first) & (stamps <= last)]
-    y = np.column_stack([row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()])
+    y = np.column_stack(
+        [row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()]
+    )
     y_stamps, y = _complete(y_stamps, y)
     require(len(y_stamps) > 1, "the log", "no instant with all outputs of the map", "a flight")
     for column, row in enumerate(rows.values()):
         y[:, column] += -np.median(y[:, column]) if row.captured else row.offset
     u_stamps = np.unique(np.concatenate([reader.stamp_ns for reader in readers.values()]))
     u_stamps = u_stamps[(u_stamps >= first) & (u_stamps <= last)]
-    u_stamps, commands = _complete(u_stamps, np.column_stack([reader.commands_at(u_stamps) for reader in readers.values()]))
+    u_stamps, commands = _complete(
+        u_stamps, np.column_stack([reader.commands_at(u_stamps) for reader in readers.values()])
+    )
     require(len(u_stamps) > 1, "the log", "no instant with all inputs of the map", "a flight")
     signals = {
         "y": Signal(y_stamps, tuple(rows), y),
@@ -158,7 +206,9 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> Source:
     if source is None:
         mask = log.parameters.get("LOG_BITMASK")
         logged = "" if mask is None else f": LOG_BITMASK is {mask[0].value:.0f}"
-        raise ParameterError(f"{key}: found no {quantity} in the log, expected {_messages(log, quantity)}{logged}")
+        raise ParameterError(
+            f"{key}: found no {quantity} in the log, expected {_messages(log, quantity)}{logged}"
+        )
     return source
 
 
@@ -167,11 +217,16 @@ def _messages(log: VehicleLog, quantity: str) -> str:
     from flight_log.vehicle_log import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
-    return " or ".join(dict.fromkeys(source.message for source in sources.get(quantity, ()))) or "one that the format has"
+    return (
+        " or ".join(dict.fromkeys(source.message for source in sources.get(quantity, ())))
+        or "one that the format has"
+    )
 
 
 class _Reader(NamedTuple):
-    """The command of an input: SI = line(raw). The raw value of the map's field comes from the pulse of a stick or a servo."""
+    """The command of an input: SI = line(raw). The raw value of the map's field comes from the
+    pulse of a stick or a servo.
+    """
 
     log: VehicleLog
     source: Source
@@ -187,51 +242,90 @@ class _Reader(NamedTuple):
         values = self.log.at(self.source, stamp_ns)
         if self.stick is not None and self.servo is not None:
             values = self.stick.raw(self.servo.deflection(values, self.stick))
-        before = self.stick.trim_line if self.stick is not None and self.servo is None else SAME_LINE
-        return np.array([to_channel(to_channel(value, before), self.line) for value in values.tolist()])
+        before = (
+            self.stick.trim_line if self.stick is not None and self.servo is None else SAME_LINE
+        )
+        return np.array(
+            [to_channel(to_channel(value, before), self.line) for value in values.tolist()]
+        )
 
 
-def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool, parameters: Mapping[str, float]) -> _Reader:
+def _commands(
+    channel_map: ChannelMap,
+    log: VehicleLog,
+    name: str,
+    servos: bool,
+    parameters: Mapping[str, float],
+) -> _Reader:
     row = channel_map.inputs[name]
     if log.format is None:
         topic = channel_map.messages[row.message].topic.rpartition("/")[2]
         source = Source(topic, row.field)
         before_1_14 = ULOG_TORQUES.get((topic, row.field), source)
         source = source if log.has(source) or not log.has(before_1_14) else before_1_14
-        require(log.has(source), f"inputs.{name}", f"no {topic}.{row.field} in the log", "it: the map and the log fit together")
-        require(not servos, "--servos", "a ULog", "none: its setpoints of torque and thrust are the commands")
+        require(
+            log.has(source),
+            f"inputs.{name}",
+            f"no {topic}.{row.field} in the log",
+            "it: the map and the log fit together",
+        )
+        require(
+            not servos,
+            "--servos",
+            "a ULog",
+            "none: its setpoints of torque and thrust are the commands",
+        )
         return _Reader(log, source, row.line)
     if log.vehicle == COPTER:
         return _torque(log, name, row, servos)
     stick = stick_of(channel_map, name)
     servo = servo_of(stick, name, parameters) if servos else None
-    place, number = (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
+    place, number = (
+        (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
+    )
     source = Source(place.message, place.field.format(number))
     expected = (
         "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
         if servo is None
         else "its pulses"
     )
-    require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", expected)
+    require(
+        log.has(source),
+        f"inputs.{name}",
+        f"no {source.message}.{source.field} in the log",
+        expected,
+    )
     return _Reader(log, source, row.line, stick, servo)
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """The output of a multicopter's rate controller: no mode has sticks that are commands. It is normalised as PX4's."""
+    """The output of a multicopter's rate controller: no mode has sticks that are commands. It is
+    normalised as PX4's.
+    """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
     source = next(filter(log.has, sources), None)
     if source is None:
         expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
-        raise ParameterError(f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected {expected}")
-    require(not servos, "--servos", "a multicopter", "none: the outputs of its rate controllers are the commands")
+        raise ParameterError(
+            f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected "
+            f"{expected}"
+        )
+    require(
+        not servos,
+        "--servos",
+        "a multicopter",
+        "none: the outputs of its rate controllers are the commands",
+    )
     return _Reader(log, source, Line(1 if sign > 0 else -1, row.scale, 0.0))
 
 
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
 ) -> tuple[int, int]:
-    """First and last instant that are taken: the window, or the longest stretch in the air, for sticks in MANUAL."""
+    """First and last instant that are taken: the window, or the longest stretch in the air, for
+    sticks in MANUAL.
+    """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)
     if window.start is not None:
@@ -240,26 +334,53 @@ def _flight(
         keep &= stamps <= start_ns + nanoseconds(window.stop)
     where = "in the window" if window != (None, None) else "in the log"
     require(
-        int(keep.sum()) > 1, "--from, --until", "no sample", f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log"
+        int(keep.sum()) > 1,
+        "--from, --until",
+        "no sample",
+        f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log",
     )
     if speed is not None and window.start is None and window.stop is None:
-        require(bool(np.isfinite(speed).any()), "the log", "no airspeed or thrust at the samples of y", "a flight")
+        require(
+            bool(np.isfinite(speed).any()),
+            "the log",
+            "no airspeed or thrust at the samples of y",
+            "a flight",
+        )
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if log.has(FLOWN_AS):  # a VTOL flies as both
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
-        mode = next((source for source in log.format.mode if log.has(source)), None) if log.format is not None else None
+        mode = (
+            next((source for source in log.format.mode if log.has(source)), None)
+            if log.format is not None
+            else None
+        )
         if mode is None:
-            raise ParameterError(f"the log: found no message with the mode, expected MANUAL in {expected}")
+            raise ParameterError(
+                f"the log: found no message with the mode, expected MANUAL in {expected}"
+            )
         keep &= log.at(mode, stamps) == log.manual
         require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
-    require(bool(keep.any()), "the log", f"no time in the air {where}", "a flight, or --from and --until")
+    require(
+        bool(keep.any()),
+        "the log",
+        f"no time in the air {where}",
+        "a flight, or --from and --until",
+    )
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
-    runs = [(int(stamps[first]), int(stamps[end - 1])) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+    runs = [
+        (int(stamps[first]), int(stamps[end - 1]))
+        for first, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
     first, last = max(runs, key=lambda run: run[1] - run[0])
     length = 1e-9 * (last - first)
-    require(length >= LEAST, "the log", f"{length:.1f} s of flight {where}", f"{LEAST:g} s or more in one stretch")
+    require(
+        length >= LEAST,
+        "the log",
+        f"{length:.1f} s of flight {where}",
+        f"{LEAST:g} s or more in one stretch",
+    )
     return first, last
 
 
@@ -271,7 +392,9 @@ def _complete(stamp_ns: Stamps, values: FloatArray) -> tuple[Stamps, FloatArray]
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:
     """The channels of the map's pose that the log has, NaN where one is not known yet."""
-    sources = {name: source for name in channel_map.pose if (source := log.source(name)) is not None}
+    sources = {
+        name: source for name in channel_map.pose if (source := log.source(name)) is not None
+    }
     if not sources:
         return None
     stamps = log.tables[next(iter(sources.values())).message].stamp_ns
@@ -281,19 +404,31 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Raise ParameterError for an imported log whose u is not by the map, but by rows of another map or an earlier version."""
+    """Raise ParameterError for an imported log whose u is not by the map, but by rows of another
+    map or an earlier version.
+    """
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return
     key = str(recorded.path or "the log")
     again = f"that of the map {channel_map.name}: import the log again, with --map"
-    require(COMPARED in source, key, "a log of an earlier version, which did not compare its parameters with the map", again)
+    require(
+        COMPARED in source,
+        key,
+        "a log of an earlier version, which did not compare its parameters with the map",
+        again,
+    )
     maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
     require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")
     content = parse_yaml(maps[0], key, "a channel map")
     before = _rows_of_import(ChannelMap.validate_mapping(content, key))
     for name, value in _rows_of_import(channel_map).items():
-        require(before.get(name) == value, key, f"{name} {before.get(name)} of the map of the import", f"{value}, {again}")
+        require(
+            before.get(name) == value,
+            key,
+            f"{name} {before.get(name)} of the map of the import",
+            f"{value}, {again}",
+        )
 
 
 def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of A and B from the log of one flight: maximum a posteriori over the innovations of the observer's filter.
+"""Identification of A and B from the log of one flight: maximum a posteriori over the innovations
+of the observer's filter.
 
-It takes y and u alone, u after its limits. Two of three seconds fit the model, and every third one, held out, validates it. The
-scale of alpha or beta cannot be told from y; such entries stay near their nominal values. No number in this module is specific
-to an aircraft.
+It takes y and u alone, u after its limits. Two of three seconds fit the model, and every third one,
+held out, validates it. The scale of alpha or beta cannot be told from y; such entries stay near
+their nominal values. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,8 +33,23 @@ from flight_design.identification.innovation_filters import (
     filter_model,
     whole_aircraft,
 )
-from flight_design.identification.likelihood import FEW, KNOWN, PRIOR, Fit, Innovations, Unknown, held_out, span_length
-from flight_design.identification.likelihood_search import REFINED, START_STEPS, STARTS, STEPS, Search
+from flight_design.identification.likelihood import (
+    FEW,
+    KNOWN,
+    PRIOR,
+    Fit,
+    Innovations,
+    Unknown,
+    held_out,
+    span_length,
+)
+from flight_design.identification.likelihood_search import (
+    REFINED,
+    START_STEPS,
+    STARTS,
+    STEPS,
+    Search,
+)
 from flight_design.identification.model_quality import (
     MAX_WHITENESS,
     Prediction,
@@ -45,8 +61,12 @@ from flight_design.identification.model_quality import (
     too_little_excitation,
 )
 
-FOLLOWS = 10.0  # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up to 3
-COUPLED_GAIN = 20.0  # of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
+# 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up
+# to 3
+FOLLOWS = 10.0
+COUPLED_GAIN = (
+    20.0  # of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
+)
 
 
 class Part(NamedTuple):
@@ -69,7 +89,9 @@ class Identification(NamedTuple):
     airframe: Airframe
     recorded: Recording
     held_out: NDArray[np.bool_]  # (T,)
-    innovations: tuple[FloatArray, FloatArray]  # (T, m) each, of the nominal model and of this one, units of y
+    innovations: tuple[
+        FloatArray, FloatArray
+    ]  # (T, m) each, of the nominal model and of this one, units of y
     before: Prediction
     after: Prediction
     parts: tuple[Part, ...]
@@ -98,13 +120,18 @@ class _Study(NamedTuple):
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
         """The search of a block."""
-        return Search(self.recorded, model, block, self.airframe, self.delay, self.unknown, coupled=coupled)
+        return Search(
+            self.recorded, model, block, self.airframe, self.delay, self.unknown, coupled=coupled
+        )
 
     def part(self, search: Search, fit: Fit) -> Part:
         """The model of a block, with the reason why the model must not be used."""
         outputs = search.names.outputs
         entries = search.entries(fit)
-        predictions = prediction(fit.before, self.validating), prediction(fit.after, self.validating)
+        predictions = (
+            prediction(fit.before, self.validating),
+            prediction(fit.after, self.validating),
+        )
         sentences = (
             another_airframe(entries, self.airframe.name, self.at_bound),
             too_little_excitation(entries, outputs),
@@ -115,7 +142,16 @@ class _Study(NamedTuple):
         delay = self.recorded.period * search.delay(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         delay_deviation = self.unknown.delay * float(fit.deviation[-1])
-        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
+        return Part(
+            search.names.inputs,
+            outputs,
+            tuple(entries),
+            *predictions,
+            refusal,
+            delay,
+            gusts,
+            delay_deviation,
+        )
 
 
 def identify(
@@ -130,20 +166,32 @@ def identify(
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
-    Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `at_bound` how many entries of a part may lie at their bound; `unknown` what else is identified; `flown`
-    the model in flight, a further start of the search; `progress` is called with the steps `completed` of
-    the search, and their largest number `total`. Raises ParameterError for an output that does not move.
+    Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
+    keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
+    bound; `unknown` what else is identified; `flown` the model in flight, a further start of the
+    search; `progress` is called with the steps `completed` of the search, and their largest number
+    `total`. Raises ParameterError for an output that does not move.
     """
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
-    still = [name for name, y in zip(airframe.outputs, recorded.y[known].T, strict=True) if not np.diff(y).any()]
-    require(not still, "record", f"a constant {', '.join(still)}", "outputs that move, or the noise of their sensors")
+    still = [
+        name
+        for name, y in zip(airframe.outputs, recorded.y[known].T, strict=True)
+        if not np.diff(y).any()
+    ]
+    require(
+        not still,
+        "record",
+        f"a constant {', '.join(still)}",
+        "outputs that move, or the noise of their sensors",
+    )
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every = blocks(model)
     step_count = count(1)
     starts = len(STARTS) + (flown is not None)
-    total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
+    total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (
+        START_STEPS + STEPS
+    )
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     study = _Study(recorded, airframe, actuation.delay, unknown, validating, paired, at_bound)
 
@@ -158,7 +206,10 @@ def identify(
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
     others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
-    follows = [correlation(fit.after.normalised, u, known) for (_, fit), u in zip(fits, others, strict=True)]
+    follows = [
+        correlation(fit.after.normalised, u, known)
+        for (_, fit), u in zip(fits, others, strict=True)
+    ]
     if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
         search = study.search(model, whole_aircraft(model), coupled=True)
         fit = search.fit(known & ~validating, step, begin=search.joined(fits))
@@ -171,7 +222,9 @@ def identify(
             last = fit.after
     identified = with_entries(airframe, chain.from_iterable(part.entries for part in parts))
     figures = prediction(first, validating), prediction(last, validating)
-    return Identification(identified, recorded, validating, (first.r, last.r), *figures, tuple(parts))
+    return Identification(
+        identified, recorded, validating, (first.r, last.r), *figures, tuple(parts)
+    )
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
@@ -196,19 +249,42 @@ def joined(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations
 
 
 def model_yaml(identified: Identification, origin: str) -> str:
-    """The identified airframe as the text of an airframe file. The header has its origin, held-out figures and deviations."""
+    """The identified airframe as the text of an airframe file. The header has its origin, held-out
+    figures and deviations.
+    """
     lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
-    lines.append("Held-out samples, one of three seconds: rms of the innovations in SI, whiteness (1 is white)")
+    lines.append(
+        "Held-out samples, one of three seconds: rms of the innovations in SI, whiteness (1 is "
+        "white)"
+    )
     for name, predicted in (("nominal", identified.before), ("identified", identified.after)):
         figures = zip(identified.airframe.outputs, predicted.rms, predicted.whiteness, strict=True)
-        lines.append(f"  {name}: " + ", ".join(f"{output} {rms:.3g}, {white:.3g}" for output, rms, white in figures))
-    lines += ["", f"Changes of entries and their standard deviations in %, {100 * PRIOR:g} before the flight:"]
+        lines.append(
+            f"  {name}: "
+            + ", ".join(f"{output} {rms:.3g}, {white:.3g}" for output, rms, white in figures)
+        )
+    lines += [
+        "",
+        (
+            f"Changes of entries and their standard deviations in %, {100 * PRIOR:g} before the "
+            "flight:"
+        ),
+    ]
     lines += [
         f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}"
         for entry in identified.entries
         if entry.nominal
     ]
     if between := [entry for entry in identified.entries if not entry.nominal]:
-        lines += ["", "Entries between parts that do not couple in the nominal airframe, and their standard deviations, SI:"]
-        lines += [f"  {entry.name}: {entry.value:.3g}, {entry.unit * entry.deviation:.3g}" for entry in between]
+        lines += [
+            "",
+            (
+                "Entries between parts that do not couple in the nominal airframe, and their "
+                "standard deviations, SI:"
+            ),
+        ]
+        lines += [
+            f"  {entry.name}: {entry.value:.3g}, {entry.unit * entry.deviation:.3g}"
+            for entry in between
+        ]
     return comment(lines) + as_yaml(identified.airframe)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How well a model predicts held-out samples, and the reasons against a model, each a sentence, or empty."""
+"""How well a model predicts held-out samples, and the reasons against a model, each a sentence, or
+empty.
+"""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -12,10 +14,20 @@ from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, Innovations, largest_error
+from flight_design.identification.likelihood import (
+    MAX_ERROR,
+    MAX_FACTOR,
+    PRIOR,
+    Innovations,
+    largest_error,
+)
 
-MAX_DEVIATION = 0.1  # of the best known effect of an input on each output: two deviations are then a fifth of the loop gain
-MAX_WHITENESS = 3.0  # 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft does
+# of the best known effect of an input on each output: two deviations are then a fifth of the loop
+# gain
+MAX_DEVIATION = 0.1
+# 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft
+# does
+MAX_WHITENESS = 3.0
 LAGS = 20  # of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
@@ -35,18 +47,22 @@ def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Predict
 
 
 def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,), rho_k the autocorrelation of n_k pairs of held-out samples.
+    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,), rho_k the autocorrelation of n_k pairs
+    of held-out samples.
 
-    It is 1 for white noise, with a standard deviation of sqrt(2 / LAGS). Arguments: e (T, m), held_out (T,). Source: G. M.
-    Ljung, G. E. P. Box, Biometrika 65(2), 1978, here for the pairs within the held-out spans.
+    It is 1 for white noise, with a standard deviation of sqrt(2 / LAGS). Arguments: e (T, m),
+    held_out (T,). Source: G. M. Ljung, G. E. P. Box, Biometrika 65(2), 1978, here for the pairs
+    within the held-out spans.
     """
     return np.diag(correlation(e, e, held_out))
 
 
 def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k), rho_k the correlation of e with what was k samples `before`.
+    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k), rho_k the correlation of e with what
+    was k samples `before`.
 
-    It is 1 for independent white noises. Arguments: e (T, m), before (T, k), `used` (T,), mask of n samples.
+    It is 1 for independent white noises. Arguments: e (T, m), before (T, k), `used` (T,), mask of n
+    samples.
     """
     now, then = (np.where(used[:, None], values, 0.0) for values in (e, before))
     power = np.outer(*(np.sum(values**2, axis=0) / used.sum() for values in (now, then)))
@@ -68,7 +84,9 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
-    """The output whose inputs are known worst, if the best known effect on it has a deviation above MAX_DEVIATION."""
+    """The output whose inputs are known worst, if the best known effect on it has a deviation above
+    MAX_DEVIATION.
+    """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
         return ""
@@ -76,18 +94,24 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     information = worst.deviation**-2 - PRIOR**-2
     factor = np.sqrt((MAX_DEVIATION**-2 - PRIOR**-2) / max(information, 1e-2 * PRIOR**-2))
     return (
-        f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.2g} %, expected"
-        f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.2g} times the amplitude, or {factor**2:.2g} times the time"
+        f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.2g} %, "
+        "expected"
+        f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.2g} times the amplitude, or "
+        f"{factor**2:.2g} times the time"
     )
 
 
 def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> str:
     """The entries at a bound of the search, if more than `allowed`."""
-    at_bound = [entry.name for entry in entries if not -MAX_ERROR < entry.error < largest_error(entry)]
+    at_bound = [
+        entry.name for entry in entries if not -MAX_ERROR < entry.error < largest_error(entry)
+    ]
     if len(at_bound) > allowed:
         return (
-            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, {1.0 - MAX_ERROR:g} or {MAX_FACTOR:g}"
-            " times the nominal value, expected a log of this airframe, in calm air if its effect of wind is not known"
+            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, "
+            f"{1.0 - MAX_ERROR:g} or {MAX_FACTOR:g}"
+            " times the nominal value, expected a log of this airframe, in calm air if its "
+            "effect of wind is not known"
         )
     return ""
 
@@ -98,24 +122,39 @@ def _minor_signs(Omega: FloatArray) -> list[float]:
 
 
 def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairing) -> str:
-    """D of the law where the identified model has another: D follows from the signs of the leading minors of C B."""
+    """D of the law where the identified model has another: D follows from the signs of the leading
+    minors of C B.
+    """
     columns = [list(nominal.inputs).index(name) for name in channels.inputs]
     order = np.ix_([nominal.outputs.index(name) for name in channels.outputs], columns)
     before = _minor_signs((nominal.matrix_c() @ nominal.matrix_b())[order])
     after = _minor_signs((identified.matrix_c() @ identified.matrix_b())[order])
-    return "" if before == after else "C B: found other signs of its minors than in the nominal airframe, expected the same D"
+    return (
+        ""
+        if before == after
+        else "C B: found other signs of its minors than in the nominal airframe, expected the "
+        "same D"
+    )
 
 
 def no_better(before: Prediction, after: Prediction) -> str:
-    """Whether the model does not predict the held-out samples better, or neither with white nor with whiter innovations."""
+    """Whether the model does not predict the held-out samples better, or neither with white nor
+    with whiter innovations.
+    """
     if after.log_likelihood <= before.log_likelihood:
         return (
-            f"held-out samples: found a log-likelihood of {after.log_likelihood:.4g} a sample, expected more than the"
-            f" {before.log_likelihood:.4g} of the nominal airframe, which explains this flight as it is"
+            f"held-out samples: found a log-likelihood of {after.log_likelihood:.4g} a sample, "
+            "expected more than the"
+            f" {before.log_likelihood:.4g} of the nominal airframe, which explains this flight "
+            "as it is"
         )
-    if np.sum(after.whiteness) >= np.sum(before.whiteness) and np.max(after.whiteness) > MAX_WHITENESS:
+    if (
+        np.sum(after.whiteness) >= np.sum(before.whiteness)
+        and np.max(after.whiteness) > MAX_WHITENESS
+    ):
         return (
-            f"held-out samples: found innovations with a whiteness of {np.mean(after.whiteness):.3g}, expected less than the"
+            "held-out samples: found innovations with a whiteness of "
+            f"{np.mean(after.whiteness):.3g}, expected less than the"
             f" {np.mean(before.whiteness):.3g} of the nominal airframe"
         )
     return ""

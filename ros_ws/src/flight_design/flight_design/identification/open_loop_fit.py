@@ -4,15 +4,18 @@
 
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
-The output error is fitted: the model is simulated from u alone, with the least squares of y less the output. Without
-stiffness the response does not tell lag from 1 / damping: the lag is the smaller of the two, of the faster pole. Source:
-L. Ljung, "System Identification", 1999, 4.2 and 10.2.
+The output error is fitted: the model is simulated from u alone, with the least squares of y less
+the output. Without stiffness the response does not tell lag from 1 / damping: the lag is the
+smaller of the two, of the faster pole. Source: L. Ljung, "System Identification", 1999, 4.2 and
+10.2.
 
-Thrust also moves the airspeed by the following climb, the phugoid. With a measured climb the model of V excludes the phugoid:
+Thrust also moves the airspeed by the following climb, the phugoid. With a measured climb the model
+of V excludes the phugoid:
 
     V_dot = -damping V + Omega v - g climb / speed
 
-Source: B. Etkin, L. D. Reid, "Dynamics of Flight", 1996, 4.9 (the X equation along the flight path).
+Source: B. Etkin, L. D. Reid, "Dynamics of Flight", 1996, 4.9 (the X equation along the flight
+path).
 """
 
 from typing import Any, NamedTuple
@@ -32,10 +35,13 @@ AFTER = 0.5
 MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
 LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
 MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel
-FASTEST_ZERO = 25.0  # 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
-MIN_GAIN = 0.85  # of the misfit, by which a second order has to lower it: noise alone does not in 10 s
-# Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a short-period or Dutch roll mode of a
-# transport and that of a model aircraft
+# 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
+FASTEST_ZERO = 25.0
+MIN_GAIN = (
+    0.85  # of the misfit, by which a second order has to lower it: noise alone does not in 10 s
+)
+# Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a
+# short-period or Dutch roll mode of a transport and that of a model aircraft
 STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01, 30.0, 400.0, 1.0))
 # Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
@@ -70,7 +76,9 @@ class ChannelModel(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero: noise may be as large as y."""
+        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero: noise
+        may be as large as y.
+        """
         gain, phase = self.at_loop_frequency()
         is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
         return is_certain and 0.0 <= self.slow / self.Omega <= FASTEST_ZERO
@@ -85,24 +93,41 @@ class ChannelModel(NamedTuple):
 
         def logarithm(theta: FloatArray) -> complex:
             delay, lag, Omega, damping, stiffness, slow = theta
-            ratio = (abs(Omega) * s + np.sign(Omega) * slow) / (s**2 + damping * s + stiffness) / (lag * s + 1.0)
+            ratio = (
+                (abs(Omega) * s + np.sign(Omega) * slow)
+                / (s**2 + damping * s + stiffness)
+                / (lag * s + 1.0)
+            )
             return complex(np.log(ratio) - s * delay)
 
         steps = 1e-6 * np.maximum(np.abs(theta), 1e-3)
-        slope = np.array([logarithm(theta + step) - logarithm(theta - step) for step in np.diag(steps)]) / (2.0 * steps)
-        gain, phase = (float(np.sqrt(part @ self.covariance @ part)) for part in (slope.real, slope.imag))
+        slope = np.array(
+            [logarithm(theta + step) - logarithm(theta - step) for step in np.diag(steps)]
+        ) / (2.0 * steps)
+        gain, phase = (
+            float(np.sqrt(part @ self.covariance @ part)) for part in (slope.real, slope.imag)
+        )
         log_ratio = logarithm(theta)
-        return Estimate(float(np.exp(log_ratio.real)), gain * float(np.exp(log_ratio.real))), Estimate(-log_ratio.imag, phase)
+        return Estimate(
+            float(np.exp(log_ratio.real)), gain * float(np.exp(log_ratio.real))
+        ), Estimate(-log_ratio.imag, phase)
 
 
 def fit_channel(
-    y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None, *, first_order: bool = False
+    y: Signal,
+    u: Signal,
+    output: str,
+    name: str,
+    sign: float,
+    gravity: Signal | None = None,
+    *,
+    first_order: bool = False,
 ) -> ChannelModel | None:
     """The model from the time of excitation of an input, of the lowest sufficient order.
 
-    None without excitation, or for a constant output. The search begins with an Omega of this sign, and may end with the
-    opposite sign. `gravity` is a measured part of y_dot without u, a channel: then, and by `first_order`, the model is of first
-    order.
+    None without excitation, or for a constant output. The search begins with an Omega of this sign,
+    and may end with the opposite sign. `gravity` is a measured part of y_dot without u, a channel:
+    then, and by `first_order`, the model is of first order.
     """
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
@@ -135,14 +160,18 @@ def fit_channel(
 
     orders = ORDERS[:1] if first_order or gravity is not None else ORDERS
     values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
-    fits = [_search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in orders]
+    fits = [
+        _search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in orders
+    ]
     misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]
     chosen = 1 if misfits[-1] < MIN_GAIN * misfits[0] and _has_zero_of_its_own(fits[-1].x) else 0
     return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Beside a constant and t: the decay of a first value, exp(-damping t), or t^2 for a damping of 0."""
+    """Beside a constant and t: the decay of a first value, exp(-damping t), or t^2 for a damping of
+    0.
+    """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
 
@@ -153,13 +182,22 @@ def _has_zero_of_its_own(theta: FloatArray) -> bool:
     return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 
 
-def _simulated(t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray) -> FloatArray:
-    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, held between t_u."""
+def _simulated(
+    t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray
+) -> FloatArray:
+    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, held
+    between t_u.
+    """
     delay, lag, Omega, damping, stiffness, slow = theta
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
     u = np.diff(np.interp(grid - delay, t_u, impulse)) / STEP
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
-    plant = A, np.array([[0.0], [0.0], [1.0 / lag]]), np.array([[slow, Omega, 0.0]]), np.zeros((1, 1))
+    plant = (
+        A,
+        np.array([[0.0], [0.0], [1.0 / lag]]),
+        np.array([[slow, Omega, 0.0]]),
+        np.zeros((1, 1)),
+    )
     numerator, denominator = ss2tf(*cont2discrete(plant, STEP)[:4])
     return np.asarray(np.interp(t, grid[:-1], lfilter(numerator[0], denominator, u)))
 
@@ -171,17 +209,27 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
         Omega = damping * size
         start = np.array([delay, lag, Omega, damping, stiffness, zero * Omega])[:order]
         scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
-        fits.append(least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60))
+        fits.append(
+            least_squares(
+                residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60
+            )
+        )
     best = min(fits, key=lambda fit: float(fit.cost))
     if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
         delay, lag, Omega, damping = best.x
-        start = np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag])  # the same response
-        best = least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60)
+        start = np.array(
+            [delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag]
+        )  # the same response
+        best = least_squares(
+            residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60
+        )
     return best
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (coloured errors)."""
+    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (coloured
+    errors).
+    """
     e = fit.fun
     lags = max(round(CORRELATION / period), 1)
     rho = np.correlate(e, e, "full")[len(e) : len(e) + lags] / (e @ e)
@@ -190,5 +238,7 @@ def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
     covariance = np.zeros((6, 6))
     variance = float(e @ e) / (len(e) - len(fit.x)) * inflation
     covariance[: len(fit.x), : len(fit.x)] = variance * np.linalg.pinv(J.T @ J)
-    delay, lag, Omega, damping, stiffness, slow = np.concatenate([fit.x, np.zeros(6 - len(fit.x))]).tolist()
+    delay, lag, Omega, damping, stiffness, slow = np.concatenate(
+        [fit.x, np.zeros(6 - len(fit.x))]
+    ).tolist()
     return ChannelModel(delay, lag, Omega, damping, stiffness, slow, covariance, misfit)

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameters of ArduPilot in a log, against what a channel map says of the transmitter.
 
-Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp, SRV_Channel.h (functions of
-servos); ArduPlane, mode_fbwa.cpp (high is roll right, nose up, more thrust, nose right where RCn_REVERSED is 0).
+Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp,
+SRV_Channel.h (functions of servos); ArduPlane, mode_fbwa.cpp (high is roll right, nose up, more
+thrust, nose right where RCn_REVERSED is 0).
 """
 
 import re
@@ -20,19 +21,35 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_log import SERVOS, Parameters
 
-CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")  # of a transmitter: Rc.msg from 0, MAVLink from 1
-AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}  # of RCMAP, by what responds
-FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}  # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
+CHANNEL = re.compile(
+    r"channels\[(\d+)\]|chan(\d+)_raw"
+)  # of a transmitter: Rc.msg from 0, MAVLink from 1
+AXES: Mapping[str, str] = {
+    "p": "ROLL",
+    "q": "PITCH",
+    "V": "THROTTLE",
+    "r": "YAW",
+}  # of RCMAP, by what responds
+FUNCTIONS = {
+    "ROLL": 4,
+    "PITCH": 19,
+    "THROTTLE": 70,
+    "YAW": 21,
+}  # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 SAME_LINE = Line(1, 1.0, 0.0)
 
-END_TOLERANCE = 0.01  # of half the range: the effect differs by as much, below the standard errors of `identify`
-TRIM_TOLERANCE = 0.05  # of half the range: the effects on the two sides of the trim differ from their mean by as much
+# of half the range: the effect differs by as much, below the standard errors of `identify`
+END_TOLERANCE = 0.01
+# of half the range: the effects on the two sides of the trim differ from their mean by as much
+TRIM_TOLERANCE = 0.05
 
 DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
-"""Parameters of ArduPilot and PX4 between a command and the surface: where one changes, so does the sign or the effect."""
+"""Parameters of ArduPilot and PX4 between a command and the surface: where one changes, so does the
+sign or the effect."""
 
 CALIBRATE = (
-    "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or calibrate the transmitter and fly again"
+    "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or "
+    "calibrate the transmitter and fly again"
 )
 MENDS = {  # by a part of the name of the parameter; no mend reverses what the pilot's stick does
     "REVERSED": "change `positive` of the row of `inputs`, and not the parameter",
@@ -44,13 +61,17 @@ MENDS = {  # by a part of the name of the parameter; no mend reverses what the p
 
 
 class Stick(NamedTuple):
-    """What a map says of an input and of the transmitter's channel. `trim_line` turns the pulse, us, into the raw value."""
+    """What a map says of an input and of the transmitter's channel. `trim_line` turns the pulse,
+    us, into the raw value.
+    """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
     channel: int  # from 1
     trim_line: Line
     raw_range: tuple[float, float]
-    raw_sign: int  # +1 where an increasing raw value is roll right, nose up, more thrust, nose right
+    raw_sign: (
+        int  # +1 where an increasing raw value is roll right, nose up, more thrust, nose right
+    )
 
     @property
     def is_centred(self) -> bool:
@@ -62,33 +83,47 @@ class Stick(NamedTuple):
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
-        ends = {f"{name}_MIN": (low, END_TOLERANCE * half), f"{name}_MAX": (high, END_TOLERANCE * half)}
+        ends = {
+            f"{name}_MIN": (low, END_TOLERANCE * half),
+            f"{name}_MAX": (high, END_TOLERANCE * half),
+        }
         trim = {f"{name}_TRIM": (low + half, TRIM_TOLERANCE * half)} if self.is_centred else {}
         is_reversed = self.raw_sign * self.trim_line.sign < 0
         return (
-            {f"RCMAP_{self.axis}": (float(self.channel), 0.0)} | ends | trim | {f"{name}_REVERSED": (float(is_reversed), 0.0)}
+            {f"RCMAP_{self.axis}": (float(self.channel), 0.0)}
+            | ends
+            | trim
+            | {f"{name}_REVERSED": (float(is_reversed), 0.0)}
         )
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """The raw value of a part of full deflection: -1 to 1 about the middle, for a throttle 0 to 1 from the lower end."""
+        """The raw value of a part of full deflection: -1 to 1 about the middle, for a throttle 0 to
+        1 from the lower end.
+        """
         low, high = self.raw_range
         part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
         return low + (high - low) * (part if self.is_centred or self.raw_sign > 0 else 1.0 - part)
 
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
-    """What a map says of the channel of an input. Raises ParameterError for an input without a channel."""
+    """What a map says of the channel of an input. Raises ParameterError for an input without a
+    channel.
+    """
     row = channel_map.inputs[name]
     trim = channel_map.trims.get(name)
     match = CHANNEL.fullmatch(row.field if trim is None else trim.field)
     if match is None:
         expected = "a field such as channels[1]"
-        raise ParameterError(f"trims.{name}: found none with a channel of the transmitter, expected {expected}")
+        raise ParameterError(
+            f"trims.{name}: found none with a channel of the transmitter, expected {expected}"
+        )
     responds, raw_sign = MOTIONS[row.positive]
     motions = "a motion of roll, pitch, yaw or thrust: the log is of a plane"
     require(responds in AXES, f"inputs.{name}.positive", f"{row.positive!r}", motions)
     channel = int(match[1]) + 1 if match[1] else int(match[2])
-    return Stick(AXES[responds], channel, SAME_LINE if trim is None else trim.line, row.range, raw_sign)
+    return Stick(
+        AXES[responds], channel, SAME_LINE if trim is None else trim.line, row.range, raw_sign
+    )
 
 
 class Servo(NamedTuple):
@@ -110,9 +145,15 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """The first servo with the function of an input. `values`: the parameters at the samples. Raises ParameterError."""
+    """The first servo with the function of an input. `values`: the parameters at the samples.
+    Raises ParameterError.
+    """
     function = FUNCTIONS[stick.axis]
-    outputs = [number for number in range(1, SERVOS + 1) if values.get(f"SERVO{number}_FUNCTION") == function]
+    outputs = [
+        number
+        for number in range(1, SERVOS + 1)
+        if values.get(f"SERVO{number}_FUNCTION") == function
+    ]
     sticks_instead = "or the sticks in MANUAL, without --servos"
     if not outputs:
         missing = f"found no servo with SERVOn_FUNCTION {function} in the log"
@@ -120,11 +161,18 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     keys = ["MIN", *(["TRIM"] if stick.is_centred else []), "MAX", "REVERSED"]
     names = [f"SERVO{outputs[0]}_{key}" for key in keys]
     absent = [key for key in names if key not in values]
-    require(not absent, f"inputs.{name}", f"no {', '.join(absent)} in the log before the samples", f"it, {sticks_instead}")
+    require(
+        not absent,
+        f"inputs.{name}",
+        f"no {', '.join(absent)} in the log before the samples",
+        f"it, {sticks_instead}",
+    )
     low, *trim, high, is_reversed = (values[key] for key in names)
     ends = [low, *trim, high]
     ascending = all(before < after for before, after in pairwise(ends))
-    require(ascending, f"SERVO{outputs[0]}_MIN, TRIM, MAX", ends, f"ascending values, {sticks_instead}")
+    require(
+        ascending, f"SERVO{outputs[0]}_MIN, TRIM, MAX", ends, f"ascending values, {sticks_instead}"
+    )
     require(is_reversed in {0.0, 1.0}, f"SERVO{outputs[0]}_REVERSED", f"{is_reversed:g}", "0 or 1")
     return Servo(outputs[0], low, trim[0] if trim else low, high, is_reversed == 1.0)
 
@@ -139,10 +187,13 @@ class Agreement(NamedTuple):
     is_known: bool = True  # at the samples, by a record before
 
 
-def compared(sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]) -> list[Agreement]:
+def compared(
+    sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]
+) -> list[Agreement]:
     """The parameters of the transmitter in a log, against a map; `values` are those at the samples.
 
-    A parameter without a value at the samples is compared by the first record after the samples, without a default.
+    A parameter without a value at the samples is compared by the first record after the samples,
+    without a default.
     """
     known = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
@@ -165,14 +216,24 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
         expected = ", ".join(f"{row.what} {row.mapped}" for row in differing)
         mends: dict[str, None] = {}
         for row in differing:
-            mends |= dict.fromkeys(mend for end, mend in MENDS.items() if end in row.what.split("_"))
-        raise ParameterError(f"the log: found {logged}, expected {expected} as in the map {name_of_map}: {'; '.join(mends)}")
+            mends |= dict.fromkeys(
+                mend for end, mend in MENDS.items() if end in row.what.split("_")
+            )
+        raise ParameterError(
+            f"the log: found {logged}, expected {expected} as in the map {name_of_map}: "
+            f"{'; '.join(mends)}"
+        )
     absent = ", ".join(row.what for row in rows if not row.is_known)
-    return f"the log has no {absent} before the samples: compare the map with them yourself" if absent else ""
+    return (
+        f"the log has no {absent} before the samples: compare the map with them yourself"
+        if absent
+        else ""
+    )
 
 
 def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
-    """Sentences on the decisive parameters that change before or after the samples from `first_ns` to `last_ns`.
+    """Sentences on the decisive parameters that change before or after the samples from `first_ns`
+    to `last_ns`.
 
     `start_ns` is the begin of the log. Raises ParameterError for a change between the samples.
     """
@@ -183,11 +244,25 @@ def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) ->
             if before.value == after.value:
                 continue
             instant = seconds(after.stamp_ns - start_ns)
-            change = f"{name} changes from {before.value:g} to {after.value:g} at {instant:.1f} s of the log"
+            change = (
+                f"{name} changes from {before.value:g} to {after.value:g} at {instant:.1f} "
+                "s of the log"
+            )
             if first_ns < after.stamp_ns <= last_ns:
                 between.append(change)
             else:
-                side, value = ("before", after.value) if after.stamp_ns <= first_ns else ("after", before.value)
-                outside.append(f"{change}, {side} the samples: signs and effects are those of {value:g}")
-    require(not between, "the log", "; ".join(between), "no change between the samples: leave it out by --from and --until")
+                side, value = (
+                    ("before", after.value)
+                    if after.stamp_ns <= first_ns
+                    else ("after", before.value)
+                )
+                outside.append(
+                    f"{change}, {side} the samples: signs and effects are those of {value:g}"
+                )
+    require(
+        not between,
+        "the log",
+        "; ".join(between),
+        "no change between the samples: leave it out by --from and --until",
+    )
     return outside

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input-output response of an aircraft from a log of y and u: Omega, lags and delays with standard errors, without a model.
+"""Input-output response of an aircraft from a log of y and u: Omega, lags and delays with standard
+errors, without a model.
 
-A predictor of every sample of y from earlier samples and from u is fitted by least squares, long enough to include the
-disturbances. The step response of the predictor is the step response of the aircraft. A second-order response with a delay
-and a lag, fitted to the begin of the step response, has Omega, the lag and the delay. Sources: L. Ljung, "System
-Identification", 1999, 7.3 and 13.4 (direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999;
-Y. Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
+A predictor of every sample of y from earlier samples and from u is fitted by least squares, long
+enough to include the disturbances. The step response of the predictor is the step response of the
+aircraft. A second-order response with a delay and a lag, fitted to the begin of the step response,
+has Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4
+(direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu,
+"Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a
+reduced one).
 """
 
 import math
@@ -23,26 +26,35 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
-WINDOW = 0.02  # s, width of the windows over which u and older y are averaged: shorter than a servo's lag
+# s, width of the windows over which u and older y are averaged: shorter than a servo's lag
+WINDOW = 0.02
 RECENT = 4  # samples of y that the predictor has one by one
 # s before a sample that are covered by windows of equal width: the longest delay and a lag
 FINE_Y = 0.2
 FINE_U = 0.45
-FAR = 2.0  # s before a sample that are covered by windows that double: the memory of disturbances and of a controller
+# s before a sample that are covered by windows that double: the memory of disturbances and of a
+# controller
+FAR = 2.0
 HORIZON = 0.8  # s of the step response
 MAX_DELAY = 0.3  # s
 DRAWS = 200  # of the predictor's coefficients, for the covariance of the step response
-PRIOR = 10.0  # of a coefficient: it turns a typical y or u into so many typical changes of y within a window
+# of a coefficient: it turns a typical y or u into so many typical changes of y within a window
+PRIOR = 10.0
 MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
-MIN_SHARE = 0.9  # of the motion in a closed loop: then feedback of disturbances is too little to be taken for a response
-CLOSED_LOOP_ERRORS = 2.0  # times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the errors
+# of the motion in a closed loop: then feedback of disturbances is too little to be taken for a
+# response
+MIN_SHARE = 0.9
+# times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the
+# errors
+CLOSED_LOOP_ERRORS = 2.0
 LOOP_MEMORY = 8.0  # s before an instant that the excitation has an effect
 LOOP_FINE = 6  # windows of PERIOD
 PERIOD = 0.05  # s
 FOLDS = 6  # the better ridge counts: few commands need the one
 RIDGES = (1e-4, 1e-2)  # many disturbances the other
-LEAST_DELAY = 0.01  # s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
+# s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
+LEAST_DELAY = 0.01
 ITERATIONS = 3  # of the variance of a prediction and the coefficients
 MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
 
@@ -52,14 +64,21 @@ RESOLUTION = 0.025  # s between the points of the step response that are fitted
 FLOOR = 0.01  # of the largest value of a step response: what windows and a linear model leave out
 STARTS_DELAY = (0.02, 0.1, 0.2)  # s
 STARTS_LAG = (0.03, 0.2)  # of the search
-# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest value of the step response
+# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest
+# value of the step response
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
 SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
-ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))  # an integrator, first order, second order
+ORDERS = (
+    (1, 1, 1, 0, 0, 0),
+    (1, 1, 1, 1, 0, 0),
+    (1, 1, 1, 1, 1, 1),
+)  # an integrator, first order, second order
 MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
-TOLERANCE = 1e-6  # of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can show
+# of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can
+# show
+TOLERANCE = 1e-6
 EARLY = 0.3  # s after delay and lag in which the sign of a response shows
 COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
 
@@ -67,7 +86,8 @@ Spans = Sequence[tuple[int, int]]
 
 
 class Response(NamedTuple):
-    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has a row of NaN in the results.
+    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has a
+    row of NaN in the results.
 
     y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
     """
@@ -82,8 +102,12 @@ class Response(NamedTuple):
     delay_deviation: FloatArray  # (m,)
     refusal: tuple[str, ...]  # (m,) why Omega_ii must not be used, one sentence; empty if it may
     seconds: float  # of the log that were used
-    share: FloatArray  # (m,) of the motion of y_i and u_i that the excitation explains; 1 in open loop
-    sign_ratio: FloatArray  # (m,) response i to input i in standard errors: the sign of Omega_ii is certain from MIN_RATIO on
+    share: (
+        FloatArray  # (m,) of the motion of y_i and u_i that the excitation explains; 1 in open loop
+    )
+    # (m,) response i to input i in standard errors: the sign of Omega_ii is certain from MIN_RATIO
+    # on
+    sign_ratio: FloatArray
 
     def sign_refusal(self, i: int) -> str:
         """The reason of an uncertain sign of Omega_ii, a sentence; empty for a certain sign."""
@@ -94,7 +118,10 @@ class Response(NamedTuple):
             return self.refusal[i]
         if ratio >= MIN_RATIO:
             return ""
-        uncertain = f"{output} by {name}: found a response of {ratio:.1f} standard errors, expected {MIN_RATIO:g} or more"
+        uncertain = (
+            f"{output} by {name}: found a response of {ratio:.1f} standard errors, "
+            f"expected {MIN_RATIO:g} or more"
+        )
         return f"{uncertain}: {_more_excitation(name, ratio)}"
 
 
@@ -107,37 +134,57 @@ def identify_response(
     excitation: Signal | None = None,
     engaged: Spans | None = None,
 ) -> Response:
-    """Omega, lag and delay of every channel of a log, with standard errors, or a refusal of the channel.
+    """Omega, lag and delay of every channel of a log, with standard errors, or a refusal of the
+    channel.
 
-    Arguments: `y`, `u` (after limits) at their stamps of a clock, regular or not; `outputs` and `inputs` the
-    channels in pairs; `excitation` what moves u from outside in a closed loop, such as y_m, None where u itself is the
-    excitation, as in an open-loop experiment; `engaged` the spans in ns in which u acts on the aircraft, by default the whole
-    log. Raises ParameterError for a missing channel, or too few samples for any result.
+    Arguments: `y`, `u` (after limits) at their stamps of a clock, regular or not; `outputs` and
+    `inputs` the channels in pairs; `excitation` what moves u from outside in a closed loop, such as
+    y_m, None where u itself is the excitation, as in an open-loop experiment; `engaged` the spans
+    in ns in which u acts on the aircraft, by default the whole log. Raises ParameterError for a
+    missing channel, or too few samples for any result.
     """
     for topic, signal, names in (("y", y, outputs), ("u", u, inputs)):
         missing = [name for name in names if name not in signal.names]
-        require(not missing, f"{topic} of the log", ", ".join(signal.names), f"the channels {', '.join(names)}")
-    require(len(y.stamp_ns) > 1 and len(u.stamp_ns) > 1, "the log", f"{len(y.stamp_ns)} samples of y", "a flight")
+        require(
+            not missing,
+            f"{topic} of the log",
+            ", ".join(signal.names),
+            f"the channels {', '.join(names)}",
+        )
+    require(
+        len(y.stamp_ns) > 1 and len(u.stamp_ns) > 1,
+        "the log",
+        f"{len(y.stamp_ns)} samples of y",
+        "a flight",
+    )
     layout = Layout.from_period(float(np.median(np.diff(y.stamp_ns))) / NANOSECONDS)
     spans = [(int(y.stamp_ns[0]), int(y.stamp_ns[-1]))] if engaged is None else engaged
     rows = [_rows(y, u, outputs, inputs, layout, span) for span in spans]
     predictor = _fit(rows, layout, len(outputs))
     share = np.ones(len(outputs))
     if excitation is not None:
-        share = np.minimum(explained(y, outputs, excitation, spans), explained(u, inputs, excitation, spans))
-    return _responses(tuple(outputs), tuple(inputs), layout, predictor.step_responses(), rows, share)
+        share = np.minimum(
+            explained(y, outputs, excitation, spans), explained(u, inputs, excitation, spans)
+        )
+    return _responses(
+        tuple(outputs), tuple(inputs), layout, predictor.step_responses(), rows, share
+    )
 
 
 # The predictor
 
 
 class Layout(NamedTuple):
-    """What the predictor of y(k) has: samples of y and windows of samples before k, ends in sample periods."""
+    """What the predictor of y(k) has: samples of y and windows of samples before k, ends in sample
+    periods.
+    """
 
     period: float  # s, of y
     recent: int  # samples of y one by one
     y_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of y(k - a - 1) to y(k - b)
-    u_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of u from t_k - b period to t_k - a period
+    u_windows: tuple[
+        tuple[int, int], ...
+    ]  # (a, b): the mean of u from t_k - b period to t_k - a period
 
     @classmethod
     def from_period(cls, period: float) -> "Layout":
@@ -164,10 +211,11 @@ class Layout(NamedTuple):
         return np.asarray(np.exp(-self.period * np.array(middles) / MEMORY))
 
     def u_root(self) -> FloatArray:
-        """Root of the covariance of the coefficients of u before the fit, relative: they are smooth and decay.
+        """Root of the covariance of the coefficients of u before the fit, relative: they are smooth
+        and decay.
 
-        The kernel is exp(-max(s, t) / MEMORY) over window times s and t. Source: T. Chen, H. Ohlsson, L. Ljung, Automatica 48,
-        2012.
+        The kernel is exp(-max(s, t) / MEMORY) over window times s and t. Source: T. Chen, H.
+        Ohlsson, L. Ljung, Automatica 48, 2012.
         """
         ends = np.array(self.u_windows)
         late = self.period * np.mean(ends, axis=1)
@@ -180,19 +228,32 @@ class _Rows(NamedTuple):
     u: FloatArray  # (K, m) as recorded in the span
 
 
-def _within(signal: Signal, names: Sequence[str], span: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def _within(
+    signal: Signal, names: Sequence[str], span: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
     """Times in s after the start of a span, and values of the named channels."""
     inside = (signal.stamp_ns >= span[0]) & (signal.stamp_ns <= span[1])
-    return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, np.stack([signal[name][inside] for name in names], axis=1)
+    return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, np.stack(
+        [signal[name][inside] for name in names], axis=1
+    )
 
 
 def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
     """Integral from t[0] to the `instants` of a signal with the means `steps` from t to t."""
-    sums = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)])
+    sums = np.concatenate(
+        [np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)]
+    )
     return np.stack([np.interp(instants, t, column) for column in sums.T], axis=1)
 
 
-def _rows(y: Signal, u: Signal, outputs: Sequence[str], inputs: Sequence[str], layout: Layout, span: tuple[int, int]) -> _Rows:
+def _rows(
+    y: Signal,
+    u: Signal,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    layout: Layout,
+    span: tuple[int, int],
+) -> _Rows:
     """Regressors and predicted samples of a span."""
     (t, values), (t_u, held), m = _within(y, outputs, span), _within(u, inputs, span), len(outputs)
     k = np.arange(layout.past, len(t))
@@ -218,7 +279,8 @@ class _Predictor(NamedTuple):
     roots: FloatArray  # (m, m lags, m lags) roots of the covariance of each column
 
     def step_responses(self) -> FloatArray:
-        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the estimate, then draws.
+        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the
+        estimate, then draws.
 
         At K whole periods after the step, up to HORIZON.
         """
@@ -256,7 +318,9 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     moves = np.std(np.diff(Y, axis=0), axis=0) * max(WINDOW / layout.period, 1.0) ** 0.5
     spread = np.std(X[:, first_u : first_u + m], axis=0)
     per_y, per_u = (1.0 / np.where(power > 0.0, power, np.inf) for power in (moves, spread))
-    prior = PRIOR * block_diag(np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u)))
+    prior = PRIOR * block_diag(
+        np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u))
+    )
     scaled = X @ prior
     normal = scaled.T @ scaled
     fits = []
@@ -264,7 +328,9 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     for i in range(m):
         variance = (1e-3 * moves[i]) ** 2 or 1.0
         for _ in range(ITERATIONS):
-            values, vectors = np.linalg.eigh(normal * moves[i] ** 2 / variance + np.eye(len(normal)))
+            values, vectors = np.linalg.eigh(
+                normal * moves[i] ** 2 / variance + np.eye(len(normal))
+            )
             root = moves[i] * prior @ (vectors / np.sqrt(np.maximum(values, 1.0)))
             fit = root @ (root.T @ (X.T @ Y[:, i])) / variance
             e = Y[:, i] - X @ fit
@@ -278,17 +344,21 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Share of the variance of the channels explained by the excitation, (k,); 1 without disturbances.
+    """Share of the variance of the channels explained by the excitation, (k,); 1 without
+    disturbances.
 
-    The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. FOLDS parts of the flight
-    are predicted with coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
-    1974.
+    The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. FOLDS
+    parts of the flight are predicted with coefficients from the rest. Source of the
+    cross-validation: M. Stone, J. Royal Statistical Society B 36, 1974.
     """
     residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
     for span in spans:
         before = int(excitation.stamp_ns[0])
-        (t, values), (t_w, w) = _within(signal, names, span), _within(excitation, excitation.names, (before, span[1]))
+        (t, values), (t_w, w) = (
+            _within(signal, names, span),
+            _within(excitation, excitation.names, (before, span[1])),
+        )
         t_w = t_w + seconds(before - span[0])
         if len(t) < 2 or len(t_w) < 2 or t_w[-1] - t[0] < FOLDS * PERIOD:
             continue
@@ -297,7 +367,10 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         while edges[-1] < LOOP_MEMORY:
             edges.append(edges[-1] + PERIOD * 2.0 ** max(len(edges) - LOOP_FINE, 0))
         ends = [_integral(t_w, (w[:-1] + w[1:]) / 2.0, instants - edge) for edge in edges]
-        means = [(new - old) / (b - a) for (new, old), (a, b) in zip(pairwise(ends), pairwise(edges), strict=True)]
+        means = [
+            (new - old) / (b - a)
+            for (new, old), (a, b) in zip(pairwise(ends), pairwise(edges), strict=True)
+        ]
         Z = np.concatenate([*means, ends[0]], axis=1)
         Z = Z - Z.mean(axis=0)
         Z = Z / np.maximum(np.linalg.norm(Z, axis=0), np.finfo(float).tiny)
@@ -313,7 +386,9 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
                 fit = np.linalg.solve(normal + ridge * np.eye(len(normal)), product)
                 residual[k] += np.sum((X[in_fold] - Z[in_fold] @ fit) ** 2, axis=0)
         total += np.sum(X**2, axis=0)
-    return np.asarray(1.0 - residual.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (total > 0.0)
+    return np.asarray(1.0 - residual.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (
+        total > 0.0
+    )
 
 
 # The step response
@@ -348,12 +423,17 @@ def _responses(
     columns = []
     refusal = []
     for j in range(len(inputs)):
-        recorded = {inputs[j]: [part.u[:, j] for part in rows], outputs[j]: [part.y[:, j] for part in rows]}
+        recorded = {
+            inputs[j]: [part.u[:, j] for part in rows],
+            outputs[j]: [part.y[:, j] for part in rows],
+        }
         still = next((name for name, parts in recorded.items() if not _moves(parts)), "")
         usable = not still and bool(np.isfinite(responses[..., j]).all())
         columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
-    counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([column.delay for column in columns]) < LEAST_DELAY))
+    counts = (share >= MIN_SHARE) & ~(
+        (share < 1.0) & (np.array([column.delay for column in columns]) < LEAST_DELAY)
+    )
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
         outputs,
@@ -372,28 +452,39 @@ def _responses(
 
 
 def _no_column(m: int) -> _Column:
-    return _Column(np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0)
+    return _Column(
+        np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0
+    )
 
 
 def _refusal(output: str, name: str, column: _Column, j: int, still: str, share: float) -> str:
     if still:
         return f"{output} by {name}: found {still} constant, expected it to move"
     if not np.isfinite(column.Omega[j]):
-        return f"{output} by {name}: found a response that grows beyond all bounds, expected a flight that does not diverge"
+        return (
+            f"{output} by {name}: found a response that grows beyond all bounds, expected a "
+            "flight that does not diverge"
+        )
     if share < MIN_SHARE:
         return f"{output} by {name}: {_too_little_share(output, name, share)}"
     ratio = abs(column.Omega[j]) / column.deviation[j]
     if ratio >= MIN_RATIO:
         return ""
-    inaccurate = f"found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected {100.0 / MIN_RATIO:.0f} % or less"
+    inaccurate = (
+        f"found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected "
+        f"{100.0 / MIN_RATIO:.0f} % or less"
+    )
     return f"{output} by {name}: {inaccurate}: {_more_excitation(name, ratio)}"
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances."""
+    """The share is P / (P + Q) with P the power of the excitation and Q the power of the
+    disturbances.
+    """
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
     excited = (
-        f"found {100.0 * max(share, 0.0):.0f} % of the motion of {output} and {name} by the excitation, the rest by feedback"
+        f"found {100.0 * max(share, 0.0):.0f} % of the motion of {output} and {name} by "
+        "the excitation, the rest by feedback"
     )
     remedy = f"command {output} {factor:.1f} times as strongly"
     return f"{excited} of disturbances, expected {100.0 * MIN_SHARE:.0f} % or more: {remedy}"
@@ -405,24 +496,32 @@ def _more_excitation(name: str, ratio: float) -> str:
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"
 
 
-def second_order(t: FloatArray, delay: float, lag: float, damping: float, stiffness: float) -> tuple[FloatArray, FloatArray]:
-    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t - delay) - v.
+def second_order(
+    t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
+) -> tuple[FloatArray, FloatArray]:
+    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t
+    - delay) - v.
 
     Shapes (N,).
     """
     begin = np.maximum(t - delay, 0.0)
-    A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])  # z, z', v; y = z' or z
+    A = np.array(
+        [[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]]
+    )  # z, z', v; y = z' or z
     values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
     small = np.abs(product) < 1e-6
-    grown = np.where(small, begin, np.expm1(product) / np.where(values == 0.0, 1.0, values)[:, None])
+    grown = np.where(
+        small, begin, np.expm1(product) / np.where(values == 0.0, 1.0, values)[:, None]
+    )
     z = (vectors @ (parts[:, None] * grown)).real
     return z[1], z[0]
 
 
 def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
-    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs with this delay and lag.
+    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs with
+    this delay and lag.
 
     Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
     """
@@ -432,10 +531,14 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
     best = _search(t, whiten, step[:, j] / size, size, ORDERS[0], None)
     for free in ORDERS[1:]:
         tried = _search(t, whiten, step[:, j] / size, size, free, best.theta)
-        if best.chi_squared - tried.chi_squared > MIN_GAIN * (sum(free) - sum(best.free)) and begins_with_Omega(t, tried.theta):
+        if best.chi_squared - tried.chi_squared > MIN_GAIN * (
+            sum(free) - sum(best.free)
+        ) and begins_with_Omega(t, tried.theta):
             best = tried
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
-    misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)  # R. T. Birge, Phys. Rev. 40, 1932
+    misfit = max(
+        best.chi_squared / max(len(t) - sum(best.free), 1), 1.0
+    )  # R. T. Birge, Phys. Rev. 40, 1932
     deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
     J = best.jacobian[:, inside]
     deviation[inside] = np.sqrt(misfit * np.diag(np.linalg.pinv(J.T @ J)))
@@ -459,7 +562,8 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Whether a fitted response has the sign of Omega up to EARLY after delay and lag.
 
-    Otherwise the slow part is the whole response, two poles are in the place of a pole and a lag, and Omega is about 0.
+    Otherwise the slow part is the whole response, two poles are in the place of a pole and a lag,
+    and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order(t[t <= delay + lag + EARLY], delay, lag, damping, stiffness)
@@ -467,18 +571,25 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Chi squared of no response against the fitted response, up to EARLY after delay and lag, less the parameters."""
+    """Chi squared of no response against the fitted response, up to EARLY after delay and lag, less
+    the parameters.
+    """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
     fitted = size * (theta[2] * first + theta[5] * second)
     whiten = _whitener(responses[:, early])
     none = whiten @ responses[0, early]
     misfit = whiten @ (responses[0, early] - fitted)
-    return max(float(none @ none - misfit @ misfit) - len(theta), 0.0) if begins_with_Omega(t, theta) else 0.0
+    return (
+        max(float(none @ none - misfit @ misfit) - len(theta), 0.0)
+        if begins_with_Omega(t, theta)
+        else 0.0
+    )
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
-    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the largest value.
+    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the
+    largest value.
 
     0 for the responses of a constant output.
     """
@@ -498,7 +609,12 @@ class _Curve(NamedTuple):
 
 
 def _search(
-    t: FloatArray, whiten: FloatArray, step: FloatArray, size: float, free: tuple[int, ...], start: FloatArray | None
+    t: FloatArray,
+    whiten: FloatArray,
+    step: FloatArray,
+    size: float,
+    free: tuple[int, ...],
+    start: FloatArray | None,
 ) -> _Curve:
     """Least squares over the free entries, from several delays and lags and from `start`."""
     fitted = np.array(free, dtype=bool)
@@ -511,7 +627,9 @@ def _search(
     def residuals(theta: FloatArray) -> FloatArray:
         delay, lag, Omega, damping, stiffness, slow = expanded(theta)
         first, second = second_order(t, delay, lag, damping, stiffness)
-        return np.concatenate([size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]])
+        return np.concatenate(
+            [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
+        )
 
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
@@ -523,7 +641,13 @@ def _search(
     bounds = LOWER[fitted], UPPER[fitted]
     best: Any = min(
         (
-            least_squares(residuals, np.clip(start[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted], ftol=TOLERANCE)
+            least_squares(
+                residuals,
+                np.clip(start[fitted], *bounds),
+                bounds=bounds,
+                x_scale=SCALE[fitted],
+                ftol=TOLERANCE,
+            )
             for start in starts
         ),
         key=lambda fit: float(fit.cost),

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sign check: D of the controller against the signs of a channel map, an airframe and a recorded flight."""
+"""Sign check: D of the controller against the signs of a channel map, an airframe and a recorded
+flight.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +18,11 @@ from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
-from flight_design.identification.response_identification import MIN_RATIO, Response, identify_response
+from flight_design.identification.response_identification import (
+    MIN_RATIO,
+    Response,
+    identify_response,
+)
 from flight_log.tape_reader import read_run
 from rise_di_controller.decomposition import signs
 
@@ -32,7 +38,9 @@ class Channel(NamedTuple):
     D: int  # of the airframe and the map
     D_controller: int
     measured: float | None  # Omega_ii of a recorded flight, NaN where the input never moves
-    ratio: float | None  # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
+    ratio: (
+        float | None
+    )  # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
 
 
 class SignCheck(NamedTuple):
@@ -40,21 +48,32 @@ class SignCheck(NamedTuple):
 
     channels: tuple[Channel, ...]
     contradictions: tuple[str, ...]  # sentences
-    uncertain: tuple[str, ...]  # sentences on the channels whose sign the recorded flight does not show
+    uncertain: tuple[
+        str, ...
+    ]  # sentences on the channels whose sign the recorded flight does not show
     seconds: float  # of the recorded flight that were used
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
-    """Raise ParameterError if a map contradicts the D of a scenario's controller, for the scenario's airframe."""
-    contradictions = check_scenario(channel_map, scenario, load_airframe(scenario.aircraft.airframe), None).contradictions
+    """Raise ParameterError if a map contradicts the D of a scenario's controller, for the
+    scenario's airframe.
+    """
+    contradictions = check_scenario(
+        channel_map, scenario, load_airframe(scenario.aircraft.airframe), None
+    ).contradictions
     if contradictions:
         raise ParameterError("; ".join(contradictions))
 
 
 def check_scenario(
-    channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None, namespace: str | None = None
+    channel_map: ChannelMap,
+    scenario: Scenario,
+    frame: Airframe,
+    bag: Path | None,
+    namespace: str | None = None,
 ) -> SignCheck:
-    """Check a channel map against a scenario's controller, for an airframe and optionally a recorded flight.
+    """Check a channel map against a scenario's controller, for an airframe and optionally a
+    recorded flight.
 
     `namespace` selects the aircraft of a log with several.
     """
@@ -69,12 +88,23 @@ def check_scenario(
     ):
         require_channels(key, names, expected, "the channels of the controller")
     Omega = frame.matrix_c() @ frame.matrix_b()
-    in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
+    in_map = Omega[
+        np.ix_(
+            _places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs)
+        )
+    ]
     if controller.allocation is not None:
-        require(bag is None, "bag", f"{bag} beside an allocation", "none: a flight does not show the effectors one by one")
+        require(
+            bag is None,
+            "bag",
+            f"{bag} beside an allocation",
+            "none: a flight does not show the effectors one by one",
+        )
         effect = np.reshape(controller.allocation.effect, (len(outputs), -1))
         return check_effectors(channel_map, in_map, outputs, inputs, effect)
-    measured = None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
+    measured = (
+        None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
+    )
     return check(channel_map, in_map, outputs, inputs, controller.D, measured)
 
 
@@ -85,11 +115,13 @@ def recorded_response(
     namespace: str | None = None,
     channel_map: ChannelMap | None = None,
 ) -> Response:
-    """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the engagements of a bridge.
+    """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the
+    engagements of a bridge.
 
-    y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
-    Raises ParameterError for a log without y and u, for a bridge without engagement, for a flight under guidance, whose
-    y_m follows y, and for a log whose import had other rows than `channel_map`.
+    y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u
+    itself is the excitation. Raises ParameterError for a log without y and u, for a bridge without
+    engagement, for a flight under guidance, whose y_m follows y, and for a log whose import had
+    other rows than `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
@@ -98,18 +130,38 @@ def recorded_response(
         require_map_of_import(channel_map, recorded)
     flown = recorded.engagements
     if flown is None:
-        require("bridge/would_send" not in tape, str(bag), "no engagement of its bridge", "a flight with an engaged bridge")
+        require(
+            "bridge/would_send" not in tape,
+            str(bag),
+            "no engagement of its bridge",
+            "a flight with an engaged bridge",
+        )
         spans = None
     else:
-        require(bool(flown), str(bag), "a bridge that was never engaged", "a flight with an engaged bridge")
-        spans = [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
-    open_loop = recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP
+        require(
+            bool(flown),
+            str(bag),
+            "a bridge that was never engaged",
+            "a flight with an engaged bridge",
+        )
+        spans = [
+            (engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1]))
+            for engagement in flown
+        ]
+    open_loop = (
+        recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP
+    )
     if not open_loop:
         require(
-            "guidance" not in tape, str(bag), "a flight under guidance, whose y_m follows y", "an experiment, or one without"
+            "guidance" not in tape,
+            str(bag),
+            "a flight under guidance, whose y_m follows y",
+            "an experiment, or one without",
         )
     excitation: Signal | None = tape["y_m"] if "y_m" in tape and not open_loop else None
-    return identify_response(tape["y"], tape["u"], outputs, inputs, excitation=excitation, engaged=spans)
+    return identify_response(
+        tape["y"], tape["u"], outputs, inputs, excitation=excitation, engaged=spans
+    )
 
 
 def check(
@@ -120,12 +172,15 @@ def check(
     D: tuple[int, ...],
     measured: Response | None = None,
 ) -> SignCheck:
-    """D of diag(output signs) Omega diag(input signs) against the controller's, and against a recorded flight.
+    """D of diag(output signs) Omega diag(input signs) against the controller's, and against a
+    recorded flight.
 
-    Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the controller's. Raises
-    ParameterError if the map does not fit the airframe, or if Omega has no D.
+    Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the
+    controller's. Raises ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
-    mapped = through(channel_map, Omega)[np.ix_(_places(outputs, channel_map.outputs), _places(inputs, channel_map.inputs))]
+    mapped = through(channel_map, Omega)[
+        np.ix_(_places(outputs, channel_map.outputs), _places(inputs, channel_map.inputs))
+    ]
     D_mapped = [int(sign) for sign in signs(mapped)]
     sentences = [
         f"outputs.{name} of the map {channel_map.name} has the wrong sign:"
@@ -138,43 +193,67 @@ def check(
     for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         effect = None if measured is None else float(measured.Omega[i, i])
         ratio = None if measured is None else float(measured.sign_ratio[i])
-        channels.append(Channel(output, name, float(mapped[i, i]), D_mapped[i], D[i], effect, ratio))
+        channels.append(
+            Channel(output, name, float(mapped[i, i]), D_mapped[i], D[i], effect, ratio)
+        )
         if D_mapped[i] != D[i]:
             sentences.append(
-                f"with the map {channel_map.name} D of {output} and {name} is {D_mapped[i]:+d}, the controller has {D[i]:+d}:"
+                f"with the map {channel_map.name} D of {output} and {name} is {D_mapped[i]:+d}, "
+                f"the controller has {D[i]:+d}:"
                 f" a positive {name} means {motion_as_channel_grows(channel_map.inputs[name])}"
             )
         if measured is None or effect is None or ratio is None:
             continue
         if ratio < MIN_RATIO:
-            uncertain.append(f"the recorded flight does not show the sign of {name}: {measured.sign_refusal(i)}")
+            uncertain.append(
+                f"the recorded flight does not show the sign of {name}: {measured.sign_refusal(i)}"
+            )
         elif effect * mapped[i, i] < 0.0:
             sentences.append(
-                f"the recorded flight has {output}_dot {'rise' if effect > 0.0 else 'fall'} with {name}"
-                f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has the opposite sign"
+                f"the recorded flight has {output}_dot {'rise' if effect > 0.0 else 'fall'} "
+                f"with {name}"
+                f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has "
+                "the opposite sign"
             )
-    return SignCheck(tuple(channels), tuple(sentences), tuple(uncertain), 0.0 if measured is None else measured.seconds)
+    return SignCheck(
+        tuple(channels),
+        tuple(sentences),
+        tuple(uncertain),
+        0.0 if measured is None else measured.seconds,
+    )
 
 
 def check_effectors(
-    channel_map: ChannelMap, Omega: FloatArray, outputs: tuple[str, ...], effectors: tuple[str, ...], effect: FloatArray
+    channel_map: ChannelMap,
+    Omega: FloatArray,
+    outputs: tuple[str, ...],
+    effectors: tuple[str, ...],
+    effect: FloatArray,
 ) -> SignCheck:
-    """The sign of each effector against `effect` of an allocation, (m, p), in the output that the effector moves most.
+    """The sign of each effector against `effect` of an allocation, (m, p), in the output that the
+    effector moves most.
 
-    `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is the sign of its effect.
+    `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is
+    the sign of its effect.
     """
-    mapped = through(channel_map, Omega)[np.ix_(_places(outputs, channel_map.outputs), _places(effectors, channel_map.inputs))]
+    mapped = through(channel_map, Omega)[
+        np.ix_(_places(outputs, channel_map.outputs), _places(effectors, channel_map.inputs))
+    ]
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
     channels = []
     sentences = []
     for j, (name, i) in enumerate(zip(effectors, largest, strict=True)):
         actual = int(np.sign(mapped[i, j]))
         expected = int(np.sign(effect[i, j]))
-        channels.append(Channel(outputs[i], name, float(mapped[i, j]), actual, expected, None, None))
+        channels.append(
+            Channel(outputs[i], name, float(mapped[i, j]), actual, expected, None, None)
+        )
         if actual != expected:
             sentences.append(
-                f"with the map {channel_map.name} {name} has {mapped[i, j]:+.3g} on {outputs[i]}_dot, allocation.effect has"
-                f" {effect[i, j]:+.3g}: a positive {name} means {motion_as_channel_grows(channel_map.inputs[name])}"
+                f"with the map {channel_map.name} {name} has {mapped[i, j]:+.3g} on "
+                f"{outputs[i]}_dot, allocation.effect has"
+                f" {effect[i, j]:+.3g}: a positive {name} means "
+                f"{motion_as_channel_grows(channel_map.inputs[name])}"
             )
     return SignCheck(tuple(channels), tuple(sentences), (), 0.0)
 
@@ -184,17 +263,29 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """+1 for an output with the sign of the stack (q nose up, p roll right, r nose right, V faster, climb up), otherwise -1.
+    """+1 for an output with the sign of the stack (q nose up, p roll right, r nose right, V faster,
+    climb up), otherwise -1.
 
-    Shape (m,) in the map's order. The motion of a row says what a channel of another name is. Raises ParameterError where the
-    motion of q, p, r or V is that of another channel, and for two channels of one motion.
+    Shape (m,) in the map's order. The motion of a row says what a channel of another name is.
+    Raises ParameterError where the motion of q, p, r or V is that of another channel, and for two
+    channels of one motion.
     """
     signs: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
         moved, sign = row.motion
         key = f"map {channel_map.name}: outputs.{name}.positive"
-        require(name not in UNITS or moved == name, key, f"{row.positive!r}", f"a motion to which {name} responds")
-        require(moved not in signs, key, f"{row.positive!r}, the motion of another output too", "a motion of its own")
+        require(
+            name not in UNITS or moved == name,
+            key,
+            f"{row.positive!r}",
+            f"a motion to which {name} responds",
+        )
+        require(
+            moved not in signs,
+            key,
+            f"{row.positive!r}, the motion of another output too",
+            "a motion of its own",
+        )
         signs[moved] = sign
     return np.array(list(signs.values()), dtype=np.float64)
 
@@ -202,8 +293,8 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """+1 for an input with an effect of the sign of Omega = C B, otherwise -1; shape (m,).
 
-    Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError for an input without effect on the
-    output.
+    Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError for an input
+    without effect on the output.
     """
     signs = []
     for j, (name, row) in enumerate(channel_map.inputs.items()):
@@ -220,7 +311,9 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
-    """Omega between the channels of the map: diag(output signs) Omega diag(input signs), shape (m, m)."""
+    """Omega between the channels of the map: diag(output signs) Omega diag(input signs), shape (m,
+    m).
+    """
     return output_signs(channel_map)[:, None] * Omega * input_signs(channel_map, Omega)
 
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sketch of an aircraft without an airframe file: a rough model from Omega and the trim speed, for a learner."""
+"""The sketch of an aircraft without an airframe file: a rough model from Omega and the trim speed,
+for a learner.
+"""
 
 from collections.abc import Sequence
 
@@ -29,27 +31,38 @@ STATES = {
 PARTS = (("q",), ("V",), ("p", "r"))  # outputs that couple through B
 
 ROUGH = Unknown(effect=0.1, drift=0.5)
-"""Standard deviation of an entry of B, from step tests, 1, and noise of the disturbances, sizes/s per root s, beside a sketch.
-The sketch leaves out slipstream and the change of the trim with dynamic pressure: 0.03 to 0.1 rad/s^2 rms over some seconds on
-the c172p of JSBSim in moderate turbulence."""
+"""Standard deviation of an entry of B, from step tests, 1, and noise of the disturbances, sizes/s
+per root s, beside a sketch. The sketch leaves out slipstream and the change of the trim with
+dynamic pressure: 0.03 to 0.1 rad/s^2 rms over some seconds on the c172p of JSBSim in moderate
+turbulence."""
 
 
-def sketch(name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str], speed: float) -> Airframe:
-    """A rough airframe with the zeros of a rigid symmetric aircraft, from Omega = C B and the trim speed V0, m/s.
+def sketch(
+    name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str], speed: float
+) -> Airframe:
+    """A rough airframe with the zeros of a rigid symmetric aircraft, from Omega = C B and the trim
+    speed V0, m/s.
 
         V_dot     = -0.26 n V + Omega_V u                          n = g / V0
         alpha_dot = -11 n alpha + q                                lift slope over lift coefficient
         q_dot     = -2.6 |Omega_q| alpha - 20 n q + Omega_q u
-        beta_dot  = -0.17 beta + 0.05 p - r + n sin(phi)           1/s, and the angle of attack in trim
-        p_dot     = -2.3 |Omega_p| beta - P p + 0.37 P r + Omega_p u,       P = 1.4 sqrt(11 n |Omega_p|)
-        r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,          R = 0.95 sqrt(11 n |Omega_r|)
+        beta_dot  = -0.17 beta + 0.05 p - r + n sin(phi)  1/s, and the angle of attack in trim
+        p_dot     = -2.3 |Omega_p| beta - P p + 0.37 P r + Omega_p u,  P = 1.4 sqrt(11 n |Omega_p|)
+        r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
-    V stands apart: an airspeed holds the wind itself, beside which y hardly shows what alpha and theta do to V. The factors are
-    geometric means over the twelve aircraft of `benchmarks.jsbsim_fleet`, from differences of their accelerations in trim;
-    the entries of one aircraft differ from them by a factor of 1.3 to 3. Arguments: Omega (m, m), rows `outputs`, columns
-    `inputs`; input i drives output i. Raises ParameterError for outputs other than q, V, p, r.
+    V stands apart: an airspeed holds the wind itself, beside which y hardly shows what alpha and
+    theta do to V. The factors are geometric means over the twelve aircraft of
+    `benchmarks.jsbsim_fleet`, from differences of their accelerations in trim; the entries of one
+    aircraft differ from them by a factor of 1.3 to 3. Arguments: Omega (m, m), rows `outputs`,
+    columns `inputs`; input i drives output i. Raises ParameterError for outputs other than q, V, p,
+    r.
     """
-    require(sorted(outputs) == ["V", "p", "q", "r"], f"airframe {name}", f"the outputs {', '.join(outputs)}", "q, V, p, r")
+    require(
+        sorted(outputs) == ["V", "p", "q", "r"],
+        f"airframe {name}",
+        f"the outputs {', '.join(outputs)}",
+        "q, V, p, r",
+    )
     n = GRAVITY / speed
     size = dict(zip(outputs, np.abs(np.diag(Omega)).tolist(), strict=True))
     lift = 11.0 * n
@@ -77,26 +90,46 @@ def sketch(name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequenc
         columns = [outputs.index(output) for output in part]
         for i in columns:
             B[places.index(outputs[i]), columns] = Omega[i, columns]
-    return _airframe(name, "Omega and trim speed", speed, A, B, gravity, tuple(STATES), outputs, inputs)
+    return _airframe(
+        name, "Omega and trim speed", speed, A, B, gravity, tuple(STATES), outputs, inputs
+    )
 
 
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
     """The airframe with the matrices of a controller's feedforward; `speed` the trim speed V0, m/s.
 
-    Wind acts by the columns of A of V, alpha and beta. Raises ParameterError for a controller without feedforward, and
-    for states other than those of a sketch.
+    Wind acts by the columns of A of V, alpha and beta. Raises ParameterError for a controller
+    without feedforward, and for states other than those of a sketch.
     """
     model = controller.feedforward
-    require(model is not None, "controller.feedforward", "none", "the rough model of an aircraft without an airframe file")
+    require(
+        model is not None,
+        "controller.feedforward",
+        "none",
+        "the rough model of an aircraft without an airframe file",
+    )
     assert model is not None  # noqa: S101 - for the type checker
     unknown = [state for state in model.states if state not in STATES]
-    require(not unknown, "controller.feedforward.states", ", ".join(unknown), f"some of {', '.join(STATES)}")
+    require(
+        not unknown,
+        "controller.feedforward.states",
+        ", ".join(unknown),
+        f"some of {', '.join(STATES)}",
+    )
     n = len(model.states)
     A = np.reshape(model.A, (n, n))
     B = np.reshape(model.B, (n, -1))
     gravity = np.zeros((n, n)) if model.gravity is None else np.reshape(model.gravity, (n, n))
     return _airframe(
-        name, "the feedforward of a controller", speed, A, B, gravity, model.states, controller.outputs, controller.inputs
+        name,
+        "the feedforward of a controller",
+        speed,
+        A,
+        B,
+        gravity,
+        model.states,
+        controller.outputs,
+        controller.inputs,
     )
 
 
@@ -117,18 +150,24 @@ def _airframe(
         if state in states:
             column = A[:, list(states).index(state)] * (speed if state == "V" else 1.0)
             effect = zip(states, (-column).tolist(), strict=True)
-            gusts[axis] = {row: value for row, value in effect if value != 0.0 and row not in KINEMATIC}
+            gusts[axis] = {
+                row: value for row, value in effect if value != 0.0 and row not in KINEMATIC
+            }
     values = {
         "name": name,
         "source": source,
         "speed": speed,
         "states": {state: STATES[state] for state in states},
-        "inputs": {input_name: {"unit": "1", "positive": INPUTS[input_name].positive} for input_name in inputs},
+        "inputs": {
+            input_name: {"unit": "1", "positive": INPUTS[input_name].positive}
+            for input_name in inputs
+        },
         "outputs": list(outputs),
         "A": A.tolist(),
         "B": B.tolist(),
         "gravity": [
-            {"into": states[i], "angle": states[j], "gain": float(gravity[i, j])} for i, j in np.argwhere(gravity != 0.0)
+            {"into": states[i], "angle": states[j], "gain": float(gravity[i, j])}
+            for i, j in np.argwhere(gravity != 0.0)
         ],
         "gusts": gusts,
         "identities": False,

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of an unknown aircraft: step tests, signs, lags and gains, written as a scenario.
 
-`identify` only needs to fly the aircraft. Every input is stepped; the steepest tangent of the paired output gives the column of
-Omega and the lag of that input. The gains are those of the engineering procedure of `rise-di gains`, with the slew of the
-inputs measured in flight. No number in this module is specific to an aircraft.
+`identify` only needs to fly the aircraft. Every input is stepped; the steepest tangent of the
+paired output gives the column of Omega and the lag of that input. The gains are those of the
+engineering procedure of `rise-di gains`, with the slew of the inputs measured in flight. No number
+in this module is specific to an aircraft.
 """
 
 import math
@@ -18,7 +19,14 @@ import numpy as np
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, NamedProperties, Trim, WindModel
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    OUTPUTS,
+    FlightCondition,
+    NamedProperties,
+    Trim,
+    WindModel,
+)
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
@@ -50,32 +58,45 @@ from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 # The step tests
 
 SIZES = (0.05, 0.1, 0.2)
-"""Steps, in normalised commands: the small ones stay linear, the large ones exceed a hysteresis and reach a rate limit."""
+"""Steps, in normalised commands: the small ones stay linear, the large ones exceed a hysteresis and
+reach a rate limit."""
 
 MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
 WINDOWS = {"V": 10.0}  # s, length of a response: engines and propellers need seconds to spin up
 WINDOW = 0.5  # s, the same for body rates
 SPAN = 0.025  # s, length of a chord
-TANGENT_CUTOFF = 0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
+TANGENT_CUTOFF = (
+    0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
+)
 
 # Hz, Hz, s: of y, of the law, of the integration
 RATE = 200.0
 CONTROL_RATE = 100.0
 STEP = 0.005
-SAMPLES = 5  # uncertain aircraft around the identified one: only the largest response of them is used
-DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of transport
+SAMPLES = (
+    5  # uncertain aircraft around the identified one: only the largest response of them is used
+)
+# s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of
+# transport
+DELAY = 0.006
 
-NOISE_SHARE = 100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+NOISE_SHARE = (
+    100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+)
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
-"""rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first flight."""
+"""rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first
+flight."""
 
 Fly = Callable[[FloatArray, float], FloatArray]
-"""(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m), deviations from trim."""
+"""(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m),
+deviations from trim."""
 
 
 class Tangent(NamedTuple):
-    """The steepest chord of a step response, an estimate of the steepest tangent: y = slope (t - lag)."""
+    """The steepest chord of a step response, an estimate of the steepest tangent: y = slope (t -
+    lag).
+    """
 
     slope: float
     lag: float  # s
@@ -84,7 +105,9 @@ class Tangent(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """Result of the step tests, outputs and inputs in their canonical order, output i driven by input i."""
+    """Result of the step tests, outputs and inputs in their canonical order, output i driven by
+    input i.
+    """
 
     Omega: FloatArray  # (m, m) effective C B: slopes of y per unit of u
     lag: FloatArray  # (m,) s, of each input's own output
@@ -94,11 +117,13 @@ class Responses(NamedTuple):
 
 
 def steepest_tangent(y: FloatArray, dt: float) -> Tangent | None:
-    """The steepest tangent of a unit step response, y of shape (N,) every dt; None if y is constant.
+    """The steepest tangent of a unit step response, y of shape (N,) every dt; None if y is
+    constant.
 
-    A chord joins samples 25 ms apart. The result is the chord at the first maximum of the slope: the search ends when the slope
-    has fallen to 0.7 of it. For y_dot = slope (1 - exp(-t / lag)) it gives slope and lag, up to exp(-t / lag) at the end.
-    Source: the process reaction curve of J. G. Ziegler, N. B. Nichols, Trans. ASME 64, 1942.
+    A chord joins samples 25 ms apart. The result is the chord at the first maximum of the slope:
+    the search ends when the slope has fallen to 0.7 of it. For y_dot = slope (1 - exp(-t / lag)) it
+    gives slope and lag, up to exp(-t / lag) at the end. Source: the process reaction curve of J. G.
+    Ziegler, N. B. Nichols, Trans. ASME 64, 1942.
     """
     count = max(round(SPAN / dt), 1)
     slopes = (y[count:] - y[:-count]) / (count * dt)
@@ -120,12 +145,14 @@ def step_responses(
     dt: float,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Responses:
-    """Step each input in both directions, by several sizes, and take Omega and the lags from the tangents of its output.
+    """Step each input in both directions, by several sizes, and take Omega and the lags from the
+    tangents of its output.
 
-    The response is the odd part, (y(+s) - y(-s)) / 2s: a drift of the trim and all even parts cancel. The steepest response of
-    all sizes gives the column, Omega_ij = y_i / (t - lag) at the middle of the chord of j, and the longest lag is used: too
-    large an Omega or lag costs little performance, too small a one costs stability. Raises FlightEnded if an output does not
-    respond to any step.
+    The response is the odd part, (y(+s) - y(-s)) / 2s: a drift of the trim and all even parts
+    cancel. The steepest response of all sizes gives the column, Omega_ij = y_i / (t - lag) at the
+    middle of the chord of j, and the longest lag is used: too large an Omega or lag costs little
+    performance, too small a one costs stability. Raises FlightEnded if an output does not respond
+    to any step.
 
     Arguments: `lower`, `upper` the end stops of u from trim, (m,); `dt` that of `fly`.
     """
@@ -138,10 +165,14 @@ def step_responses(
     for j, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         progress(f"steps of {name}")
         responses: list[tuple[Tangent, float, FloatArray]] = []
-        for step in sorted({min(size, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for size in SIZES}):
+        for step in sorted(
+            {min(size, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for size in SIZES}
+        ):
             u = step * np.eye(m)[j]
             try:
-                y = (fly(u, WINDOWS.get(output, WINDOW)) - fly(-u, WINDOWS.get(output, WINDOW))) / (2.0 * step)
+                y = (fly(u, WINDOWS.get(output, WINDOW)) - fly(-u, WINDOWS.get(output, WINDOW))) / (
+                    2.0 * step
+                )
             except FlightEnded as error:
                 rejected.append(f"{name} by {step:.3g}: {error}")
                 continue
@@ -150,7 +181,9 @@ def step_responses(
                 rejected.append(f"{name} by {step:.3g}: {output} does not move")
                 continue
             middle = (chord.first + chord.last) / 2.0 * dt
-            responses.append((chord, step, (y[chord.first] + y[chord.last]) / 2.0 / (middle - chord.lag)))
+            responses.append(
+                (chord, step, (y[chord.first] + y[chord.last]) / 2.0 / (middle - chord.lag))
+            )
         if not responses:
             raise FlightEnded(f"{output} does not respond to {name}: {'; '.join(rejected)}")
         steepest, size[j], Omega[:, j] = max(responses, key=lambda response: abs(response[0].slope))
@@ -164,11 +197,20 @@ def step_responses(
 PULSE_Q = 0.05  # rad/s
 PULSE_P = 0.15  # rad/s
 PULSE_V = 2.0  # m/s: heights of the pulses
-HEIGHTS = {"q": PULSE_Q, "V": PULSE_V, "p": PULSE_P, "r": PULSE_Q}  # also the units of the outputs in the coupling
+HEIGHTS = {
+    "q": PULSE_Q,
+    "V": PULSE_V,
+    "p": PULSE_P,
+    "r": PULSE_Q,
+}  # also the units of the outputs in the coupling
 NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
 DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
-AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
-FASTEST_V = 0.46  # rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no lag alone
+AUTHORITY_FRACTION = (
+    1.0 / 3.0
+)  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
+# rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no
+# lag alone
+FASTEST_V = 0.46
 DURATION = 60.0  # s
 # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_SPEED = 5.0
@@ -183,14 +225,20 @@ LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8
 
 
 def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
-    """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of the throttle (m/s^2).
+    """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of
+    the throttle (m/s^2).
 
-        q   0.05 rad/s, or 1 g / speed if that is less, up and down for 1 s each: each pair restores the flight path
-        V   2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority, omega up to 1.2 rad/s
+        q
+            0.05 rad/s, or 1 g / speed if that is less, up and down for 1 s each: each pair restores
+            the flight path
+        V
+            2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority,
+            omega up to 1.2 rad/s
         p   0.15 rad/s right and left for 1 s each: banks of 9 degrees
         r   the coordinated turn g/V0 sin(bank)
 
-    The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not commanded: the nose drops in them.
+    The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not
+    commanded: the nose drops in them.
     """
     q = min(PULSE_Q, GRAVITY / speed)
     p = PULSE_P
@@ -199,21 +247,33 @@ def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
         "rate": RATE,
         "outputs": list(OUTPUTS),
         "second_order": {
-            "natural_frequency": [slow if name == "V" else NATURAL_FREQUENCY[name] for name in OUTPUTS],
+            "natural_frequency": [
+                slow if name == "V" else NATURAL_FREQUENCY[name] for name in OUTPUTS
+            ],
             "damping": [DAMPING[name] for name in OUTPUTS],
         },
         "rise": 0.1,
         "pulses": {
-            "q": {"start": [2.0, 4.0, 40.0, 42.0], "stop": [3.0, 5.0, 41.0, 43.0], "value": [q, -q, -q, q]},
+            "q": {
+                "start": [2.0, 4.0, 40.0, 42.0],
+                "stop": [3.0, 5.0, 41.0, 43.0],
+                "value": [q, -q, -q, q],
+            },
             "V": {"start": [10.0], "stop": [30.0], "value": [PULSE_V]},
-            "p": {"start": [12.0, 14.0, 18.0, 20.0], "stop": [13.0, 15.0, 19.0, 21.0], "value": [p, -p, -p, p]},
+            "p": {
+                "start": [12.0, 14.0, 18.0, 20.0],
+                "stop": [13.0, 15.0, 19.0, 21.0],
+                "value": [p, -p, -p, p],
+            },
         },
         "coordinated_turn": {"bank_rate": "p", "turn_rate": "r", "speed": speed},
     }
 
 
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
-    """Parameters of moderate turbulence at an altitude, m; at high altitude the intensity is 10 ft/s."""
+    """Parameters of moderate turbulence at an altitude, m; at high altitude the intensity is 10
+    ft/s.
+    """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
         values["wind"] = MODERATE_WIND
@@ -235,12 +295,19 @@ class ManoeuvreResult(NamedTuple):
     outcome: str
     rms: dict[str, float]  # of the error by output, SI
     largest: dict[str, float]  # abs(u) by input
-    at_stop: dict[str, float]  # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
+    at_stop: dict[
+        str, float
+    ]  # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
 
     @property
     def text(self) -> str:
         """The outcome, and the inputs that were at their limits."""
-        return ", ".join([self.outcome, *(f"{name} at its stop {share:.0%}" for name, share in self.at_stop.items())])
+        return ", ".join(
+            [
+                self.outcome,
+                *(f"{name} at its stop {share:.0%}" for name, share in self.at_stop.items()),
+            ]
+        )
 
 
 class IdentifiedAircraft(NamedTuple):
@@ -252,7 +319,9 @@ class IdentifiedAircraft(NamedTuple):
     coupling: float  # max abs(U - I), inputs of unit response, outputs in units of the manoeuvre
     selection: Selection
     text: str  # of the scenario file
-    sideslip_zero: float  # 1/s, of sideslip with p and r held; Assumption 3 does not hold if it is positive
+    sideslip_zero: (
+        float  # 1/s, of sideslip with p and r held; Assumption 3 does not hold if it is positive
+    )
     flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
 
     @property
@@ -267,12 +336,20 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def failure(self) -> str:
-        """Reason of a failure, or "": every flight completes, and in calm air each error is below its command."""
+        """Reason of a failure, or "": every flight completes, and in calm air each error is below
+        its command.
+        """
         for title, flight in self.flights.items():
             if flight.outcome != COMPLETED:
                 return f"{title}: {flight.outcome}"
-        too_large = [name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]]
-        return f"calm: the error of {', '.join(too_large)} is larger than the command" if too_large else ""
+        too_large = [
+            name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]
+        ]
+        return (
+            f"calm: the error of {', '.join(too_large)} is larger than the command"
+            if too_large
+            else ""
+        )
 
 
 def identify(
@@ -287,21 +364,26 @@ def identify(
     needed: Requirement = REQUIREMENT,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> IdentifiedAircraft:
-    """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
+    """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s,
+    altitude in m.
 
-    1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs in units of the manoeuvre,
-    and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
-    f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control
-    and gives beta; that of V is K bandwidth / 4 times the rms of light turbulence. With `observer_margin`, the delay margin in
-    s of the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. The margins of that loop
-    meet `needed`, with 35 degrees of phase beside an observer. 6. Simulations of the result:
-    in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by
-    90 degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft
-    whose `sideslip_zero` is positive, too. With `learns` the scenario learns in moderate turbulence: the gains
-    begin alone, `observer_margin` is the margin of the designs, and the rough model is the `sketch` of Omega and speed.
+    1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs
+       in units of the manoeuvre,
+    and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the
+    lags; all other terms count as f. 5. A simulation in moderate turbulence with K and Lambda
+    alone: the slew of its u replaces that of the ideal control and gives beta; that of V is K
+    bandwidth / 4 times the rms of light turbulence. With `observer_margin`, the delay margin in s
+    of the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them.
+    The margins of that loop meet `needed`, with 35 degrees of phase beside an observer. 6.
+    Simulations of the result: in calm air, with a gust, in turbulence. With `guided` the scenario
+    has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its
+    stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft whose
+    `sideslip_zero` is positive, too. With `learns` the scenario learns in moderate turbulence: the
+    gains begin alone, `observer_margin` is the margin of the designs, and the rough model is the
+    `sketch` of Omega and speed.
 
-    Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
-    paired, or if the speed is below guidance's speed floor.
+    Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
+    outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
     """
     condition = FlightCondition(name, speed, altitude, nanoseconds(STEP), named)
     progress("trim")
@@ -320,7 +402,9 @@ def identify(
     inputs = tuple(INPUTS)
     measured = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
     throttle = inputs.index("throttle")
-    authority = abs(measured.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
+    authority = abs(measured.Omega[throttle, throttle]) * min(
+        -trim.lower[throttle], trim.upper[throttle]
+    )
     commands = reference_parameters(speed, float(authority))
     scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
@@ -333,11 +417,14 @@ def identify(
 
     progress("slew of the inputs")
     first = gain_selection.select_gains(studied, setting)
-    turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
+    turbulent = _load(scenario_text(first)).vary(
+        aircraft={"turbulence": moderate_turbulence(altitude)}
+    )
     tape = simulate(without_beta(turbulent))
     slew = _slew(tape, measured.lag)
-    # V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no faster than the Lambda of
-    # the rule would, bandwidth / 4; the phase margin may ask for less Lambda
+    # V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no
+    # faster than the Lambda of the rule would, bandwidth / 4; the phase margin may ask for less
+    # Lambda
     sign = V_bandwidth**2 / 4.0 * LIGHT_SIGMA  # m/s^3
     slew[throttle] = sign / (gain_selection.BETA_TO_SLEW * abs(measured.Omega[throttle, throttle]))
     chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
@@ -347,13 +434,17 @@ def identify(
     flights = fly_all(_load(text), progress)
     if observer_margin is not None and learns:
         text = scenario_text(that_learns(chosen, condition, measured.Omega, observer_margin))
-    return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
+    return IdentifiedAircraft(
+        condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights
+    )
 
 
 def slowest_trim(condition: FlightCondition) -> float:
-    """The slowest airspeed at which an aircraft trims in level flight at an altitude, within 1 % of the condition's, m/s.
+    """The slowest airspeed at which an aircraft trims in level flight at an altitude, within 1 % of
+    the condition's, m/s.
 
-    Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection, from 0.2 of the condition's.
+    Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection,
+    from 0.2 of the condition's.
     """
     slow = 0.2 * condition.speed
     fast = condition.speed
@@ -368,19 +459,27 @@ def slowest_trim(condition: FlightCondition) -> float:
 
 
 def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
-    """The selection with an extended-state observer in its engineering gains; Omega in the aircraft's order."""
+    """The selection with an extended-state observer in its engineering gains; Omega in the
+    aircraft's order.
+    """
     controller = selection.chosen
     rows = [list(OUTPUTS).index(name) for name in controller.outputs]
     columns = [list(INPUTS).index(name) for name in controller.inputs]
     size = sizes(OUTPUTS[name] for name in controller.outputs)
     needed = selection.setting.requirement
     needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
-    observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed)
+    observed = with_extended_state_observer(
+        controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed
+    )
     return replace(selection, chosen=observed.controller)
 
 
-def that_learns(selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float) -> Selection:
-    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`; Omega in the aircraft's order."""
+def that_learns(
+    selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
+) -> Selection:
+    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`; Omega in
+    the aircraft's order.
+    """
     start = selection.chosen
     rows = [list(OUTPUTS).index(name) for name in start.outputs]
     columns = [list(INPUTS).index(name) for name in start.inputs]
@@ -388,19 +487,31 @@ def that_learns(selection: Selection, condition: FlightCondition, Omega: FloatAr
     rough = sketch(name, Omega[np.ix_(rows, columns)], start.outputs, start.inputs, condition.speed)
     noise = np.array([NOISE[output] for output in start.outputs])
     axes = tuple(rough.gusts)
-    gains = gains_beside_sketch(model_for(rough, start, noise), start.outputs, axes, condition.speed)
-    designed = with_aircraft_observer(start, rough, [gains], noise, margin, uncertain=False).controller
+    gains = gains_beside_sketch(
+        model_for(rough, start, noise), start.outputs, axes, condition.speed
+    )
+    designed = with_aircraft_observer(
+        start, rough, [gains], noise, margin, uncertain=False
+    ).controller
     assert designed.observer is not None  # noqa: S101 - it was designed
     observer = designed.observer.model_copy(update={"part": 0.0})
     sections = {"feedforward": designed.feedforward, "observer": observer, "learn": LearnConfig()}
     return replace(selection, chosen=start.model_copy(update=sections))
 
 
-def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:
-    """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate "turbulence" without the gust."""
+def fly_all(
+    scenario: Scenario, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, ManoeuvreResult]:
+    """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate
+    "turbulence" without the gust.
+    """
     turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}
-    for title, changes in (("calm", {"gusts": {}}), ("gust", {}), ("turbulence", {"gusts": {}, "turbulence": turbulence})):
+    for title, changes in (
+        ("calm", {"gusts": {}}),
+        ("gust", {}),
+        ("turbulence", {"gusts": {}, "turbulence": turbulence}),
+    ):
         progress(f"flight: {title}")
         flights[title] = manoeuvre_result(simulate(scenario.vary(aircraft=changes)))
     return flights
@@ -410,7 +521,9 @@ def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
     """Rms errors, the largest commands and the inputs at their limits of a tape."""
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
-    largest = {name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names}
+    largest = {
+        name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names
+    }
     shares = {name: kinds["magnitude"] for name, kinds in saturation_shares(tape).items()}
     at_stop = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
     return ManoeuvreResult(tape.outcome, rms, largest, at_stop)
@@ -434,24 +547,33 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
             "source": "step tests in JSBSim",
             "speed": condition.speed,
             "states": dict(OUTPUTS),
-            "inputs": {name: {"unit": "1", "positive": effect.positive} for name, effect in INPUTS.items()},
+            "inputs": {
+                name: {"unit": "1", "positive": effect.positive} for name, effect in INPUTS.items()
+            },
             "outputs": list(OUTPUTS),
             "A": np.zeros_like(Omega).tolist(),
             "B": Omega.tolist(),
         },
         f"airframe {condition.title}",
     )
-    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, DURATION)
+    manoeuvre = Manoeuvre(
+        ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, DURATION
+    )
     return ideal_control.study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
 def airspeed_bandwidth(authority: float, lag: float) -> float:
-    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s): min(0.46 / total, authority / sigma).
+    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s): min(0.46
+    / total, authority / sigma).
 
-    The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms, the throttle then moves
-    by its authority rms; with more it goes from stop to stop, and V is off by twice the wind (737).
+    The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms,
+    the throttle then moves by its authority rms; with more it goes from stop to stop, and V is off
+    by twice the wind (737).
     """
-    return min(FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)), authority / MODERATE_SIGMA)
+    return min(
+        FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),
+        authority / MODERATE_SIGMA,
+    )
 
 
 def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
@@ -460,20 +582,48 @@ def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
     ones = [1.0] * len(inputs)
     base = RiseDiConfig.validate_mapping(
         dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
-        | {"rate": CONTROL_RATE, "outputs": list(OUTPUTS), "inputs": inputs, "k_g": 1.0, "k_d": ones[1:]}
-        | {"D": [1] * len(inputs), "sign": "auto", "lag": lag.tolist(), "delay": DELAY, "softening": gain_selection.SOFTENING}
-        | {"max_age": 0.1, "hold": 0.5, "ramp": 2.0, "lower": trim.lower.tolist(), "upper": trim.upper.tolist()},
+        | {
+            "rate": CONTROL_RATE,
+            "outputs": list(OUTPUTS),
+            "inputs": inputs,
+            "k_g": 1.0,
+            "k_d": ones[1:],
+        }
+        | {
+            "D": [1] * len(inputs),
+            "sign": "auto",
+            "lag": lag.tolist(),
+            "delay": DELAY,
+            "softening": gain_selection.SOFTENING,
+        }
+        | {
+            "max_age": 0.1,
+            "hold": 0.5,
+            "ramp": 2.0,
+            "lower": trim.lower.tolist(),
+            "upper": trim.upper.tolist(),
+        },
         "controller",
     )
     total = total_lag(lag, DELAY, 1.0 / CONTROL_RATE)
-    products = {**gain_selection.CROSSOVER_LAG_PRODUCTS, "V": V_bandwidth * float(total[inputs.index("throttle")])}
+    products = {
+        **gain_selection.CROSSOVER_LAG_PRODUCTS,
+        "V": V_bandwidth * float(total[inputs.index("throttle")]),
+    }
     return LoopSetting(
-        base, CONTROL_RATE, dict(zip(inputs, lag.tolist(), strict=True)), DELAY, {}, crossover_lag_products=products
+        base,
+        CONTROL_RATE,
+        dict(zip(inputs, lag.tolist(), strict=True)),
+        DELAY,
+        {},
+        crossover_lag_products=products,
     )
 
 
 def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
-    """Largest mean slew of each input over the lag of its loop, shape (m,), 1/s: no loop follows a faster one."""
+    """Largest mean slew of each input over the lag of its loop, shape (m,), 1/s: no loop follows a
+    faster one.
+    """
     period = 1.0 / CONTROL_RATE
     slew = np.zeros(len(INPUTS))
     for j, (name, total) in enumerate(zip(INPUTS, total_lag(lag, DELAY, period), strict=True)):
@@ -562,7 +712,7 @@ SCENARIO_YAML = gain_yaml.yaml_template("""\
 /**/recorder:
   ros__parameters:
     rate: 100.0                # Hz, polling of the subscriptions
-""")
+""")  # noqa: E501 - a text as it is written
 
 
 def _text(
@@ -576,7 +726,10 @@ def _text(
     """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
     return SCENARIO_YAML.render(
         condition=condition,
-        named={name: " ".join(f"{path}={at_one!r}" for path, at_one in paths) for name, paths in condition.named},
+        named={
+            name: " ".join(f"{path}={at_one!r}" for path, at_one in paths)
+            for name, paths in condition.named
+        },
         trim=trim,
         inputs=list(INPUTS),
         outputs=list(OUTPUTS),

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether inputs have lost effect since the model was identified: a likelihood ratio over the last seconds of a flight."""
+"""Whether inputs have lost effect since the model was identified: a likelihood ratio over the last
+seconds of a flight.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,22 +13,40 @@ from numpy.typing import NDArray
 from aircraft_sim.airframe import Airframe
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
-from flight_design.identification.innovation_filters import Actuation, Block, Recording, blocks, filter_model
+from flight_design.identification.innovation_filters import (
+    Actuation,
+    Block,
+    Recording,
+    blocks,
+    filter_model,
+)
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.likelihood_search import CLOSE, PROGRESS, STARTS, STEPS, Search
 from flight_design.identification.model_quality import MAX_DEVIATION
 
 RECORD = 10.0  # s, of the flight that is tested
-LOSS = 2.0 * MAX_DEVIATION  # 1, of the effect of an input: up to two deviations of an accepted model are no change
+LOSS = (
+    2.0 * MAX_DEVIATION
+)  # 1, of the effect of an input: up to two deviations of an accepted model are no change
 MAX_GAIN = 8.0  # of log-likelihood: four standard deviations, see `change_test`
-ANGLE = 0.3  # rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
-FLOW = 0.03  # rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
-TURBULENT = STARTS[2]  # level of the wind with which a search begins: moderate turbulence, whose strength is free
-FACTOR = 1.0  # 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as probable
+# rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
+ANGLE = 0.3
+# rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
+FLOW = 0.03
+TURBULENT = STARTS[
+    2
+]  # level of the wind with which a search begins: moderate turbulence, whose strength is free
+# 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as
+# probable
+FACTOR = 1.0
 DEAD = -1.0  # 1
 MOST = 2.0  # bounds of a change of effect
 NONE = MAX_DEVIATION  # 1, of an effect: what is known no better is none
-DEAD_WITHIN = MAX_GAIN / 2.0  # of log-likelihood: so close to the best loss an input without effect explains the flight as well
+DEAD_WITHIN = (
+    MAX_GAIN / 2.0
+    # of log-likelihood: so close to the best loss an input without effect explains the flight as
+    # well
+)
 
 
 class Change(NamedTuple):
@@ -34,7 +54,9 @@ class Change(NamedTuple):
 
     outputs: tuple[str, ...]
     gain: float  # of log-likelihood by a loss of effect beyond LOSS
-    left: Mapping[str, float]  # 1, the most probable effect of each input in parts of that of the model
+    left: Mapping[
+        str, float
+    ]  # 1, the most probable effect of each input in parts of that of the model
     dead: str  # the input without any effect; empty where there is none
 
     @property
@@ -44,37 +66,49 @@ class Change(NamedTuple):
 
 
 def change_test(
-    recorded: Recording, flown: Airframe, actuation: Actuation, delays: Mapping[tuple[str, ...], float] | None = None
+    recorded: Recording,
+    flown: Airframe,
+    actuation: Actuation,
+    delays: Mapping[tuple[str, ...], float] | None = None,
 ) -> tuple[Change, ...]:
-    """The gains G of log-likelihood of the parts of the aircraft by a loss of effect, and inputs without effect.
+    """The gains G of log-likelihood of the parts of the aircraft by a loss of effect, and inputs
+    without effect.
 
         B[:, j] = (1 + kappa_j) B_flown[:, j]
         J(kappa) = N/2 sum_i log mean e_i^2 + 1/2 sum log det S + |kappa / FACTOR|^2 / 2
         G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -1)
 
-    with e the normalised innovations and S their covariance, as in `Search.fit`. A fault of an effector changes a column by
-    a factor, so a part has as many unknowns as inputs. A is known. Winds, and angles at the begin, are free in the two J,
-    which have the same winds. G is 0 while the losses are within LOSS. For a loss z standard deviations beyond, 2 G = z^2,
-    by S. S. Wilks (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 8 with a probability of 3e-5,
-    and a lesser loss more seldom.
+    with e the normalised innovations and S their covariance, as in `Search.fit`. A fault of an
+    effector changes a column by a factor, so a part has as many unknowns as inputs. A is known.
+    Winds, and angles at the begin, are free in the two J, which have the same winds. G is 0 while
+    the losses are within LOSS. For a loss z standard deviations beyond, 2 G = z^2, by S. S. Wilks
+    (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 8 with a probability
+    of 3e-5, and a lesser loss more seldom.
 
-    The input j is dead if kappa_j <= NONE - 1 has a J lower than the first J by more than MAX_GAIN, and at most DEAD_WITHIN
-    above the second. Arguments: `delays` of u by the outputs of a part, s, by default the delay of `actuation`.
+    The input j is dead if kappa_j <= NONE - 1 has a J lower than the first J by more than MAX_GAIN,
+    and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a part, s,
+    by default the delay of `actuation`.
     """
     changes = []
     for block in blocks(filter_model(flown, actuation, recorded)):
         outputs = tuple(flown.outputs[i] for i in block.outputs)
-        effects = Effects(recorded, flown, actuation, block, (delays or {}).get(outputs, actuation.delay))
+        effects = Effects(
+            recorded, flown, actuation, block, (delays or {}).get(outputs, actuation.delay)
+        )
         inputs = effects.names.inputs
         gain = 0.0
         dead = ""
         lost = effects.most_probable()
         if lost.theta[: len(inputs)].min() < -LOSS:
             # what another wind explains is no change
-            kept = least_of(effects.most_probable(-LOSS), effects.least(lost.theta, -LOSS, levels=lost.levels))
+            kept = least_of(
+                effects.most_probable(-LOSS), effects.least(lost.theta, -LOSS, levels=lost.levels)
+            )
             lost = least_of(lost, effects.least(lost.theta, levels=kept.levels))
             gain = kept.J - lost.J
-            without = [effects.least(lost.theta, dead=j, levels=lost.levels).J for j in range(len(inputs))]
+            without = [
+                effects.least(lost.theta, dead=j, levels=lost.levels).J for j in range(len(inputs))
+            ]
             if min(without) < min(kept.J - MAX_GAIN, lost.J + DEAD_WITHIN):
                 dead = inputs[int(np.argmin(without))]
         left = dict(zip(inputs, (1.0 + lost.theta).tolist(), strict=False))
@@ -86,14 +120,17 @@ class Least(NamedTuple):
     """The least J of a hypothesis."""
 
     J: float
-    theta: FloatArray  # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the begin
+    # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the begin
+    theta: FloatArray
     levels: NDArray[np.int64]  # (spans,) of the wind
 
 
 class Effects(Search):
     """The search for a factor of every column of B of a part."""
 
-    def __init__(self, recorded: Recording, flown: Airframe, actuation: Actuation, block: Block, delay: float) -> None:
+    def __init__(
+        self, recorded: Recording, flown: Airframe, actuation: Actuation, block: Block, delay: float
+    ) -> None:
         """`delay` of u, s."""
         model = filter_model(flown, actuation, recorded)
         super().__init__(recorded, model, block, flown, delay, Unknown(angle=ANGLE), factor=1)
@@ -104,25 +141,34 @@ class Effects(Search):
         self.count = len(block.inputs)
         self.prior, self._lower, self._upper = (
             np.concatenate([np.full(self.count, of_inputs), values[entries:]])
-            for of_inputs, values in ((FACTOR, self.prior), (DEAD, self._lower), (MOST, self._upper))
+            for of_inputs, values in (
+                (FACTOR, self.prior),
+                (DEAD, self._lower),
+                (MOST, self._upper),
+            )
         )
         self._errors = np.arange(len(self.prior)) < self.count
         self._winds, self._begin = (
-            slice(part.start - entries + self.count, part.stop - entries + self.count) for part in (self._winds, self._begin)
+            slice(part.start - entries + self.count, part.stop - entries + self.count)
+            for part in (self._winds, self._begin)
         )
         turned = np.any(self._model.gravity[:, self._angles], axis=0)
         self.prior[self._begin] = np.where(turned, 1.0, FLOW / ANGLE)
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The flown model with other effects of its inputs, thetas (N, p)."""
-        A, wind = (np.repeat(matrix, len(thetas), axis=0) for matrix in (self._flown.A, self._flown.wind))
-        return self._flown._replace(A=A, B=self._flown.B * (1.0 + thetas[:, None, : self.count]), wind=wind)
+        A, wind = (
+            np.repeat(matrix, len(thetas), axis=0) for matrix in (self._flown.A, self._flown.wind)
+        )
+        return self._flown._replace(
+            A=A, B=self._flown.B * (1.0 + thetas[:, None, : self.count]), wind=wind
+        )
 
     def most_probable(self, lower: float = DEAD) -> Least:
         """The least J of kappa >= `lower`.
 
-        A loss looks like gusts to the flown model. So the search begins with the winds of this model, with the same wind
-        in every span, and with a dead input if CLOSE.
+        A loss looks like gusts to the flown model. So the search begins with the winds of this
+        model, with the same wind in every span, and with a dead input if CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))
@@ -139,12 +185,16 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """The least J, from theta, (p,), or 0 on, in winds by theta or of `levels`: kappa >= `lower`, or with an input dead."""
+        """The least J, from theta, (p,), or 0 on, in winds by theta or of `levels`: kappa >=
+        `lower`, or with an input dead.
+        """
         self._lower[: self.count] = lower
         self._upper[: self.count] = MOST
         if dead is not None:
             self._upper[dead] = DEAD + NONE
-        theta = np.clip(np.zeros(len(self.prior)) if theta is None else theta, self._lower, self._upper)
+        theta = np.clip(
+            np.zeros(len(self.prior)) if theta is None else theta, self._lower, self._upper
+        )
         used = self.known()
         free = np.ones(len(theta), dtype=bool)
         for _ in range(STEPS):

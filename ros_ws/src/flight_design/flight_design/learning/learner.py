@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: A and B from the last seconds of a flight, checked, and the observer and feedforward of that model.
+"""Learning in the air: A and B from the last seconds of a flight, checked, and the observer and
+feedforward of that model.
 
-The identification is that of a log (`model_identification.identify`), about a rough airframe. A model that fails a check is
-refused with a sentence. The controller refuses parameters that fail its own checks at load.
+The identification is that of a log (`model_identification.identify`), about a rough airframe. A
+model that fails a check is refused with a sentence. The controller refuses parameters that fail its
+own checks at load.
 """
 
 from collections import deque
@@ -23,23 +25,43 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_design.identification.likelihood import HELD_OUT, KNOWN, MAX_DELAY_ERROR, PRIOR, Unknown
-from flight_design.identification.model_identification import Identification, Part, identify, with_entries
-from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, another_airframe, best_known
+from flight_design.identification.model_identification import (
+    Identification,
+    Part,
+    identify,
+    with_entries,
+)
+from flight_design.identification.model_quality import (
+    MAX_DEVIATION,
+    MAX_WHITENESS,
+    another_airframe,
+    best_known,
+)
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from rise_di_controller import divergence
 from rise_di_controller.proposals import outputs_without, with_channels_of, without_models
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
-DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
-DELAY_LEFT = 0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
+# entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
+AT_BOUND = 1
+DELAY_DEVIATION = (
+    0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
+)
+DELAY_LEFT = (
+    0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
+)
 FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
-SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
+SHORTEST = (
+    20.0 * TRANSIENT
+)  # s, of a record: two held-out seconds of the six that `identify` needs at least
 
-SPREAD = 0.02  # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4 %
+# 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4
+# %
+SPREAD = 0.02
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
-"""A controller with the feedforward and the observer of a model, and its delay margin. Raises ParameterError."""
+"""A controller with the feedforward and the observer of a model, and its delay margin. Raises
+ParameterError."""
 
 
 class Known(NamedTuple):
@@ -69,20 +91,32 @@ class Sample(NamedTuple):
 class Learner:
     """The record of y and u over a window, and proposals from it.
 
-    The parts of the aircraft that do not couple are learned one by one: one without a model flies the law of the start.
+    The parts of the aircraft that do not couple are learned one by one: one without a model flies
+    the law of the start.
     """
 
     def __init__(
-        self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0, rough: Unknown = KNOWN
+        self,
+        controller: RiseDiConfig,
+        airframe: Airframe,
+        design: Design,
+        delay: float = 0.0,
+        rough: Unknown = KNOWN,
     ) -> None:
-        """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling and lags.
+        """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling
+        and lags.
 
-        `rough` has the deviation of B in the rough model, and the noise of the disturbances. With more noise than DRIFT the
-        aircraft is not tested for a change: the disturbances stand for a change, and for a dead input.
-        Raises ParameterError for a controller that does not learn.
+        `rough` has the deviation of B in the rough model, and the noise of the disturbances. With
+        more noise than DRIFT the aircraft is not tested for a change: the disturbances stand for a
+        change, and for a dead input. Raises ParameterError for a controller that does not learn.
         """
         settings = controller.learn
-        require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
+        require(
+            settings is not None,
+            "controller.learn",
+            "no such section",
+            "one: a window and times of identifications",
+        )
         assert settings is not None  # noqa: S101 - for the type checker
         self._controller = controller
         self._rough = airframe
@@ -101,7 +135,8 @@ class Learner:
         self._prior = airframe
         self._model = airframe
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
-        # Parts that fly the law of the start for good: their inputs without effect, "" for outputs of `learn.without`
+        # Parts that fly the law of the start for good: their inputs without effect, "" for outputs
+        # of `learn.without`
         self._dead: dict[tuple[str, ...], str] = {}
         self._start = controller  # with the `learn.without` of what flies
         self._has_ended = False
@@ -114,11 +149,15 @@ class Learner:
 
     @property
     def model(self) -> Airframe | None:
-        """The rough airframe with the models of the parts that are known; None where there is none."""
+        """The rough airframe with the models of the parts that are known; None where there is
+        none.
+        """
         return self._model if self._known else None
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Record y and u, after its limits, of a tick, (m,), in the law's order, and the digest of its parameters."""
+        """Record y and u, after its limits, of a tick, (m,), in the law's order, and the digest of
+        its parameters.
+        """
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         if not self._record or stamp_ns > self._record[-1][0]:
             self._record.append(Sample(stamp_ns, y, u, flown))
@@ -126,7 +165,9 @@ class Learner:
             self._record.popleft()
 
     def recording(self, after_ns: int = -1) -> Recording:
-        """The record after an instant in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""
+        """The record after an instant in equal periods, in the airframe's order; y of a lost tick
+        is NaN, u is held.
+        """
         record = [sample for sample in self._record if sample.stamp_ns > after_ns]
         stamp_ns = np.array([sample.stamp_ns for sample in record])
         place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
@@ -137,21 +178,28 @@ class Learner:
         padded_y = np.full((len(t), y.shape[1]), np.nan)
         padded_y[place] = y
         held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
-        y = np.stack([padded_y[:, self._controller.outputs.index(name)] for name in self._rough.outputs], axis=1)
-        u = np.stack([held[:, self._controller.inputs.index(name)] for name in self._rough.inputs], axis=1)
+        y = np.stack(
+            [padded_y[:, self._controller.outputs.index(name)] for name in self._rough.outputs],
+            axis=1,
+        )
+        u = np.stack(
+            [held[:, self._controller.inputs.index(name)] for name in self._rough.inputs], axis=1
+        )
         return Recording(self._period, t, y, u)
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
-        """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
+        """Parameters with the observer and the feedforward of what was identified, or the sentence
+        of a refusal.
 
-        The last RECORD seconds are tested for a loss of effect of inputs. After a loss the older record is left out, and the
-        flown model is the prior. A part with an input without effect flies the law of the start, without this input.
-        Before the first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken
-        itself.
+        The last RECORD seconds are tested for a loss of effect of inputs. After a loss the older
+        record is left out, and the flown model is the prior. A part with an input without effect
+        flies the law of the start, without this input. Before the first model of a part, a rough
+        airframe that explains the flight as it is, with white innovations, is taken itself.
 
-        Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
-        controller fell back. Outputs that the controller gave up, `given_up`, are not proposed again. Where no part is left,
-        nothing is identified, and the sentence says so once.
+        Where the last proposal does not fly, by the digest `flown`, an identification is due: the
+        proposal was refused, or the controller fell back. Outputs that the controller gave up,
+        `given_up`, are not proposed again. Where no part is left, nothing is identified, and the
+        sentence says so once.
         """
         try:
             return self._proposal(flown, given_up)
@@ -161,7 +209,9 @@ class Learner:
     def _proposal(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """The proposal of `propose`. Raises ParameterError where there is none."""
         end_ns = self._record[-1].stamp_ns if self._record else 0
-        length = seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0  # lost ticks included
+        length = (
+            seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0
+        )  # lost ticks included
         if length < SHORTEST - self._period:
             return LearnerResult(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         self._note_given_up(flown, given_up)
@@ -169,7 +219,10 @@ class Learner:
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
             return LearnerResult(
-                None, "" if ended else "each part flies the law of the start from now on: no part is left to learn"
+                None,
+                ""
+                if ended
+                else "each part flies the law of the start from now on: no part is left to learn",
             )
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
@@ -178,7 +231,9 @@ class Learner:
         if not (due or damaged or self._changed):
             return LearnerResult(None, unchanged(changes))
         if damaged:
-            self._record = deque(sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD))
+            self._record = deque(
+                sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD)
+            )
             self._prior = self._model
             self._changed |= {change.outputs for change in damaged}
         identified = self.identification = self._identified()
@@ -190,41 +245,71 @@ class Learner:
             if name
         ]
         sentences += [changed(change) for change in damaged if change.outputs not in dead]
-        known, model = {part: value for part, value in self._known.items() if part not in without_model}, self._model
+        known, model = (
+            {part: value for part, value in self._known.items() if part not in without_model},
+            self._model,
+        )
         refusals = []
         for part in identified.parts:
-            if any(is_within(part.outputs, outputs) or is_within(outputs, part.outputs) for outputs in without_model):
+            if any(
+                is_within(part.outputs, outputs) or is_within(outputs, part.outputs)
+                for outputs in without_model
+            ):
                 continue
-            rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
-            learned = {outputs for outputs, estimate in known.items() if not estimate.is_rough} - self._changed
+            rough = (
+                part.outputs not in known
+                and part.before.whiteness.max() <= MAX_WHITENESS
+                and explains(part)
+            )
+            learned = {
+                outputs for outputs, estimate in known.items() if not estimate.is_rough
+            } - self._changed
             before = model if part.outputs in learned and not lost else None
             reason = "" if rough else part.refusal or not_white(part) or weaker(part, before)
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
                 continue
-            entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
+            entries = (
+                [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
+            )
             model = with_entries(model, entries)
-            deviation = {entry.name: abs(entry.deviation * entry.unit / entry.value) for entry in entries if entry.value}
+            deviation = {
+                entry.name: abs(entry.deviation * entry.unit / entry.value)
+                for entry in entries
+                if entry.value
+            }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
             known[part.outputs] = Known(end_ns, deviation, part.delay, rough, part.delay_deviation)
             sentences.append(
-                f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
+                f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
+                if rough
+                else sentence(part)
             )
-        if self._changed and any(another_airframe(part.entries, self._rough.name, AT_BOUND) for part in identified.parts):
+        if self._changed and any(
+            another_airframe(part.entries, self._rough.name, AT_BOUND) for part in identified.parts
+        ):
             # the model that flew may have been the wrong one, and not the aircraft have changed
             self._prior = self._model if self._prior is self._rough else self._rough
         if not sentences:
-            return LearnerResult(None, "; ".join(refusals) or "each part flies the law of the start from before on")
+            return LearnerResult(
+                None, "; ".join(refusals) or "each part flies the law of the start from before on"
+            )
         proposed = self._designed(model, known, without_model)
         new = [*without_model, *(part for part, value in known.items() if value.end_ns == end_ns)]
-        self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
+        self._changed = {
+            part for part in self._changed if not any(is_within(part, outputs) for outputs in new)
+        }
         self._known, self._model, self._dead = known, model, without_model
         self._last, self._proposed = proposed, proposed.digest()
         self._proposals.add(self._proposed)
-        return LearnerResult(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
+        return LearnerResult(
+            proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals])
+        )
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
-        """Give up the outputs that the controller gave up. The rest of what flies is the last proposal, or it was refused."""
+        """Give up the outputs that the controller gave up. The rest of what flies is the last
+        proposal, or it was refused.
+        """
         if set(outputs) <= set(outputs_without(self._start)):
             return
         self._give_up(outputs)
@@ -239,7 +324,9 @@ class Learner:
         if outputs:
             part = outputs_without(self._start)
             self._dead[part] = ""
-            self._known = {names: known for names, known in self._known.items() if not is_within(names, part)}
+            self._known = {
+                names: known for names, known in self._known.items() if not is_within(names, part)
+            }
 
     def _is_due(self, end_ns: int) -> bool:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""
@@ -253,23 +340,35 @@ class Learner:
         return due
 
     def _acts(self, name: str, identified: Identification) -> bool:
-        """Whether an identified model predicts the held-out samples better than one that is identified without an input.
+        """Whether an identified model predicts the held-out samples better than one that is
+        identified without an input.
 
-        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not. Better
-        is a gain of log-likelihood above the limit of the test: beside a dead rudder, with wider bounds, it was 1.1.
+        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A
+        free it does not. Better is a gain of log-likelihood above the limit of the test: beside a
+        dead rudder, with wider bounds, it was 1.1.
         """
-        gain = identified.after.log_likelihood - self._identified(dead_input=name).after.log_likelihood  # of a sample
+        gain = (
+            identified.after.log_likelihood - self._identified(dead_input=name).after.log_likelihood
+        )  # of a sample
         return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN
 
     def _identified(self, dead_input: str = "") -> Identification:
-        """A and B from the record, about the prior, without the effect of `dead_input`; also from the model that flies on.
+        """A and B from the record, about the prior, without the effect of `dead_input`; also from
+        the model that flies on.
 
-        Beside models at several speeds the record is of a steady speed, and so is the prior. The entries are reduced to the
-        trim speed. Raises ParameterError where the speed is not steady over SHORTEST.
+        Beside models at several speeds the record is of a steady speed, and so is the prior. The
+        entries are reduced to the trim speed. Raises ParameterError where the speed is not steady
+        over SHORTEST.
         """
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
-        identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
+        identified = partial(
+            identify,
+            actuation=self._actuation,
+            channels=channels,
+            at_bound=AT_BOUND,
+            unknown=unknown,
+        )
         prior = self._prior
         model = self.model
         if dead_input:
@@ -279,15 +378,26 @@ class Learner:
             return identified(self.recording(), prior, flown=model)
         steady, ratio = self._steady(self.recording())
         length = self._period * len(steady.t)
-        expected = f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
-        require(length > SHORTEST - self._period, "airspeed", f"it steady over the last {length:.3g} s", expected)
+        expected = (
+            f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
+        )
+        require(
+            length > SHORTEST - self._period,
+            "airspeed",
+            f"it steady over the last {length:.3g} s",
+            expected,
+        )
         flown = None if model is None else self._at_speed(model, ratio)
         reduced = identified(steady, self._at_speed(prior, ratio), flown=flown)
-        parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in reduced.parts)
+        parts = (
+            part._replace(entries=self._at_trim(part.entries, ratio)) for part in reduced.parts
+        )
         return reduced._replace(parts=tuple(parts))
 
     def _steady(self, recorded: Recording) -> tuple[Recording, float]:
-        """Beside models at several speeds: the steady end of a record, about the trim there, and the speed over V0."""
+        """Beside models at several speeds: the steady end of a record, about the trim there, and
+        the speed over V0.
+        """
         if not self._has_speeds:
             return recorded, 1.0
         steady, ratio = steady_end(recorded, self._rough)
@@ -304,7 +414,10 @@ class Learner:
         columns = {"A": states, "B": list(self._rough.inputs)}
         exponent = {"A": powers.A, "B": powers.B}
         factors = [
-            ratio ** exponent[entry.matrix][states.index(entry.row), columns[entry.matrix].index(entry.column)].item()
+            ratio
+            ** exponent[entry.matrix][
+                states.index(entry.row), columns[entry.matrix].index(entry.column)
+            ].item()
             for entry in entries
         ]
         return tuple(
@@ -313,13 +426,18 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not steady over the test.
+        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not
+        steady over the test.
 
-        Nor is there one where the law fell back in these seconds, or an output oscillated: a loop near instability moves y as
-        no model with a stable loop says, and healthy inputs look weak.
+        Nor is there one where the law fell back in these seconds, or an output oscillated: a loop
+        near instability moves y as no model with a stable loop says, and healthy inputs look weak.
         """
         tested = {part: known for part, known in self._known.items() if part not in self._changed}
-        old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
+        old = {
+            part: known
+            for part, known in tested.items()
+            if end_ns - known.end_ns >= nanoseconds(RECORD)
+        }
         if not old or self._believed.drift > DRIFT:
             return []
         begin_ns = end_ns - nanoseconds(RECORD)
@@ -334,7 +452,9 @@ class Learner:
         return [change for change in changes if change.outputs in old]
 
     def _fell_back(self, after_ns: int) -> bool:
-        """Whether the law fell back after an instant: other parameters than a proposal replaced those that flew."""
+        """Whether the law fell back after an instant: other parameters than a proposal replaced
+        those that flew.
+        """
         flown = [sample.flown for sample in self._record if sample.stamp_ns > after_ns]
         return any(new != old and new not in self._proposals for old, new in pairwise(flown))
 
@@ -344,7 +464,10 @@ class Learner:
         return bool(divergence.oscillating(y, divergence.least(self._controller.outputs)).any())
 
     def _designed(
-        self, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+        self,
+        model: Airframe,
+        known: Mapping[tuple[str, ...], Known],
+        dead: Mapping[tuple[str, ...], str],
     ) -> RiseDiConfig:
         """The controller of a model, with the law of the start in the parts without one.
 
@@ -360,7 +483,11 @@ class Learner:
             raise
 
     def _designed_behind(
-        self, delay: float, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+        self,
+        delay: float,
+        model: Airframe,
+        known: Mapping[tuple[str, ...], Known],
+        dead: Mapping[tuple[str, ...], str],
     ) -> RiseDiConfig:
         """`_designed`, with the delay margin behind a delay, s. Raises ParameterError."""
         start = self._controller
@@ -369,9 +496,15 @@ class Learner:
         designed = start.model_copy(update={"learn": None})
         if learned:
             designed = self._design(with_margin(designed, margin_behind(delay, start)), model)
-            designed = _with_deviations(designed, {k: v for part in known.values() for k, v in part.deviation.items()})
-        proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
-        return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal")
+            designed = _with_deviations(
+                designed, {k: v for part in known.values() for k, v in part.deviation.items()}
+            )
+        proposed = with_channels_of(
+            start, designed, bare, [name in dead.values() for name in start.inputs]
+        )
+        return RiseDiConfig.validate_mapping(
+            proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
+        )
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -383,7 +516,9 @@ def margin_of(controller: RiseDiConfig) -> float:
 def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
     """A controller that loads with another delay margin, s."""
     assert controller.observer is not None  # noqa: S101 - a controller that learns has one
-    return controller.model_copy(update={"observer": controller.observer.model_copy(update={"margin": margin})})
+    return controller.model_copy(
+        update={"observer": controller.observer.model_copy(update={"margin": margin})}
+    )
 
 
 def margin_behind(delay: float, start: RiseDiConfig) -> float:
@@ -392,31 +527,44 @@ def margin_behind(delay: float, start: RiseDiConfig) -> float:
     Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
     """
     reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
-    return max(margin_of(start), round(delay + reserve, 4))  # 0.1 ms, as few digits as the file of a scenario
+    return max(
+        margin_of(start), round(delay + reserve, 4)
+    )  # 0.1 ms, as few digits as the file of a scenario
 
 
 def unchanged(changes: Iterable[Change]) -> str:
     """The sentence of tests without a change."""
-    effects = ", ".join(f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items())
+    effects = ", ".join(
+        f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items()
+    )
     if not effects:
         return "no identification is due, and no part is tested for a change"
     return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"
 
 
 def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
-    """A controller whose model of the feedforward has the standard deviations of B, given by entry and relative to it."""
+    """A controller whose model of the feedforward has the standard deviations of B, given by entry
+    and relative to it.
+    """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one
     names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
-    values = tuple(abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True))
-    return designed.model_copy(update={"feedforward": model.model_copy(update={"deviation": values})})
+    values = tuple(
+        abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True)
+    )
+    return designed.model_copy(
+        update={"feedforward": model.model_copy(update={"deviation": values})}
+    )
 
 
 def without_effect(model: Airframe, name: str) -> Airframe:
     """A model with almost no effect of an input."""
     column = model.matrix_b()[:, list(model.inputs).index(name)].tolist()
     effects = zip(model.states, column, strict=True)
-    return with_entries(model, [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value])
+    return with_entries(
+        model,
+        [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value],
+    )
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
@@ -432,7 +580,9 @@ def changed(change: Change) -> str:
 
 
 def explains(part: Part) -> bool:
-    """Whether the nominal airframe predicts the held-out samples as well as the identified model."""
+    """Whether the nominal airframe predicts the held-out samples as well as the identified
+    model.
+    """
     return bool(part.after.log_likelihood <= part.before.log_likelihood)
 
 
@@ -443,52 +593,80 @@ def not_white(part: Part) -> str:
     if white <= MAX_WHITENESS:
         return ""
     name = part.outputs[worst]
-    return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
+    return (
+        f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
+        f"{MAX_WHITENESS:g}, 1 being white"
+    )
 
 
 def too_late(part: Part, delay: float) -> str:
-    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of the loop, s."""
+    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of
+    the loop, s.
+    """
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
     if part.delay < bound - 1e-6:  # s, of rounding
         return ""
     names = " and ".join(part.inputs)
-    return f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than {1e3 * bound:.0f} ms"
+    return (
+        f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than "
+        f"{1e3 * bound:.0f} ms"
+    )
 
 
 def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
-    """The refusal of a part alone where the flown model couples the part with another; empty where it does not."""
+    """The refusal of a part alone where the flown model couples the part with another; empty where
+    it does not.
+    """
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return ""
-    return f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that which flies"
+    return (
+        f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that "
+        "which flies"
+    )
 
 
 def weaker(part: Part, flown: Airframe | None) -> str:
-    """The effect that a record of gusts has weaker than the model that flies, if by more than MAX_DEVIATION.
+    """The effect that a record of gusts has weaker than the model that flies, if by more than
+    MAX_DEVIATION.
 
     Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
     """
     if flown is None or not part.gusts:
         return ""
     for entry in best_known(part.entries, part.outputs):
-        share = entry.value / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
+        share = (
+            entry.value
+            / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
+        )
         if share < 1.0 - MAX_DEVIATION:
-            expected = f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
-            return f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, {expected}"
+            expected = (
+                f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which "
+                "hide effects"
+            )
+            return (
+                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, "
+                f"{expected}"
+            )
     return ""
 
 
 def sentence(part: Part) -> str:
-    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with deviations."""
+    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with
+    deviations.
+    """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
-    text = ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
+    text = ", ".join(
+        f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known
+    )
     return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
 
 
 def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
     """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
 
-    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then vary twice as much.
+    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then
+    vary twice as much.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]
@@ -498,7 +676,9 @@ def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, floa
     square = np.cumsum(ratio**2) / count - mean**2
     length = int(np.flatnonzero(square <= (SPREAD * mean) ** 2)[-1]) + 1
     first = len(V) - length
-    return recorded._replace(t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]), float(mean[length - 1])
+    return recorded._replace(
+        t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]
+    ), float(mean[length - 1])
 
 
 def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:

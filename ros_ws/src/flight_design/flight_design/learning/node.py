@@ -37,11 +37,13 @@ NICE = 10  # of a search in real time, above the nodes of the loop: it takes a c
 
 
 class LearnerNode(FlightNode[LearnerConfig]):
-    """Takes y and u of each tick from `internals`, and publishes a proposal for each identification that is due.
+    """Takes y and u of each tick from `internals`, and publishes a proposal for each identification
+    that is due.
 
-    While a search runs, the samples wait in the queue of the subscription: the record of a search does not change, and in
-    lockstep the proposals are those of the loop in one process. In real time a search begins with the newest sample: of
-    identifications that became due meanwhile the last is made.
+    While a search runs, the samples wait in the queue of the subscription: the record of a search
+    does not change, and in lockstep the proposals are those of the loop in one process. In real
+    time a search begins with the newest sample: of identifications that became due meanwhile the
+    last is made.
     """
 
     def __init__(self) -> None:
@@ -50,7 +52,10 @@ class LearnerNode(FlightNode[LearnerConfig]):
         lockstep = self.parameters.lockstep
         make = learner(scenario, real_time=not lockstep)
         if make is None:
-            raise ParameterError("learner.scenario_file: found a scenario without controller.learn, expected one that learns")
+            raise ParameterError(
+                "learner.scenario_file: found a scenario without controller.learn, expected one "
+                "that learns"
+            )
         self._start = scenario.rise_di()
         assert self._start.learn is not None  # noqa: S101 - for the type checker
         self._settings, self._new_learner = self._start.learn, partial(make, self._start)
@@ -99,13 +104,17 @@ class LearnerNode(FlightNode[LearnerConfig]):
         return max_age_ns, max_age_ns + nanoseconds(self._start.hold + self._start.ramp)
 
     def _advance(self, now_ns: int) -> bool:
-        """Publish the proposal of a search that has ended, and take samples until the next search. Whether there was one."""
+        """Publish the proposal of a search that has ended, and take samples until the next search.
+        Whether there was one.
+        """
         advanced = False
         if self._search is not None and not self._search.is_alive():
             self._search = None
             proposal = as_received(self._proposal, self._start, self._end_ns, self._flown)
             values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
-            report = Report(self._end_ns, self.instance, proposal.sentence, values, warns=not proposal.change)
+            report = Report(
+                self._end_ns, self.instance, proposal.sentence, values, warns=not proposal.change
+            )
             self._publish(reports.encode(report, "proposal"))
             if (found := self._identifications.next(self._proposal)) is not None:
                 self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
@@ -124,7 +133,9 @@ class LearnerNode(FlightNode[LearnerConfig]):
         """Begin the search that is due, if any, on the record so far."""
         if self._is_due and self._search is None:
             self._is_due = False
-            self._search = threading.Thread(target=self._propose, daemon=True)  # it does not delay the end of the node
+            self._search = threading.Thread(
+                target=self._propose, daemon=True
+            )  # it does not delay the end of the node
             self._search.start()
 
     def _take(self, sample: StampedVector, now_ns: int) -> None:
@@ -139,7 +150,9 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._has_record = True
         self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         self._flown = int(flown)
-        self._given_up = tuple(name for name, is_left in zip(self._start.outputs, given_up, strict=True) if is_left)
+        self._given_up = tuple(
+            name for name, is_left in zip(self._start.outputs, given_up, strict=True) if is_left
+        )
         self._is_due = self._updates.due(self._end_ns) or self._is_due
 
     def _propose(self) -> None:
@@ -149,10 +162,14 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self._proposal = self._learner.propose(self._flown, self._given_up)
         except Exception as error:  # the flight goes on, and in lockstep waits for a proposal
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
-            self._proposal = LearnerResult(None, f"the identification failed: {' '.join(str(error).split())}")
+            self._proposal = LearnerResult(
+                None, f"the identification failed: {' '.join(str(error).split())}"
+            )
 
     def close(self) -> None:
-        """In lockstep complete the searches that are due: the log has their entries, as that of one process."""
+        """In lockstep complete the searches that are due: the log has their entries, as that of one
+        process.
+        """
         if self.parameters.lockstep:
             self._advance(0)
             while self._search is not None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the learner. What it identifies, and when, is the section `learn` of the controller in its scenario."""
+"""Parameters of the learner. What it identifies, and when, is the section `learn` of the controller
+in its scenario.
+"""
 
 from flight_core.fields import Field
 from flight_core.parameters import NodeConfig
@@ -9,4 +11,6 @@ from flight_core.parameters import NodeConfig
 class LearnerConfig(NodeConfig):
     """The learner's parameters."""
 
-    scenario_file: str = Field(description="path of the scenario that flies: its airframe file is the rough model")
+    scenario_file: str = Field(
+        description="path of the scenario that flies: its airframe file is the rough model"
+    )

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner of a scenario: its airframe file is the rough model, and its observers have the gains of `rise-di gains`."""
+"""The learner of a scenario: its airframe file is the rough model, and its observers have the gains
+of `rise-di gains`.
+"""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -26,11 +28,12 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
-    """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not learn.
+    """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not
+    learn.
 
-    The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim the rough model is the
-    controller's feedforward. In real time the loop has the delay of the controller's section; in one process and in lockstep u
-    acts at once. Raises ParameterError.
+    The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim
+    the rough model is the controller's feedforward. In real time the loop has the delay of the
+    controller's section; in one process and in lockstep u acts at once. Raises ParameterError.
     """
     controller = scenario.controller
     aircraft = scenario.aircraft
@@ -51,15 +54,24 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         slow, fast = (there.ratio for there in controller.schedule.models)
         speeds = (slow, fast)
         V0 = controller.schedule.speed
-        require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", f"{airframe.speed:g} m/s, that of the model")
+        require(
+            airframe.speed == V0,
+            "controller.schedule.speed",
+            f"{V0:g} m/s",
+            f"{airframe.speed:g} m/s, that of the model",
+        )
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
         assert start.observer is not None  # noqa: S101 - a controller that learns has one
         margin = start.observer.margin
         sketch = aircraft.is_jsbsim
-        return observed(start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds)[0]
+        return observed(
+            start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds
+        )[0]
 
-    return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
+    return lambda parameters: Learner(
+        parameters, airframe, design, parameters.delay if real_time else 0.0, rough
+    )
 
 
 def _prior(path: str, flown: Airframe) -> Airframe:
@@ -67,7 +79,12 @@ def _prior(path: str, flown: Airframe) -> Airframe:
     prior = load_airframe(path)
     for key in ("name", "states", "inputs", "outputs", "speed"):
         same = getattr(prior, key) == getattr(flown, key)
-        require(same, "controller.learn.prior", f"an airframe with another {key}", f"a model of {flown.name}")
+        require(
+            same,
+            "controller.learn.prior",
+            f"an airframe with another {key}",
+            f"a model of {flown.name}",
+        )
     return prior
 
 
@@ -88,10 +105,11 @@ class LearnResult(NamedTuple):
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
-    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError.
+    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises
+    ParameterError.
 
-    A deactivated law ends a record, as in flight. Where the log has other settings of the learner than the scenario, or none,
-    each proposal is taken as flown.
+    A deactivated law ends a record, as in flight. Where the log has other settings of the learner
+    than the scenario, or none, each proposal is taken as flown.
     """
     # simulated time begins at 0
     make = learner(scenario, real_time=tape.start_ns > 0)
@@ -126,14 +144,18 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         "a log that has the outputs that the controller gave up",
     )
     (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
-    for k, (stamp_ns, now_ns) in enumerate(zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)):
+    for k, (stamp_ns, now_ns) in enumerate(
+        zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)
+    ):
         if mode[k] == Mode.INACTIVE:
             continue
         if k and mode[k - 1] == Mode.INACTIVE:
             (learned, updates), proposed, begin_ns = begun(), start, now_ns
         longest_ns = max(longest_ns, now_ns - begin_ns)
         if mode[k] == Mode.ENGAGED:
-            learned.take(stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed)
+            learned.take(
+                stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed
+            )
         if updates.due(now_ns):
             left = tuple(name for name in given_up.names if is_of_log and given_up[name][k])
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed, left)
@@ -142,15 +164,25 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             if proposal.sentence:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
-    require(bool(steps), "the log", f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller", first)
+    require(
+        bool(steps),
+        "the log",
+        f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller",
+        first,
+    )
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """The model of a result as the text of an airframe file; the header has the steps. Raises ParameterError without one."""
+    """The model of a result as the text of an airframe file; the header has the steps. Raises
+    ParameterError without one.
+    """
     require(result.model is not None, "the learner", "no model", "one")
     assert result.model is not None  # noqa: S101 - for the type checker
     lines = [f"The airframe {result.model.name}, with A and B learned from {origin}.", ""]
-    lines += [f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}" for step in result.steps]
+    lines += [
+        f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}"
+        for step in result.steps
+    ]
     return comment(lines) + as_yaml(result.model)
