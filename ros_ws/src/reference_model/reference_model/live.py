@@ -22,6 +22,7 @@ class LiveParams(NamedTuple):
     max_age_ns: int  # an older u_m has timed out
     levelling_ns: int  # how long the ending levels the wings before all commands are zero
     bounds: FloatArray  # (m,) largest absolute values of u_m
+    reach: FloatArray  # (m,) largest changes of u_m from step to step
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
     channels: (
         tuple[int, int, int, int] | None

@@ -82,6 +82,9 @@ class LiveCommands(Config):
         default=0.35, description="the largest roll rate to level the wings, rad/s"
     )
     bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands")
+    slew: dict[str, Positive] = Field(
+        default={}, description="largest rates of the commands, 1/s of their units"
+    )
 
 
 class SecondOrder(Config):
@@ -145,6 +148,7 @@ class ReferenceModelConfig(NodeConfig):
                 "coordinated_turn.turn_rate": turn.turn_rate,
             }
         named |= {f"live.bounds.{name}": name for name in self.live.bounds}
+        named |= {f"live.slew.{name}": name for name in self.live.slew}
         for key, name in named.items():
             require(
                 name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}"
@@ -248,6 +252,7 @@ class ReferenceModelConfig(NodeConfig):
             nanoseconds(section.max_age),
             nanoseconds(section.levelling),
             np.array([section.bounds.get(name, np.inf) for name in self.outputs]),
+            np.array([section.slew.get(name, np.inf) for name in self.outputs]) / self.rate,
             section.speed,
             channels,
             gain,

@@ -31,6 +31,7 @@ class Reference:
         self._u_m = self._block(0)
         self._live_params = parameters.live_params()
         self._live: Live | None = None
+        self._applied = np.zeros_like(self._u_m[0])  # u_m at the end of the last step
 
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
@@ -41,6 +42,11 @@ class Reference:
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")
         self._live = live.take(t_ns, u_m, attitude, self._live_params)
+
+    @property
+    def x_m(self) -> FloatArray:
+        """State of the model at the last sample, shape (n,)."""
+        return self._x_m
 
     def source(self) -> str:
         """Where the commands come from at the last sample: "profile", "live commands", or "ending"
@@ -64,8 +70,10 @@ class Reference:
                 self._u_m = self._block(self._number)
             if self._live is None:
                 u_m = self._u_m[2 * index : 2 * index + 3].ravel()
+                self._applied = self._u_m[2 * index + 2]
             else:
-                u_m = np.tile(self._live_u_m(self._live), 3)
+                self._applied = self._live_u_m(self._live)
+                u_m = np.tile(self._applied, 3)
                 self._live = live.dead_reckon(
                     self._live, tracked, self.period_ns, self._live_params
                 )
@@ -86,7 +94,12 @@ class Reference:
 
     def _live_u_m(self, state: Live) -> FloatArray:
         y_m = model.output(self._x_m, self._model)
-        return live.commands(self._number * self.period_ns, state, y_m, self._live_params)
+        u_m = live.commands(self._number * self.period_ns, state, y_m, self._live_params)
+        reach = self._live_params.reach
+        applied: FloatArray = np.minimum(
+            np.maximum(u_m, self._applied - reach), self._applied + reach
+        )
+        return applied
 
     def _block(self, number: int) -> FloatArray:
         """Commands of the profile at the starts, middles and ends of BLOCK steps, ten times faster
