@@ -42,7 +42,8 @@ IMPORTS: dict[str, set[str]] = {
         "flight_guidance",
         "flight_log", "rise_di_controller",
     },
-    "c_export": {"flight_analysis.closed_loop", "flight_core", "flight_log", "rise_di_controller"},
+    "c_export": {"flight_analysis.closed_loop", "flight_core", "flight_log", "reference_model",
+    "rise_di_controller"},
     "flight_design.gains": {
         "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
         "reference_model", "rise_di_controller",

@@ -4,6 +4,7 @@
 sanitizers, refusals.
 """
 
+import ctypes
 import json
 import re
 import shutil
@@ -21,8 +22,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.conftest import REPOSITORY
 
-from c_export.constants import exportable
-from c_export.drawn import drawn_calls, drawn_steps
+from c_export.constants import TABLE, constants, exportable, packed
+from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import (
     RETUNE,
     Recorder,
@@ -64,6 +65,24 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 GCC = shutil.which("gcc")
+CROSS = shutil.which("aarch64-linux-gnu-gcc")
+QEMU = shutil.which("qemu-aarch64")
+FLAGS_OF_PX4 = (
+    "-Os",
+    "-freciprocal-math",
+    "-fno-signed-zeros",
+    "-fno-trapping-math",
+    "-fno-math-errno",
+)
+PX4_FLAGS = (
+    *FLAGS_OF_PX4,
+    *re.findall(
+        r"^\t\t(-f\S+)",
+        (SOURCE / "px4" / "CMakeLists.txt").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    ),
+)
+"""What PX4 compiles with, and then the module."""
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
@@ -95,18 +114,20 @@ def export_case(name: str, folder: Path) -> Case:
     where Python allocates.
     """
     slow = {"rate": 100.0, "step": 0.005}
+    limits = {"bounds": {"q": 0.4, "p": 0.5}, "slew": {"p": 1.0, "r": 0.5}}
+    model = {"rate": 100.0, "live": limits}
     scenario = SCENARIOS[name]().vary(
-        aircraft=slow, reference_model={"rate": 100.0}, flight={"duration": 8.0}
+        aircraft=slow, reference_model=model, flight={"duration": 8.0}
     )
     sets = parameter_sets(exportable(scenario.controller))
-    write_code(sets[0], name, folder, float32=False)
+    write_code(sets[0], name, folder, scenario.reference_model, float32=False)
     part = 10 if sets[0].allocation is None else 1
     steps = [drawn_steps(sets, k, 30 * part, k) for k in range(len(sets))]
+    drawn = [drawn_calls(sets, 150 * part, 3), any_numbers(sets), *steps]
     recordings = [
         *flight_recordings(scenario, sets),
-        drawn_calls(sets, 150 * part, 3),
-        any_numbers(sets),
-        *steps,
+        drawn_commands(scenario.reference_model, 900, 2),
+        *drawn,
     ]
     return Case(folder, sets, recordings)
 
@@ -150,10 +171,11 @@ def test_every_bit_is_equal(case: Case) -> None:
     assert proof.holds, report(proof, "the case")
     assert proof.figures["data_bytes"] == 0  # no global
     assert proof.figures["multiply"] > 0 or shutil.which("g++") is None
-    modes = np.concatenate([recording.integers[:, 2] for recording in case.recordings])
+    ticks = [recording for recording in case.recordings if recording.name != "drawn commands"]
+    modes = np.concatenate([recording.integers[:, 2] for recording in ticks])
     assert set(modes.tolist()) == set(map(int, Mode))
     u, u_free = (
-        np.concatenate([recording.reals[:, 4 * k : 4 * k + 4] for recording in case.recordings])
+        np.concatenate([recording.reals[:, 4 * k : 4 * k + 4] for recording in ticks])
         for k in range(2)
     )
     assert 0.05 < (u != u_free).mean() < 0.95  # limits act in many ticks and not in many
@@ -174,7 +196,12 @@ def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "flags",
-    [("-O0",), ("-O3", "-march=native"), ("-Os", "-Wconversion", "-Wdouble-promotion", "-Wundef")],
+    [
+        ("-O0",),
+        ("-O3", "-march=native"),
+        ("-Os", "-Wconversion", "-Wdouble-promotion", "-Wundef"),
+        PX4_FLAGS,
+    ],
 )
 def test_bits_do_not_depend_on_optimisation(
     flags: tuple[str, ...], case: Case, tmp_path: Path
@@ -198,6 +225,23 @@ def test_contraction_does_not_start(case: Case, tmp_path: Path) -> None:
     program = Program(case.code, ["gcc"], case.sets, tmp_path, flags=flags)
     with pytest.raises(ParameterError, match="rise_di_start returns false"):
         program.compare(case.recordings[0])
+
+
+@pytest.mark.skipif(
+    not (CROSS and QEMU), reason="no aarch64-linux-gnu-gcc with qemu-aarch64 on this machine"
+)
+def test_proof_of_another_machine(case: Case) -> None:
+    commands = [["aarch64-linux-gnu-gcc", "-static"]]
+    proof = prove(
+        case.code, commands, case.sets, case.recordings, float32=False, runner=["qemu-aarch64"]
+    )
+    assert proof.holds, report(proof, "the case")
+    assert "aarch64-linux-gnu-gcc" in proof.compilers[0]
+    with pytest.raises(
+        ParameterError,
+        match="runner: found no program 'qemu-of-nothing', expected a command such as",
+    ):
+        export("osprey_servo", case.code, runner="qemu-of-nothing")
 
 
 MUTANTS: dict[str, tuple[str, str]] = {
@@ -295,6 +339,12 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "rise_di_command": ("controller->effectors", "controller->effectors_failsafe"),
     "rise_di_retune": ("c->parameters = parameters;", "(void)parameters;"),
     "rise_di_restart": ("controller->mode = RISE_DI_WAITING;", ""),
+    "rise_di_reference_start": (
+        "fill(reference->x_m, RISE_DI_R, ZERO);",
+        "fill(reference->x_m, RISE_DI_R, ONE);",
+    ),
+    "rise_di_take_u_m": ("reference->parameters->bounds[i]", "REAL_MAX"),
+    "rise_di_reference_step": ("before + p->reach[i]", "REAL_MAX"),
 }
 """Of each function of rise_di.c: a text of its body and what a mutant has instead."""
 
@@ -334,6 +384,41 @@ def is_found(case: Case, mutant: str, folder: Path) -> bool:
     with suppress(ParameterError):  # rise_di_start refuses what is not computed as written
         return any(program.compare(recording).differing for recording in case.recordings)
     return True
+
+
+@pytest.mark.parametrize("name", ["observer", "schedule and allocation"])
+def test_check_names_an_edit_out_of_bounds(
+    name: str, exported: Callable[[str], Case], tmp_path: Path
+) -> None:
+    """Each set of the proof passes; each real beyond each of its finite bounds, each NaN and each
+    odd integer is named.
+    """
+    case = exported(name)
+    build(
+        ["gcc", *FLAGS, "-fPIC", "-shared", "-o", str(tmp_path / "table.so"), "rise_di_table.c"],
+        case.code,
+    )
+    library = ctypes.CDLL(str(tmp_path / "table.so"))
+    library.rise_di_check.restype = ctypes.c_char_p
+    for config in case.sets:
+        assert library.rise_di_check(packed(config, float32=False)) is None
+    members = constants(case.sets[0])
+    good = packed(case.sets[0], float32=False)
+    place = 8 * sum(np.size(value) for _, value in members if not isinstance(value, np.ndarray))
+    for member, value in members:
+        if isinstance(value, np.ndarray):
+            _, least, largest = TABLE.get(member, ("", -np.inf, np.inf))
+            beyond = [np.nan, np.inf, *np.array([least * 1.01 - 1.0, largest * 1.01 + 1.0])]
+            for k, edit in np.ndindex(value.size, len(beyond)):
+                wrong = bytearray(good)
+                wrong[place + 8 * k : place + 8 * k + 8] = np.float64(beyond[edit]).tobytes()
+                assert library.rise_di_check(bytes(wrong)).decode() == member
+            place += 8 * value.size
+    odd = {"period_ns": 0, "max_age_ns": -1, "hold_ns": -1, "ramp_ns": -1, "slope_ns": 0, "sign": 3}
+    for k, name_of_member in enumerate(list(dict(members))[:8]):
+        if name_of_member in odd:
+            odd_set = good[: 8 * k] + np.int64(odd[name_of_member]).tobytes() + good[8 * k + 8 :]
+            assert name_of_member in library.rise_di_check(odd_set).decode()
 
 
 POSITIVE = st.floats(1e-3, 1e3)
@@ -440,7 +525,7 @@ def test_command_proves_with_a_recorded_run(
     )  # the ticks of the log
     with pytest.raises(
         ParameterError,
-        match="--run: found a flight with other parameters, expected those of osprey_servo",
+        match="run: found a flight with other parameters, expected those of osprey_servo",
     ):
         export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 
@@ -496,16 +581,16 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         export("osprey_servo", tmp_path)
     with pytest.raises(
         ParameterError,
-        match="--compiler: found no program 'tcc', expected the command of a C compiler",
+        match="compiler: found no program 'tcc', expected the command of a C compiler",
     ):
         export("osprey_servo", tmp_path, compiler=["tcc"])
     with pytest.raises(
         ParameterError,
-        match=r"--compiler: found .gcc '. \(No closing quotation\), expected the command of a C",
+        match=r"compiler: found .gcc '. \(No closing quotation\), expected the command of a C",
     ):
         export("osprey_servo", tmp_path, compiler=["gcc '"])
     (tmp_path / "file").touch()
-    with pytest.raises(ParameterError, match=r"--c: .*file"):
+    with pytest.raises(ParameterError, match=r"c: .*file"):
         export("osprey_servo", tmp_path / "file", without_proof=True)
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / REPORT).write_text(

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a controller as constants of C: the header rise_di_parameters.h, and the bytes of
-struct rise_di_parameters.
+"""Parameters of controller and reference model in C: rise_di_parameters.h, and struct
+rise_di_parameters as bytes.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ from numpy.typing import ArrayLike
 
 from flight_core.arithmetic import INVERSE_PI, MAX_ANGLE, PI_HIGH, PI_LOW, SINE_COEFFICIENTS
 from flight_core.parameters import require
-from flight_core.rates import seconds
+from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray
+from reference_model.model import stepper
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller import samples
 from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
 from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
@@ -28,6 +31,37 @@ SCALARS = frozenset(
     {"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"}
 )
 """Reals that are no list."""
+
+LEAST, LARGEST = -math.inf, math.inf
+POSITIVE = float(np.finfo(np.float32).tiny)  # of float32, so of both
+TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
+    dict.fromkeys(("period", "dt_least", "dt_largest", "time"), ("s", POSITIVE, LARGEST))
+    | dict.fromkeys(("K", "Lambda"), ("1/s", POSITIVE, LARGEST))
+    | dict.fromkeys(("eps", "y_max"), ("y", POSITIVE, LARGEST))
+    | dict.fromkeys(("speed", "V_least", "V_largest"), ("m/s", POSITIVE, LARGEST))
+    | dict.fromkeys(("limits.lower", "observer_limits.lower"), ("u", LEAST, 0.0))
+    | dict.fromkeys(("limits.upper", "observer_limits.upper"), ("u", 0.0, LARGEST))
+    | dict.fromkeys(("limits.rate", "observer_limits.rate"), ("u/s", 0.0, LARGEST))
+    | {
+        "stops.lower": ("effector", LEAST, 0.0),
+        "stops.upper": ("effector", 0.0, LARGEST),
+        "stops.rate": ("effector/s", 0.0, LARGEST),
+    }
+    | dict.fromkeys(("airspeed", "has_sine"), ("1", 0.0, 1.0))
+    | {
+        "beta": ("y/s^2", POSITIVE, LARGEST),
+        "D": ("1", -1.0, 1.0),
+        "input_scale": ("u s/y", POSITIVE, LARGEST),
+        "omega": ("1", POSITIVE, LARGEST),
+        "y_reach": ("y", 0.0, LARGEST),
+        "lead": ("s", 0.0, LARGEST),
+        "fade_rate": ("1/s", 0.0, LARGEST),
+        "T": ("effector/v", LEAST, LARGEST),
+        "effect": ("v/effector", LEAST, LARGEST),
+    }
+)
+"""Unit and bounds of the reals; a matrix of the model, which has no row here, has any finite values
+in SI."""
 
 
 class Constant(NamedTuple):
@@ -181,19 +215,41 @@ def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
     return np.clip(values, -largest, largest)
 
 
-def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
-    """The text of rise_di_parameters.h."""
+def reference_constants(reference: ReferenceModelConfig) -> list[Constant]:
+    """Members of struct rise_di_reference_parameters in the order of rise_di.h."""
+    live = reference.live_params()
+    model = reference.model()
+    period = period_ns(reference.rate, "rate")
+    reals = (*stepper(seconds(period), model), model.C, live.bounds, live.reach)
+    names = ("Phi", "Gamma", "C", "bounds", "reach")
+    return [
+        Constant("period_ns", period),
+        Constant("max_age_ns", live.max_age_ns),
+        *(Constant(name, values.ravel()) for name, values in zip(names, reals, strict=True)),
+    ]
+
+
+def header(
+    controller: RiseDiConfig,
+    scenario: str,
+    reference: ReferenceModelConfig | None = None,
+    *,
+    float32: bool,
+) -> str:
+    """The text of rise_di_parameters.h; without a reference model where `reference` is None."""
     m, p, n, s, schedule = sizes(controller)
+    r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
     real = np.float32 if float32 else np.float64
 
     def numbers(value: FloatArray) -> str:
         return ", ".join(f"{float(real(x)).hex()}{suffix}" for x in _finite(value, real))
 
-    members = [
-        f"    /* {name} */ {_initialiser(name, value, numbers)}"
-        for name, value in constants(controller)
-    ]
+    def struct(members: list[Constant]) -> list[str]:
+        return [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in members]
+
+    members = constants(controller)
+    rows = _rows(members, numbers)
     single = {
         "MAX_ANGLE": MAX_ANGLE,
         "INVERSE_PI": INVERSE_PI,
@@ -212,7 +268,8 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         " *",
         (
             f" * Parameters of the controller of {scenario}, written by `rise-di export`. "
-            "rise_di.h has units and meaning."
+            "rise_di.h "
+            "has units and meaning."
         ),
         (
             f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; "
@@ -229,6 +286,7 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
         f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
         f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
+        f"#define RISE_DI_R {r} /* states of the reference model, 0: no reference model */",
         (
             f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic "
             "pressure */"
@@ -245,13 +303,39 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         f"#define RISE_DI_HALVINGS {HALVINGS}",
         f"#define RISE_DI_SINE_COEFFICIENTS {{{numbers(np.array(SINE_COEFFICIENTS))}}}",
         "",
-        "#define RISE_DI_PARAMETERS { \\",
-        ", \\\n".join(members) + " \\",
-        "}",
-        "",
+        *_macro("RISE_DI_PARAMETERS", struct(members)),
+        *(
+            []
+            if reference is None
+            else _macro("RISE_DI_REFERENCE", struct(reference_constants(reference)))
+        ),
+        f"#define RISE_DI_ROWS {len(rows)} /* of the table of parameters */",
+        *_macro("RISE_DI_TABLE", rows, braces=False),
         "#endif",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _macro(name: str, parts: list[str], *, braces: bool = True) -> list[str]:
+    return [
+        "",
+        f"#define {name} {'{ ' * braces}\\",
+        ", \\\n".join(parts) + (" \\\n}" if braces else ""),
+        "",
+    ]
+
+
+def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list[str]:
+    """Initialisers of the table of parameters, in the order of the reals of the struct."""
+    rows = []
+    place = 0
+    for name, value in members:
+        if isinstance(value, np.ndarray):
+            unit, least, largest = TABLE.get(name, ("SI", LEAST, LARGEST))
+            bounds = numbers(np.array([least, largest]))
+            rows.append(f'    {{"{name}", "{unit}", {place}, {value.size}, {bounds}}}')
+            place += value.size
+    return rows
 
 
 def _initialiser(

@@ -11,10 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from c_export.events import GUARD_TICK, LOAD, START, Recorder, Recording, event_type, real_groups
+from c_export.events import (
+    GUARD_TICK,
+    LOAD,
+    START,
+    STEP_REFERENCE,
+    TAKE_U_M,
+    Recorder,
+    Recording,
+    event_type,
+    numbered,
+    real_groups,
+    state_names,
+)
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from reference_model.params import ReferenceModelConfig
+from reference_model.reference import Reference
 from rise_di_controller import feedforward
 from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, fields, restored
@@ -135,7 +149,55 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     groups = list(real_groups(sets[index]))
     reals = _rows(after, groups)
     loaded = _rows(before, groups)
-    return Recording(f"drawn steps, parameters {index}", events, integers, reals, loaded)
+    return Recording(
+        f"drawn steps, parameters {index}",
+        state_names(sets[index]),
+        events,
+        integers,
+        reals,
+        loaded,
+    )
+
+
+def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Recording:
+    """Live commands for the reference model: of any size, beyond the bounds, late, repeated, lost
+    for longer than `max_age`.
+    """
+    rng = np.random.default_rng(seed)
+    model = Reference(
+        reference.model_copy(update={"pulses": {}, "sines": {}, "coordinated_turn": None})
+    )
+    m = len(reference.outputs)
+    bounds = reference.live_params().bounds
+    size = np.where(np.isfinite(bounds), bounds, 1.0)
+    events: list[tuple[int, int, int, int, int, FloatArray, FloatArray]] = [
+        (START, 0, 0, 0, 0, np.zeros(m), np.zeros(m))
+    ]
+    refused = []
+    reals = []
+    silence = 0
+    for k in range(steps):
+        silence = (
+            int(rng.exponential(2.0 * reference.live.max_age * reference.rate))
+            if rng.random() < 0.02
+            else silence - 1
+        )
+        refused.append(0)
+        if silence <= 0:
+            stamp_ns = max(k + round(rng.uniform(-1.5, 0.5)), 0) * model.period_ns
+            u_m = rng.uniform(-1.1, 1.1) * size * rng.uniform(0.2, 1.0, m)
+            events.append((TAKE_U_M, 0, stamp_ns, 0, 0, u_m, np.zeros(m)))
+            try:
+                model.take(stamp_ns, u_m)
+            except ChannelError:
+                refused[-1] = 1
+        events.append((STEP_REFERENCE, 0, 0, 0, 0, np.zeros(m), np.zeros(m)))
+        reals.append(np.concatenate([model.sample(k + 1), model.x_m]))
+    names = ("refused", *numbered({"y_m": m, "x_m": len(model.x_m)}))
+    integers = np.array(refused, dtype=np.int64)[:, None]
+    return Recording(
+        "drawn commands", names, np.array(events, dtype=event_type(m)), integers, np.array(reals)
+    )
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:

@@ -27,7 +27,9 @@ from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.guard import TickInputs
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD = range(8)
+START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(
+    10
+)
 REFUSALS = 1 << 20  # 20 samples since the last tick, a bit a sample
 INTEGERS = (
     "published",
@@ -46,12 +48,15 @@ NOTHING = np.zeros(0)
 
 
 class Recording(NamedTuple):
-    """Events, and the state of the Python controller after each of the T ticks."""
+    """Events, and the state of the Python controller or reference model after each of the T
+    ticks.
+    """
 
     name: str
+    names: tuple[str, ...]  # of the integers and the reals
     events: NDArray[np.void]  # of `event_type`
-    integers: NDArray[np.int64]  # (T, 9), INTEGERS
-    reals: FloatArray  # (T, w), `real_groups`
+    integers: NDArray[np.int64]  # (T, i)
+    reals: FloatArray  # (T, w), u or y_m first
     loaded: FloatArray = NOTHING  # reals of the states before the ticks, for LOAD
 
     @property
@@ -83,12 +88,15 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
     return groups | {"output.y": m, "output.y_m": m, "output.y_m_offset": 1, "output.dt": 1}
 
 
-def real_names(controller: RiseDiConfig) -> list[str]:
-    """Names of the reals in a state."""
-    names: list[str] = []
-    for group, count in real_groups(controller).items():
-        names += [f"{group}[{i}]" for i in range(count)]
-    return names
+def state_names(controller: RiseDiConfig) -> tuple[str, ...]:
+    """Names of the integers and the reals in a state."""
+    return (*INTEGERS, *numbered(real_groups(controller)))
+
+
+def numbered(groups: Mapping[str, int]) -> Iterator[str]:
+    """Names of the values of groups: u[0], u[1], ..."""
+    for group, count in groups.items():
+        yield from (f"{group}[{i}]" for i in range(count))
 
 
 class Recorder(Controller):
@@ -113,7 +121,7 @@ class Recorder(Controller):
         self._reals: list[FloatArray] = []
         self._refused = 0
         self._none = np.zeros(len(sets[0].outputs))
-        self._width = len(real_names(sets[0]))
+        self._names = state_names(sets[0])
         self._add(START)
 
     def _add(
@@ -215,7 +223,7 @@ class Recorder(Controller):
         times = (state.failsafe_start_ns, state.hold_ns, state.ramp_ns, stamp_ns)
         self._integers.append((*map(int, integers), *times))
         self._refused = 0
-        row = np.zeros(self._width)
+        row = np.zeros(len(self._names) - len(INTEGERS))
         parts = [state.u, state.u_free, state.u_trim, state.u_ff, state.u_failsafe]
         if (effectors := state.effectors) is not None:
             at_failsafe = state.effectors_failsafe
@@ -235,7 +243,8 @@ class Recorder(Controller):
         """Events and states so far."""
         events = np.array(self._events, dtype=event_type(len(self._none)))
         integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
-        return Recording(name, events, integers, np.array(self._reals).reshape(-1, self._width))
+        reals = np.array(self._reals).reshape(len(integers), -1)
+        return Recording(name, self._names, events, integers, reals)
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:

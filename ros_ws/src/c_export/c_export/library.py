@@ -172,11 +172,6 @@ def build_fmu(
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("modelDescription.xml", model_description(controller, scenario))
             archive.write(library, "binaries/linux64/rise_di.so")
-            for part in (
-                code / "rise_di.h",
-                code / "rise_di.c",
-                code / PARAMETERS,
-                SOURCE / "fmu.c",
-            ):
+            for part in (*(code / name for name in (*CODE, PARAMETERS)), SOURCE / "fmu.c"):
                 archive.write(part, f"sources/{part.name}")
     return path

@@ -17,14 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from c_export.constants import header, packed
-from c_export.events import INTEGERS, Recording, real_names
+from c_export.events import Recording
 from flight_core.files import write_file, writing
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SOURCE = Path(str(files("c_export"))) / "source"
-CODE = ("rise_di.h", "rise_di.c")
+CODE = ("rise_di.h", "rise_di.c", "rise_di_table.c")
 PARAMETERS = "rise_di_parameters.h"
 # beside the code
 REPORT = "proof.txt"
@@ -68,9 +69,16 @@ class Comparison(NamedTuple):
 
 
 def write_code(
-    controller: RiseDiConfig, scenario: str, folder: Path, *, float32: bool
+    controller: RiseDiConfig,
+    scenario: str,
+    folder: Path,
+    reference: ReferenceModelConfig | None = None,
+    *,
+    float32: bool,
 ) -> list[Path]:
-    """Write the C code of a controller to a folder, and remove report and unit of the code before.
+    """Write the C code of a controller and of a reference model to a folder; remove the report and
+    the unit of earlier code.
+
     Raises ParameterError.
     """
     with writing("c", folder, "a folder that can"):
@@ -79,7 +87,7 @@ def write_code(
             (folder / name).unlink(missing_ok=True)
         for name in CODE:
             shutil.copyfile(SOURCE / name, folder / name)
-        write_file(folder / PARAMETERS, header(controller, scenario, float32=float32))
+        write_file(folder / PARAMETERS, header(controller, scenario, reference, float32=float32))
     return [folder / name for name in (*CODE, PARAMETERS)]
 
 
@@ -87,29 +95,37 @@ def compilers(named: Sequence[str] = ()) -> list[list[str]]:
     """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises
     ParameterError for none.
     """
-    commands = [_words(command) for command in named] or [
+    commands = [words(command) for command in named] or [
         [name] for name in COMPILERS if shutil.which(name)
     ]
     if not commands:
         raise ParameterError(
             f"compiler: found none of {', '.join(COMPILERS)} on the PATH, expected one for the "
-            "proof; --no-proof writes the code without a proof"
+            "proof; "
+            "--no-proof writes the code without a proof"
         )
     return commands
 
 
-def _words(command: str) -> list[str]:
-    """The words of the command of a compiler, as a shell reads them. Raises ParameterError for what
-    is no program.
+def words(
+    command: str, option: str = "compiler", expected: str = "the command of a C compiler"
+) -> list[str]:
+    """The words of a command, as a shell reads them. Raises ParameterError for what is no
+    program.
     """
-    expected = "expected the command of a C compiler"
     try:
-        words = shlex.split(command)
+        parts = shlex.split(command)
     except ValueError as error:  # a quotation without an end
-        raise ParameterError(f"compiler: found {command!r} ({error}), {expected}") from None
-    if not words or shutil.which(words[0]) is None:
-        raise ParameterError(f"compiler: found no program {command!r}, {expected}")
-    return words
+        raise ParameterError(
+            f"{option}: found {command!r} ({error}), expected {expected}"
+        ) from None
+    require(
+        bool(parts) and shutil.which(parts[0]) is not None,
+        option,
+        f"no program {command!r}",
+        expected,
+    )
+    return parts
 
 
 class Program:
@@ -118,18 +134,17 @@ class Program:
     def __init__(
         self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *,
         float32: bool = False,
-        flags: Sequence[str] = FLAGS, source: str | None = None,
+        flags: Sequence[str] = FLAGS, source: str | None = None, runner: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Compile; `source` replaces the text of rise_di.c. Raises ParameterError with the words of
-        the compiler.
+        """Compile; `source` replaces the text of rise_di.c, `runner` starts the program. Raises
+        ParameterError.
         """
         self._folder = folder
+        self._runner = runner
         self._float32 = float32
         folder.mkdir(parents=True, exist_ok=True)
         for path in (
-            code / "rise_di.h",
-            code / "rise_di.c",
-            code / PARAMETERS,
+            *(code / name for name in (*CODE, PARAMETERS)),
             SOURCE / "proof.c",
             SOURCE / "counting.h",
         ):
@@ -146,10 +161,12 @@ class Program:
         (self._folder / "sets").write_bytes(content)
 
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
-        """Integers (T, 9) and reals (T, w) of the states of C, and what the program prints."""
+        """Integers and reals of the states of C, as the recording has them, and what the program
+        prints.
+        """
         (self._folder / "events").write_bytes(recording.events.tobytes())
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
-        command = ["./proof", "sets", "events", "loaded", "states"]
+        command = [*self._runner, "./proof", "sets", "events", "loaded", "states"]
         try:
             process = subprocess.run(  # noqa: S603 - built here
                 command, cwd=self._folder, capture_output=True, text=True, check=False
@@ -163,15 +180,15 @@ class Program:
             raise ParameterError(
                 f"the exported code: {(process.stderr or 'the program failed').strip()[-2000:]}"
             )
-        integers = len(INTEGERS)
-        reals = len(real_names(self._sets[0]))
-        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, integers + reals)
+        integers = recording.integers.shape[1]
+        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(
+            -1, len(recording.names)
+        )
         return words[:, :integers], words[:, integers:].view(np.float64), json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
         """The states of C beside the states of Python."""
         integers, reals, _ = self.run(recording)
-        names = real_names(self._sets[0])
         m = len(self._sets[0].outputs)
         if len(integers) != recording.ticks:
             raise ParameterError(
@@ -190,7 +207,7 @@ class Program:
                 np.hstack([integers[tick], reals[tick]]),
             )
             first = Difference(
-                tick, (*INTEGERS, *names)[column], float(both[0][column]), float(both[1][column])
+                tick, recording.names[column], float(both[0][column]), float(both[1][column])
             )
         u = recording.reals[:, :m]
         with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
@@ -230,9 +247,12 @@ def prove(
     recordings: Iterable[Recording],
     *,
     float32: bool,
+    runner: Sequence[str] = (),
 ) -> Proof:
     """Compile the code in a folder with each compiler, and compare the states of C with the
     recordings.
+
+    `runner` starts the programs of a compiler for a different machine, as qemu does.
 
     With g++ a program whose reals count gives the largest number of operations of a call.
     """
@@ -240,7 +260,7 @@ def prove(
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
         folder = Path(name)
         programs = [
-            Program(code, command, sets, folder / str(k), float32=float32)
+            Program(code, command, sets, folder / str(k), float32=float32, runner=runner)
             for k, command in enumerate(commands)
         ]
         figures = footprint(code, commands[0], folder)
@@ -252,7 +272,10 @@ def prove(
             printed = (counting or programs[0]).run(recording)[2]
             figures |= {key: max(value, figures.get(key, 0)) for key, value in printed.items()}
     return Proof(
-        tuple(version(command) for command in commands), tuple(comparisons), figures, float32
+        tuple(" ".join([version(command), *command[1:]]) for command in commands),
+        tuple(comparisons),
+        figures,
+        float32,
     )
 
 
@@ -349,8 +372,9 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         known["stack_bytes"] = sum(int(line[1]) for line in lines)
     if (size := shutil.which("size")) is not None:
         process = subprocess.run(  # noqa: S603 - of binutils
-            [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True
+            [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=False
         )
-        text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
-        known |= {"code_bytes": text, "data_bytes": data + bss}
+        if not process.returncode:  # not of a file for a different machine
+            text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
+            known |= {"code_bytes": text, "data_bytes": data + bss}
     return known

@@ -24,8 +24,13 @@ def export(
         str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")
     ],
     folder: Annotated[
-        Path, typer.Option("--c", help="Folder to write the C code and the report of the proof to.")
-    ],
+        Path | None,
+        typer.Option("--c", help="Folder to write the C code and the report of the proof to."),
+    ] = None,
+    px4: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write an external module of PX4 to, in place of --c."),
+    ] = None,
     run: Annotated[
         Path | None,
         typer.Option(help="Prove with the ticks of a recorded run, in place of flights."),
@@ -53,6 +58,9 @@ def export(
             "and clang, if there."
         ),
     ] = None,
+    runner: Annotated[
+        str, typer.Option(help="Command that starts what the compiler makes, as qemu-aarch64.")
+    ] = "",
     fmu: Annotated[
         bool,
         typer.Option(
@@ -71,20 +79,25 @@ def export(
     engagement, limits), with drawn calls and with drawn steps. It compares every u and every state.
     Exit status: 0 proved, 1 a bit differs, 2 bad input.
     """
+    chosen = folder or px4
+    if chosen is None or (folder and px4):
+        raise typer.BadParameter("expected --c FOLDER or --px4 FOLDER")
     recorded = None if run is None else read_run(run)
     if recorded is not None:
         warn_of_lacks(recorded)
     with Console(stderr=True, quiet=as_json).status("flying and comparing"):
         files, proof, text = write_export(
             scenario,
-            folder,
+            chosen,
             run=recorded,
             float32=float32,
             duration=duration,
             drawn=drawn,
             seed=seed,
             compiler=compiler or (),
+            runner=runner,
             fmu=fmu,
+            px4=px4 is not None,
             proof=not without_proof,
         )
     if proof is None:

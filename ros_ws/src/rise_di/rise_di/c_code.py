@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from c_export.constants import exportable
-from c_export.drawn import drawn_calls, drawn_steps
+from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import build_fmu
-from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, write_code
+from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
+from c_export.px4 import MODULE, write_px4
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_path
@@ -44,7 +45,9 @@ def export(
     drawn: int = 50_000,
     seed: int = 1,
     compiler: Sequence[str] = (),
+    runner: str = "",
     fmu: bool = False,
+    px4: bool = False,
     proof: bool = True,
 ) -> Exported:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
@@ -59,7 +62,9 @@ def export(
         drawn: Number of drawn steps of the proof.
         seed: Seed of the drawn inputs.
         compiler: Commands of C compilers; gcc and clang where none is named.
+        runner: Command that starts a program of the compiler, as qemu-aarch64 for a cross compiler.
         fmu: Write a co-simulation unit of FMI 2.0 too.
+        px4: Write the code as an external module of PX4.
         proof: Whether to prove.
 
     Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C
@@ -70,9 +75,15 @@ def export(
     title = printable(chosen.name)  # of a file, whose name may hold any character
     controller = exportable(chosen.controller)
     commands = compilers(compiler) if proof or fmu else []
-    files = write_code(controller, title, folder, float32=float32)
+    starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
+    if px4:
+        code = folder / MODULE
+        files = write_px4(chosen, folder, float32=float32)
+    else:
+        code = folder
+        files = write_code(controller, title, folder, chosen.reference_model, float32=float32)
     if fmu:
-        files.append(build_fmu(folder, commands[0], controller, title, folder / FMU))
+        files.append(build_fmu(code, commands[0], controller, title, folder / FMU))
     if not proof:
         return Exported(files, None, "")
     logged = ""
@@ -90,7 +101,7 @@ def export(
         require(same, "run", "a flight with other parameters", f"those of {title}")
         recordings = iter([recording])
         logged = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
-    proved = prove(folder, commands, sets, recordings, float32=float32)
+    proved = prove(code, commands, sets, recordings, float32=float32, runner=starter)
     text = report(proved, title) + logged
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
@@ -100,8 +111,11 @@ def export(
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int
 ) -> Iterator[Recording]:
-    """Flights; `drawn` steps and a tenth as many calls, in parts, so that a part fits in memory."""
+    """Flights, drawn commands; `drawn` steps and a tenth as many calls, in parts, so that a part
+    fits in memory.
+    """
     yield from flight_recordings(scenario, sets)
+    yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)
     if drawn:
         yield drawn_calls(sets, max(drawn // 10, 100), seed)
         each = -(-drawn // len(sets))

@@ -1,7 +1,7 @@
 /* SPDX-FileCopyrightText: RISE-DI contributors
  * SPDX-License-Identifier: Apache-2.0
  *
- * The proof's program: reads events of the controller, writes the state after each tick. Arguments: parameter sets, events, states to
+ * The proof's program: reads events of controller and reference model, writes the state after each tick. Arguments: parameter sets, events, states to
  * load, states.
  * With counting.h in front, as C++, every value counts its operations; the largest count of a tick goes to standard output.
  */
@@ -10,7 +10,8 @@
 
 #include "rise_di.c"
 
-enum { START = 0, TAKE_Y = 1, TAKE_Y_M = 2, TICK = 3, RETUNE = 4, RESTART = 5, GUARD_TICK = 6, LOAD = 7 };
+enum { START = 0, TAKE_Y = 1, TAKE_Y_M = 2, TICK = 3, RETUNE = 4, RESTART = 5, GUARD_TICK = 6, LOAD = 7, TAKE_U_M = 8,
+       STEP_REFERENCE = 9 };
 
 typedef struct {
     int64_t kind, now_ns, stamp_ns, flag, offset_ns; /* flag: index of a set, active, or 1 active + 2 with samples */
@@ -137,6 +138,10 @@ int main(int count, char **arguments) {
     static const rise_di_parameters exported = RISE_DI_PARAMETERS;
     static rise_di_parameters sets[64];
     static rise_di_controller controller;
+#if RISE_DI_R > 0
+    static const rise_di_reference_parameters model = RISE_DI_REFERENCE;
+    static rise_di_reference reference;
+#endif
     rise_di_output output;
     event next;
     int64_t refused = 0;
@@ -165,6 +170,9 @@ int main(int count, char **arguments) {
                 return EXIT_FAILURE;
             }
             refused = 0;
+#if RISE_DI_R > 0
+            rise_di_reference_start(&reference, &model);
+#endif
             break;
         case TAKE_Y:
             refused = refused * 2 % 1048576 + (rise_di_take_y(&controller, next.stamp_ns, next.now_ns, y) != RISE_DI_TAKEN);
@@ -184,6 +192,18 @@ int main(int count, char **arguments) {
         case GUARD_TICK:
             published = guard_tick(&controller, &next, &output);
             break;
+#if RISE_DI_R > 0
+        case TAKE_U_M:
+            refused = rise_di_take_u_m(&reference, next.stamp_ns, y) != RISE_DI_TAKEN;
+            break;
+        case STEP_REFERENCE:
+            rise_di_reference_step(&reference, y_m);
+            write_integer(refused);
+            write_reals(y_m, RISE_DI_M);
+            write_reals(reference.x_m, RISE_DI_R);
+            refused = 0;
+            break;
+#endif
         case LOAD:
             load_state(&controller, loaded, next.stamp_ns);
             break;

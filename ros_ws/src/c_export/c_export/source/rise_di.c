@@ -2,8 +2,8 @@
  * SPDX-License-Identifier: Apache-2.0
  *
  * The RISE-DI controller in C99. rise_di.h says what is called when. Functions and order of operations are those of the Python
- * modules law, saturation, allocation, observer, schedule, feedforward, guard and controller of rise_di_controller, and of
- * flight_core.arithmetic.
+ * modules law, saturation, allocation, observer, schedule, feedforward, guard and controller of rise_di_controller, of
+ * reference_model and of flight_core.arithmetic.
  */
 #include "rise_di.h"
 
@@ -93,7 +93,7 @@ static bool is_finite(const rise_di_real *values, int32_t count) {
 /* The nearest integer, half to even, for magnitudes below 2^51 (float: 2^22). */
 static rise_di_real rounded(rise_di_real a) { return (a + ROUNDING) - ROUNDING; }
 
-#if (RISE_DI_N > 0) || (RISE_DI_S > 0) || (RISE_DI_P > 0)
+#if (RISE_DI_N > 0) || (RISE_DI_S > 0) || (RISE_DI_P > 0) || (RISE_DI_R > 0)
 /* result = matrix vector, summed over the columns 0, 1, ... in this order. */
 static void product(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector, rise_di_real *result) {
     for (int32_t i = 0; i < rows; i++) {
@@ -1138,3 +1138,62 @@ void rise_di_restart(rise_di_controller *controller) {
         controller->mode = RISE_DI_WAITING;
     }
 }
+
+/* ---- reference model ---- */
+
+#if RISE_DI_R > 0
+void rise_di_reference_start(rise_di_reference *reference, const rise_di_reference_parameters *parameters) {
+    reference->parameters = parameters;
+    reference->number = 0;
+    reference->stamp_ns = 0;
+    reference->has_u_m = false;
+    fill(reference->u_m, RISE_DI_M, ZERO);
+    fill(reference->applied, RISE_DI_M, ZERO);
+    fill(reference->x_m, RISE_DI_R, ZERO);
+}
+
+rise_di_status rise_di_take_u_m(rise_di_reference *reference, int64_t stamp_ns, const rise_di_real u_m[RISE_DI_M]) {
+    rise_di_status status = RISE_DI_TAKEN;
+    if (reference->has_u_m && (stamp_ns <= reference->stamp_ns)) {
+        status = RISE_DI_ORDER;
+    } else if (!is_finite(u_m, RISE_DI_M)) {
+        status = RISE_DI_NOT_FINITE;
+    } else {
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            if (magnitude(u_m[i]) > reference->parameters->bounds[i]) {
+                status = RISE_DI_IMPLAUSIBLE;
+            }
+        }
+    }
+    if (status == RISE_DI_TAKEN) {
+        reference->has_u_m = true;
+        reference->stamp_ns = stamp_ns;
+        copy(u_m, reference->u_m, RISE_DI_M);
+    }
+    return status;
+}
+
+void rise_di_reference_step(rise_di_reference *reference, rise_di_real y_m[RISE_DI_M]) {
+    const rise_di_reference_parameters *p = reference->parameters;
+    const int64_t now_ns = reference->number * p->period_ns;
+    const bool aged = elapsed_ns(now_ns, reference->stamp_ns) > (uint64_t)p->max_age_ns;
+    rise_di_real inputs[3 * RISE_DI_M];
+    rise_di_real moved_x_m[RISE_DI_R];
+    rise_di_real driven[RISE_DI_R];
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real u_m = aged ? ZERO : reference->u_m[i];
+        const rise_di_real before = reference->applied[i];
+        reference->applied[i] = clipped(u_m, before - p->reach[i], before + p->reach[i]);
+        for (int32_t k = 0; k < 3; k++) {
+            inputs[(k * RISE_DI_M) + i] = reference->applied[i];
+        }
+    }
+    product(p->Phi, RISE_DI_R, RISE_DI_R, reference->x_m, moved_x_m);
+    product(p->Gamma, RISE_DI_R, 3 * RISE_DI_M, inputs, driven);
+    for (int32_t i = 0; i < RISE_DI_R; i++) {
+        reference->x_m[i] = moved_x_m[i] + driven[i];
+    }
+    product(p->C, RISE_DI_M, RISE_DI_R, reference->x_m, y_m);
+    reference->number = reference->number + 1;
+}
+#endif

@@ -1,8 +1,8 @@
 /* SPDX-FileCopyrightText: RISE-DI contributors
  * SPDX-License-Identifier: Apache-2.0
  *
- * The RISE-DI controller in C99: law, anti-windup, limits, guard, allocation, feedforward, observer, schedule. No library, no
- * heap, no global.
+ * The RISE-DI controller in C99: law, anti-windup, limits, guard, allocation, feedforward, observer, schedule; the reference
+ * model of live commands. No library, no heap, no global.
  *
  * The caller owns the struct rise_di_controller. Order of calls in a period:
  *
@@ -174,7 +174,7 @@ typedef struct {
     int32_t count;  /* number of samples, at most RISE_DI_SAMPLES */
 } rise_di_samples;
 
-/* A controller. Read by the caller: mode, rise_di_command. */
+/* A controller. Read by the caller: mode, rise_di_command. u may be set by the caller before engagement: the law begins there. */
 typedef struct {
     const rise_di_parameters *parameters;
     rise_di_mode mode;
@@ -242,5 +242,57 @@ void rise_di_restart(rise_di_controller *controller);
 
 /* Append a sample to a ring. */
 void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_real value[RISE_DI_M]);
+
+/* The first member of parameters that is out of its bounds, such as "K", after an edit; a null pointer where none is. An edit needs
+ * another digest: rise_di_retune takes parameters of equal digest for the same. In rise_di_table.c. */
+const char *rise_di_check(const rise_di_parameters *parameters);
+
+#define RISE_DI_TEXT 24 /* characters of a name and of a unit at most, with the 0 at the end */
+
+/* A row of the table of parameters: `count` reals of struct rise_di_parameters, the first at `place`, from `period` on. */
+typedef struct {
+    char name[RISE_DI_TEXT];
+    char unit[RISE_DI_TEXT]; /* y, u: of the channel; v: of an input of the law */
+    int32_t place;
+    int32_t count;
+    rise_di_real least; /* bounds, both allowed */
+    rise_di_real largest;
+} rise_di_row;
+
+/* The row of an index from 0 on; a null pointer behind the last. In rise_di_table.c. */
+const rise_di_row *rise_di_row_at(int32_t index);
+
+#if RISE_DI_R > 0
+/* Parameters of the reference model, equation (2), constant: x_m+ = Phi x_m + Gamma (u_m, u_m, u_m), y_m = C x_m, R states. */
+typedef struct {
+    int64_t period_ns;
+    int64_t max_age_ns;                            /* the command counts as 0 when u_m is older */
+    rise_di_real Phi[RISE_DI_R * RISE_DI_R];       /* row by row, as every matrix */
+    rise_di_real Gamma[RISE_DI_R * 3 * RISE_DI_M]; /* for u_m at the begin, in the middle and at the end of a step */
+    rise_di_real C[RISE_DI_M * RISE_DI_R];
+    rise_di_real bounds[RISE_DI_M];                /* largest abs(u_m), units of y */
+    rise_di_real reach[RISE_DI_M];                 /* largest change of u_m from step to step, units of y */
+} rise_di_reference_parameters;
+
+/* The reference model at number * period_ns since its start. Read by the caller: number. */
+typedef struct {
+    const rise_di_reference_parameters *parameters;
+    int64_t number;                /* of the steps */
+    int64_t stamp_ns;              /* of u_m */
+    bool has_u_m;
+    rise_di_real u_m[RISE_DI_M];     /* the last taken */
+    rise_di_real applied[RISE_DI_M]; /* within the limits of rate */
+    rise_di_real x_m[RISE_DI_R];
+} rise_di_reference;
+
+/* Set a reference model to x_m = 0. RISE_DI_REFERENCE initialises the parameters of the scenario. */
+void rise_di_reference_start(rise_di_reference *reference, const rise_di_reference_parameters *parameters);
+
+/* Take a live command, with its stamp since the start. Acts from the next step on; a refused u_m changes nothing. */
+rise_di_status rise_di_take_u_m(rise_di_reference *reference, int64_t stamp_ns, const rise_di_real u_m[RISE_DI_M]);
+
+/* A step of a period. Gives y_m at its end, at number * period_ns since the start. */
+void rise_di_reference_step(rise_di_reference *reference, rise_di_real y_m[RISE_DI_M]);
+#endif
 
 #endif

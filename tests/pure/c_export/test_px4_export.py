@@ -1,0 +1,298 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di export --px4`: what the module decides, in a host build without PX4; its C++ beside a
+stub of PX4's headers.
+"""
+
+import ctypes
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from tests.conftest import REPOSITORY
+
+from c_export.proof import FLAGS, build
+from c_export.px4 import AXES, MODULE, write_px4
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_cli.export import export
+from flight_core.parameters import ParameterError
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"
+)
+RATES = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
+PERIOD_US = 4000
+WARNINGS = ("-Wshadow", "-Wfloat-equal", "-Wdouble-promotion")  # of PX4
+(
+    FLIES,
+    OFF,
+    NOT_ARMED,
+    NO_RATES,
+    LANDED,
+    STALE_RATES,
+    STALE_SETPOINT,
+    NO_NUMBER,
+    REFUSED,
+    FAILSAFE,
+    DIVERGED,
+) = range(11)
+
+
+class Cycle(ctypes.Structure):
+    """rise_di_cycle."""
+
+    _fields_ = (
+        *((name, ctypes.c_uint64) for name in ("now_us", "rates_us", "setpoint_us")),
+        *((name, ctypes.c_bool) for name in ("enabled", "armed", "has_rates", "landed")),
+        *((name, 3 * ctypes.c_float) for name in ("rates", "setpoint", "spare")),
+        *((name, ctypes.c_float) for name in ("airspeed", "max_age", "max_error")),
+    )
+
+
+WRAPPER = """
+#include "rise_di_rates.c"
+unsigned long host_bytes(void) { return sizeof(rise_di_rates); }
+int host_run(rise_di_rates *rates, const rise_di_cycle *cycle, float *torque, double *values) {
+    (void)rise_di_rates_run(rates, cycle);
+    for (int k = 0; k < 3; k++) {
+        torque[k] = rates->torque[k];
+        values[k] = (double)rates->y_m[k];
+        values[3 + k] = (double)rates->controller.u[k];
+    }
+    return (int)rates->refusal;
+}
+"""
+
+
+class Shell:
+    """The decisions of the module, with a clock of its own: a cycle a period."""
+
+    def __init__(self, library: Path) -> None:
+        self._library = ctypes.CDLL(str(library))
+        self._library.host_bytes.restype = ctypes.c_ulong
+        self._memory = ctypes.create_string_buffer(self._library.host_bytes())
+        self._library.rise_di_rates_start(self._memory)
+        self.now_us = 1_000_000
+        self.torque = np.zeros(3, dtype=np.float32)
+        self.values = np.zeros(6)
+        self.spare = (0.1, -0.2, 0.05)
+        self.lost: set[str] = set()
+
+    def run(self, **changes: object) -> int:
+        """A cycle in which everything is as RISE-DI needs it, less `changes`; the refusal."""
+        self.now_us += PERIOD_US
+        stamps = dict.fromkeys(("rates_us", "setpoint_us"), self.now_us)
+        switches = dict.fromkeys(("enabled", "armed", "has_rates"), True)
+        cycle = Cycle(
+            now_us=self.now_us, **stamps, **switches, max_age=0.02, max_error=3.0, airspeed=11.5
+        )
+        cycle.spare = (3 * ctypes.c_float)(*self.spare)
+        for name, value in changes.items():
+            setattr(
+                cycle, name, (3 * ctypes.c_float)(*value) if isinstance(value, tuple) else value
+            )
+        pointers = (ctypes.c_void_p(array.ctypes.data) for array in (self.torque, self.values))
+        return int(self._library.host_run(self._memory, ctypes.byref(cycle), *pointers))
+
+    def fly(self, cycles: int, **changes: object) -> list[int]:
+        """The refusals of some cycles."""
+        return [self.run(**changes) for _ in range(cycles)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("px4")
+    write_px4(find_scenario(str(RATES)), folder, float32=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def library(folder: Path) -> Path:
+    module = folder / MODULE
+    (module / "host.c").write_text(WRAPPER, encoding="utf-8")
+    command = [
+        "gcc",
+        *FLAGS,
+        *WARNINGS,
+        "-Wconversion",
+        "-fPIC",
+        "-shared",
+        "-o",
+        "host.so",
+        "host.c",
+        "rise_di.c",
+    ]
+    build(command, module)
+    (module / "host.c").unlink()
+    return module / "host.so"
+
+
+@pytest.fixture
+def shell(library: Path) -> Shell:
+    return Shell(library)
+
+
+def test_spare_flies_until_all_is_ready(shell: Shell) -> None:
+    """Its torque goes through in the same cycle, to the bit."""
+    for changes, refusal in (
+        ({"enabled": False}, OFF),
+        ({"armed": False}, NOT_ARMED),
+        ({"has_rates": False}, NO_RATES),
+        ({"landed": True}, LANDED),
+        ({"setpoint_us": 1}, STALE_SETPOINT),
+        ({"rates_us": 1}, STALE_RATES),
+        ({"rates": (0.0, float("nan"), 0.0)}, NO_NUMBER),
+        ({"setpoint": (float("inf"), 0.0, 0.0)}, NO_NUMBER),
+    ):
+        assert shell.fly(3, **changes) == [refusal] * 3
+        assert (shell.torque == np.array(shell.spare, dtype=np.float32)).all()
+    assert shell.run() == FLIES
+
+
+def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
+    shell.fly(500, enabled=False)
+    assert shell.run() == FLIES
+    assert shell.torque == pytest.approx(shell.spare, abs=0.02)
+    assert shell.values[3:] == pytest.approx(
+        0.261799 * shell.torque[[1, 0, 2]], rel=1e-6
+    )  # u in rad, q p r
+
+
+@pytest.mark.parametrize(
+    ("changes", "refusal", "latches"),
+    [
+        ({"armed": False}, NOT_ARMED, False),
+        ({"has_rates": False}, NO_RATES, False),
+        ({"landed": True}, LANDED, False),
+        ({"rates_us": 1_000_001}, STALE_RATES, False),
+        ({"setpoint_us": 1_000_001}, STALE_SETPOINT, False),
+        ({"rates": (float("nan"), 0.0, 0.0)}, NO_NUMBER, False),
+        ({"rates": (0.0, 3.5, 0.0)}, DIVERGED, True),
+    ],
+)
+def test_falls_back_in_the_same_cycle(
+    shell: Shell, changes: dict[str, object], refusal: int, latches: bool
+) -> None:
+    """And fades the difference; a fault stays until it is switched off."""
+    shell.fly(100, enabled=False)
+    assert set(shell.fly(50, setpoint=(0.3, 0.2, 0.1))) == {FLIES}
+    before = shell.torque.copy()
+    assert shell.run(**changes) == refusal
+    assert shell.torque == pytest.approx(before, abs=1e-6)  # no jump
+    assert np.abs(before - shell.spare).max() > 0.02
+    shell.fly(1000, armed=False)
+    assert shell.torque == pytest.approx(shell.spare, abs=1e-4)
+    assert shell.run() == (refusal if latches else FLIES)
+    shell.run(enabled=False)
+    assert shell.run() == FLIES
+
+
+def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
+    """The cycle goes on without samples: the spare flies once they are older than the limit of 0.02
+    s.
+    """
+    shell.fly(20)
+    stamp_us = shell.now_us
+    refusals = shell.fly(10, rates_us=stamp_us)
+    assert refusals == [FLIES] * 5 + [STALE_RATES] * 5
+
+
+def test_reference_follows_the_setpoint(shell: Shell) -> None:
+    """y_m is that of Python at the instants of the periods, for any rates that come faster; a pause
+    starts it again.
+    """
+    shell.fly(2, enabled=False)
+    shell.fly(300, setpoint=(0.3, -0.2, 0.1), rates=(0.3, -0.2, 0.1), enabled=False)
+    assert shell.values[:3] == pytest.approx([-0.2, 0.3, 0.1], abs=1e-3)  # q, p, r
+    shell.now_us += 2_000_000
+    shell.run(setpoint=(0.3, -0.2, 0.1), enabled=False)
+    shell.run(setpoint=(0.3, -0.2, 0.1), enabled=False)
+    assert 0.0 < np.abs(shell.values[:3]).max() < 0.05
+
+
+def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
+    """The same error at twice the airspeed: a quarter of the torque; without an airspeed no
+    scale.
+    """
+    rise = {}
+    for airspeed in (8.0, 11.5, 16.0, float("nan"), 0.0):
+        shell = Shell(library)
+        shell.spare = (0.0, 0.0, 0.0)
+        shell.fly(50, enabled=False, airspeed=airspeed)
+        shell.fly(10, setpoint=(0.1, 0.0, 0.0), airspeed=airspeed)
+        rise[airspeed] = float(shell.torque[0])
+    unscaled = rise.pop(0.0)
+    for airspeed, torque in rise.items():
+        ratio = 1.0 if np.isnan(airspeed) else 11.5 / airspeed
+        assert torque == pytest.approx(unscaled * ratio**2, rel=1e-4)
+    assert unscaled > 0.0
+
+
+def test_limits_are_those_of_the_torque(library: Path) -> None:
+    """In slow flight the torque of 1 comes at a smaller u: the law stops there and does not wind
+    up.
+    """
+    shell = Shell(library)
+    shell.fly(400, setpoint=(5.0, 0.0, 0.0), airspeed=8.0, max_error=30.0)
+    assert shell.torque[0] == 1.0
+    assert shell.values[4] == pytest.approx(0.261799 * (8.0 / 11.5) ** 2, rel=1e-6)
+
+
+def test_compiles_beside_a_stub_of_px4(folder: Path, tmp_path: Path) -> None:
+    module = folder / MODULE
+    source = (module / "RiseDiControl.cpp").read_text(encoding="utf-8")
+    for header in re.findall(r"#include <(.*)>", source):
+        (tmp_path / header).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / header).write_text('#include "px4.h"\n', encoding="utf-8")
+    if shutil.which("g++") is None:
+        pytest.skip("no g++ on this machine")
+    flags = ["-std=gnu++14", "-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", *WARNINGS]
+    stub = REPOSITORY / "tests" / "px4"
+    build(
+        [
+            "g++",
+            *flags,
+            f"-I{tmp_path}",
+            f"-I{stub}",
+            "-c",
+            "-o",
+            str(tmp_path / "o"),
+            "RiseDiControl.cpp",
+        ],
+        module,
+    )
+
+
+def test_parameters_and_topics_are_those_of_the_source(folder: Path) -> None:
+    module = folder / MODULE
+    source = (module / "RiseDiControl.cpp").read_text(encoding="utf-8")
+    yaml = (module / "module.yaml").read_text(encoding="utf-8")
+    used = set(re.findall(r"px4::params::(\w+)", source))
+    assert used == set(re.findall(r"^        (RDI_\w+):", yaml, re.MULTILINE))
+    assert all(len(name) <= 16 for name in used)
+    message = (folder / "msg" / "RiseDiStatus.msg").read_text(encoding="utf-8")
+    fields = re.findall(r"^(?:uint|float)\S+ ([a-z_]+)", message, re.MULTILINE)
+    assert set(re.findall(r"\tstatus\.(\w+)", source)) == set(fields)
+
+
+def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
+    def refused(scenario: Scenario, words: str) -> None:
+        with pytest.raises(ParameterError, match=words):
+            write_px4(scenario, tmp_path, float32=False)
+
+    rates = find_scenario(str(RATES))
+    refused(
+        find_scenario("osprey_servo"),
+        r"^controller\.outputs: found q, p, r, V, expected some of p, q, r",
+    )
+    refused(
+        rates.vary(aircraft={"actuators": {"upper": []}}),
+        r"^aircraft\.actuators\.upper: found no end stop of elevator",
+    )
+    with pytest.raises(typer.BadParameter, match="--c FOLDER or --px4 FOLDER"):
+        export("osprey_servo")
+    assert set(AXES) == set("pqr")
