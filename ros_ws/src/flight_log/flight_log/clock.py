@@ -223,7 +223,8 @@ def _candidates(
     stamp_ns = signals[name].stamp_ns
     elapsed_ns = np.diff(stamp_ns)
     if "t" in signals[name].names:
-        flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
+        with np.errstate(over="ignore", invalid="ignore"):  # a flight time that no flight has
+            flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
     elif len(elapsed_ns) and all(
         recording[topic].lost == 0 for topic in LOOP if topic in recording
     ):

@@ -25,7 +25,6 @@ from flight_guidance.params import GuidanceConfig
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.proposals import authority_names
 
 Take = Callable[[StampedVector, int], object]
 """Takes a sample at an instant, ns."""
@@ -76,6 +75,10 @@ class Topics:
     def advertise(self, topic: str, names: Sequence[str]) -> None:
         """Name the channels of a topic."""
         self._names[topic] = tuple(names)
+
+    def names(self, topic: str) -> tuple[str, ...]:
+        """The channels of a topic. Raises KeyError before it is advertised."""
+        return self._names[topic]
 
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
         """Hand each sample of a topic to `take`: these channels in this order; None: all
@@ -194,7 +197,6 @@ class GuidanceStation:
         self._guidance = guidance
         self._topics = topics
         self.period_ns = guidance.period_ns
-        self._authority = authority_names(parameters.outputs)
         topics.advertise("u_m", (*parameters.outputs, *ATTITUDE))
         topics.advertise("guidance", guidance.names)
         topics.subscribe("y", _or_refuse(guidance.take_y), parameters.outputs)
@@ -202,9 +204,8 @@ class GuidanceStation:
         topics.subscribe("authority", self._take_authority)
 
     def _take_authority(self, sample: StampedVector, _t_ns: int) -> None:
-        self._guidance.take_authority(
-            dict(zip(self._authority, sample.value.tolist(), strict=True))
-        )
+        names = self._topics.names("authority")
+        self._guidance.take_authority(dict(zip(names, sample.value.tolist(), strict=True)))
 
     def step(self, t_ns: int) -> None:
         """See Station."""
