@@ -230,7 +230,10 @@ def settable_clock(folder: Path) -> Path:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")
-    library, source = folder / "clock.so", Path(__file__).parent / "faults" / "clock.c"
+    library, source = (
+        folder / "clock.so",
+        Path(__file__).parent / "flight_bringup" / "faults" / "clock.c",
+    )
     subprocess.run(
         [compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"],
         check=True,

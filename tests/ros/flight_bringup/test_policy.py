@@ -164,11 +164,11 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
     further = {
         "guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)
     }  # where tf2_msgs is installed
+    empty = frozenset[str]()
+    by_clock = Access(empty, frozenset({"/clock"}), empty, empty)  # by use_sim_time
     for role in lockstep:
-        assert (
-            real_time[role].merged(lockstep[role]).merged(further.get(role, lockstep[role]))
-            == policy[role]
-        ), role
+        observed = real_time[role].merged(lockstep[role]).merged(by_clock)
+        assert observed.merged(further.get(role, by_clock)) == policy[role], role
 
 
 def check_bridge(own: Access, policy: Access) -> None:
@@ -192,5 +192,6 @@ def check_bridge(own: Access, policy: Access) -> None:
         if not kind.startswith(f"{MAVLINK}/")
     }
     assert own.publish | published == policy.publish
+    subscribed |= {"/clock"}  # by use_sim_time
     assert own.subscribe | subscribed == policy.subscribe
     assert (own.reply, own.request | requested) == (policy.reply, policy.request)

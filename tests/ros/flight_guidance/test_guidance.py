@@ -193,7 +193,7 @@ def test_command_and_page_say_what_guidance_took_and_refused(
     rejected = start("flight_cli.cli", "guide", "phi=80")  # degrees
     flight.until(lambda: rejected.popen.poll() is not None, "the end of the command")
     assert rejected.end() == 1
-    assert "error: not in force: target.phi: found 80, expected -30 to 30 deg" in rejected.output
+    assert "error: refused: target.phi: found 80, expected -30 to 30 deg" in rejected.output
 
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
 
