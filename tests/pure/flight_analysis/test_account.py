@@ -5,8 +5,9 @@ was recorded.
 """
 
 import json
+import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from tests.damaged import DAMAGES, damage
+from tests.damaged import DAMAGES, Damage, damage
 from tests.recordings import EPOCH
 
+import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
@@ -367,3 +369,37 @@ def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
     }
     assert command_results(figures) == f"1 of {len(edges)} commands flown"
     assert figures["account"]["processes"] == {}  # of a flight in one process
+
+
+PARTS_HELD: Mapping[str, tuple[str, Damage, float]] = {
+    "cut at half": ("", DAMAGES["ends in the middle"], 0.5),
+    "without a third": ("", DAMAGES["without a third"], 2.0 / 3.0),
+    "thinned y": ("/y", DAMAGES["every second sample"], 0.5),
+}
+
+
+@pytest.mark.parametrize("name", PARTS_HELD)
+def test_python_says_over_which_part_its_figures_are(
+    whole: Path, tmp_path: Path, name: str
+) -> None:
+    topic, change, held = PARTS_HELD[name]
+    run = rise_di.read_run(damage(whole, tmp_path / "damaged.mcap", topic, change))
+    assert run.account.topics["y"].share == pytest.approx(held, abs=0.01)
+    counts = run.account.topics["y"]
+    assert f"the log lacks y {counts.found} of {counts.expected} samples" in " ".join(
+        run.tape.notes
+    )
+    kind, _ = rise_di.best_error(run.tape)
+    percent = math.floor(100.0 * run.account.topics["y_m"].share)
+    assert kind == (
+        "true error" if topic else f"true error, over {percent} % of truth, {percent} % of y_m"
+    )
+    notes = rise_di.summarise(run.tape, rise_di.recorded_scenario(run))["notes"]
+    assert len(notes) == len(set(notes))
+
+
+def test_python_says_nothing_of_a_log_that_lacks_nothing(whole: Path) -> None:
+    run = rise_di.read_run(whole)
+    assert run.tape.notes == ()
+    assert run.account.lacks == ()
+    assert rise_di.best_error(run.tape)[0] == "true error"

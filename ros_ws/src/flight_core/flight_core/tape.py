@@ -110,7 +110,7 @@ class Tape:
     `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of
     `simulate`: `scenario`, and `changes` of the controller's parameters in flight. Of a log:
     `recording` by topic, `duration`, s, of a whole flight where the log has it, `processes` by
-    name, and how many samples of a topic were `refused`.
+    name, how many samples of a topic were `refused`, and the `account` of `rise_di.read_run`.
     """
 
     signals: Mapping[str, Signal]
@@ -123,6 +123,7 @@ class Tape:
     changes: tuple[Mapping[str, Any], ...] = ()
     processes: Mapping[str, Process] = field(default_factory=dict)
     refused: Mapping[str, int] = field(default_factory=dict)
+    account: Any = None
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""

@@ -126,6 +126,13 @@ class RecordedRun(NamedTuple):
     topics: Mapping[str, str] = {}
     age_of_u: Signal | None = None
 
+    @property
+    def account(self) -> Any:
+        """The share of each topic, and what the log lacks, as `rise_di.read_run` finds them; else
+        None.
+        """
+        return self.tape.account
+
     def require(self, *names: str) -> None:
         """Raise ParameterError with the topics of the log where a topic of a flight has no sample,
         or every topic.
@@ -166,17 +173,7 @@ def read_run(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> RecordedRun:
-    """Read the folder or a file of a run: named vectors by topic name (without the namespace),
-    samples by stamp.
-
-    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several
-    files, compressed or not. A truncated MCAP file is read up to the last complete chunk, and a
-    note of the tape says so. The file `scenario` replaces the scenario in the log. `remaps` gives
-    topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of remapped nodes
-    without these names. Raises ParameterError for a missing bag, for a bag without a sample, for
-    several aircraft, in a namespace each, of which `namespace` names none, and for a scenario file
-    that cannot be read.
-    """
+    """Read the folder or a file of a run, as `rise_di.read_run` does, without its account."""
     run = as_path(run, "run", A_RUN)
     replacement = (
         None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))

@@ -96,10 +96,12 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
     from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
     from flight_analysis.closed_loop.simulate import simulate
-    from flight_analysis.metrics import best_error, error_metrics
+    from flight_analysis.metrics import error_metrics
+    from flight_analysis.report.account import best_error_over as best_error
     from flight_analysis.report.data_frame import data_frame
     from flight_analysis.report.report import Report, report
     from flight_analysis.report.run_folder import FlightResult
+    from flight_analysis.report.run_folder import read_accounted as read_run
     from flight_analysis.report.summary import RecordedFlight, summarise
     from flight_bringup.fly import fly_and_report as fly
     from flight_core.fields import Field
@@ -111,7 +113,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_design.gains.gain_selection import GainAssessment, Selection
     from flight_design.gains.gain_yaml import as_yaml as gains_yaml
     from flight_design.learning.scenario_learner import learner
-    from flight_log.tape_reader import RecordedRun, read_run
+    from flight_log.tape_reader import RecordedRun
     from rise_di.c_code import Exported, export
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.flight_env import FlightEnv, FlightVectorEnv
@@ -141,10 +143,11 @@ else:  # type checkers would take a module with __getattr__ to have any name
             "Selection",
             "as_yaml as gains_yaml",
         ),
-        "flight_analysis.metrics": ("best_error", "error_metrics"),
+        "flight_analysis.metrics": ("error_metrics",),
+        "flight_analysis.report.account": ("best_error_over as best_error",),
         "flight_analysis.report.data_frame": ("data_frame",),
         "flight_analysis.report.report": ("Report", "report"),
-        "flight_analysis.report.run_folder": ("FlightResult",),
+        "flight_analysis.report.run_folder": ("FlightResult", "read_accounted as read_run"),
         "flight_analysis.report.summary": ("RecordedFlight", "summarise"),
         "flight_bringup.fly": ("fly_and_report as fly",),
         "flight_analysis.closed_loop.scenario_library": ("find_scenario", "scenarios"),
@@ -152,7 +155,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_core.parameters": ("NonNegatives", "ParameterError", "Positives", "require_length"),
         "flight_core.tape": ("Signal", "Tape"),
         "flight_core.vectors": ("Array", "StampedVector", "array_namespace"),
-        "flight_log.tape_reader": ("RecordedRun", "read_run"),
+        "flight_log.tape_reader": ("RecordedRun",),
         "rise_di.c_code": ("Exported", "export"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.flight_env": ("FlightEnv", "FlightVectorEnv"),

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import TRUE_ERROR, best_error
 from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
 from flight_core.modes import Mode
 from flight_core.outcome import (
@@ -156,6 +157,19 @@ class Account(NamedTuple):
             "commands": None if self.commands is None else self.commands._asdict(),
             "late": self.late,
         }  # fmt: skip
+
+
+def best_error_over(tape: Tape) -> tuple[str, Signal]:
+    """Name and signal of the best error on a tape: the true error, or else the measured error.
+
+    Of a log that lacks samples, the name has the part of the flight: "true error, over 49 % of
+    truth".
+    """
+    kind, error = best_error(tape)
+    part = ""
+    if isinstance(tape.account, Account):
+        part = tape.account.over("truth" if kind == TRUE_ERROR else "y", "y_m")
+    return f"{kind}, {part}" if part else kind, error
 
 
 def final_outcome(outcome: str, account: Account) -> str:

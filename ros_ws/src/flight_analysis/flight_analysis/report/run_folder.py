@@ -114,6 +114,33 @@ def _write(path: Path, text: str | bytes) -> Path:
     return path
 
 
+def read_accounted(
+    run: FilePath,
+    namespace: str | None = None,
+    scenario: FilePath | None = None,
+    remaps: Mapping[str, str] = {},
+) -> RecordedRun:
+    """Read the folder or a file of a run: named vectors by topic name (without the namespace),
+    samples by stamp.
+
+    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several
+    files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
+    `run.account` has the share of each topic, and `run.tape.notes` say what the log lacks; a log
+    without a scenario has no account. The file `scenario` replaces the scenario in the log.
+    `remaps` gives topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of
+    remapped nodes without these names. Raises ParameterError for a missing bag, for a bag without a
+    sample, for several aircraft, in a namespace each, of which `namespace` names none, and for a
+    scenario file that cannot be read.
+    """
+    recorded = read_run(run, namespace, scenario, remaps)
+    flight_account = log_account(recorded)
+    if flight_account is None:
+        return recorded
+    tape = recorded.tape
+    notes = (*tape.notes, *flight_account.notes())
+    return recorded._replace(tape=replace(tape, notes=notes, account=flight_account))
+
+
 def read_flight(
     run: Path,
     outcome: str | None = None,

@@ -222,7 +222,7 @@ def summarise(
         "notes": [
             *notes,
             *late_u(scenario, age),
-            *tape.notes,
+            *(note for note in tape.notes if note != flight_account.busy),
             *mode_notes(tape),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),
