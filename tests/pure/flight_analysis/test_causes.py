@@ -389,6 +389,23 @@ def test_outcome_in_the_log_is_before_that_of_a_summary_beside(
     assert read_flight(run).summary["outcome"] == "completed"
 
 
+@pytest.mark.parametrize("later_by", [0, NANOSECONDS])
+def test_summary_of_another_flight_is_not_believed(
+    recorded: Path, numbered: Messages, tmp_path: Path, later_by: int
+) -> None:
+    """A log without an outcome takes that of the summary of its flight alone."""
+    run = tmp_path / "run"
+    log = write_messages(recorded / "run_0.mcap", run / "run_0.mcap", numbered)
+    summary = read_flight(log).summary
+    summary["flight"]["start_ns"] += later_by
+    ended = {"outcome": "aircraft was killed by SIGKILL"}
+    (run / "summary.json").write_text(json.dumps(summary | ended), encoding="utf-8")
+    assert read_run(log).tape.outcome == "unknown"
+    told = read_flight(log).summary["outcome"]
+    assert (told == ended["outcome"]) is not bool(later_by)
+    assert told.startswith("completed") is bool(later_by)
+
+
 def test_scenario_beside_a_log_without_attachments_is_that_of_the_flight(run: Path) -> None:
     """The scenario and the parameters of the flight lie in the folder of the run."""
     path = run / "run_0.mcap"

@@ -54,6 +54,7 @@ DEPENDENCIES = (
     "zstandard",
 )
 
+FLIGHT = "rise_di_flight"  # name of the metadata record with start and command
 VERSIONS = "rise_di_versions"  # name of the versions in the metadata of a log
 GIT_TIMEOUT = 5.0  # s
 
@@ -61,7 +62,7 @@ GIT_TIMEOUT = 5.0  # s
 def provenance() -> dict[str, dict[str, str]]:
     """The provenance of this process now. What cannot be determined is left out."""
     return {
-        "rise_di_flight": {
+        FLIGHT: {
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": shlex.join(sys.argv),
         },

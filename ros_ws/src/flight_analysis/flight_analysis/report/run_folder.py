@@ -38,7 +38,7 @@ from flight_core.tape import Tape
 from flight_core.text import bounded, printable
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
-from flight_log.provenance import provenance
+from flight_log.provenance import FLIGHT, provenance
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import AIRCRAFT_TOPICS, PARAMETERS, RecordedRun, read_run
 
@@ -177,9 +177,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     signals = {name: signal for name, signal in timed.items() if signal is not None}
     log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
     engagements = recorded.engagements
-    outcome = outcome or _previous_outcome(
-        folder, recorded.tape, scenario, simulated=engagements is None
-    )
+    outcome = outcome or _previous_outcome(recorded, folder, scenario)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
     tape = flown(log)
@@ -187,6 +185,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
     summary = summarise(engaged if has_figures else tape, scenario, outcome, flight_account)
+    summary["flight"] = _identity(recorded)
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
         summary["notes"] = [
@@ -210,10 +209,9 @@ def log_account(recorded: RecordedRun) -> Account | None:
         )
     except ParameterError:
         return None
-    simulated = recorded.engagements is None
     folder = None if recorded.path is None else _folder(recorded.path)
-    outcome = _previous_outcome(folder, recorded.tape, scenario, simulated=simulated)
-    return account(recorded.tape, scenario, outcome, simulated=simulated)
+    outcome = _previous_outcome(recorded, folder, scenario)
+    return account(recorded.tape, scenario, outcome, simulated=recorded.engagements is None)
 
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
@@ -325,22 +323,30 @@ def _folder(run: Path) -> Path:
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
-def _previous_outcome(
-    folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool
-) -> str:
+def _identity(recorded: RecordedRun) -> dict[str, Any]:
+    """What distinguishes a flight from others: the stamp of t = 0, ns, and the time of day of the
+    start where the log has it.
+    """
+    started = recorded.metadata.get(FLIGHT, {}).get("start")
+    return {"start_ns": recorded.tape.start_ns, "started": started}
+
+
+def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> str:
     """The outcome in the log, else in the summary of the run, else the outcome that a launch left
     beside the log.
 
-    The samples in the log tell the outcome of nodes started by hand.
+    The summary of another flight is not believed. The samples in the log tell the outcome of nodes
+    started by hand.
     """
+    tape = recorded.tape
     if tape.outcome != UNKNOWN:
         return tape.outcome
     if folder is not None:
         with suppress(OSError, ValueError, TypeError, KeyError):
-            before = printable(
-                str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"])
-            )
-            if not before.startswith(UNKNOWN):  # as of an earlier version
+            summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+            before = printable(str(summary["outcome"]))
+            of_this_flight = summary.get("flight") in (None, _identity(recorded))
+            if of_this_flight and not before.startswith(UNKNOWN):  # as of an earlier version
                 return before
     if folder is not None:
         with suppress(ParameterError):
@@ -349,6 +355,6 @@ def _previous_outcome(
             ):
                 return bounded(outcome.strip())
     return (
-        outcome_of_log(tape, scenario, simulated=simulated)
+        outcome_of_log(tape, scenario, simulated=recorded.engagements is None)
         or f"{UNKNOWN}: neither the run nor the log has one"
     )

@@ -448,6 +448,7 @@ def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
     return {
         "scenario": None if scenario is None else scenario.name,
         "outcome": outcome,
+        "flight": None,
         "duration": None,
         "error": None,
         "errors": {},
