@@ -6,6 +6,7 @@ was recorded.
 
 import json
 import math
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from rich.console import Console
 from tests.damaged import DAMAGES, Damage, damage
 from tests.recordings import EPOCH
 
@@ -28,11 +30,25 @@ from flight_analysis.report.account import (
     account,
     final_outcome,
 )
+from flight_analysis.report.html import write_page
+from flight_analysis.report.paper import write_latex
 from flight_analysis.report.run_folder import read_flight
-from flight_analysis.report.summary import command_results, pulse_edges, taken_over
+from flight_analysis.report.summary import (
+    RecordedFlight,
+    command_results,
+    pulse_edges,
+    summarise,
+    taken_over,
+)
+from flight_analysis.report.tables import Interval, flight_tables
+from flight_bringup.fleet import Flown, Member
 from flight_bringup.fly import fly_and_report
+from flight_cli.fleet import _Result as FleetResult
+from flight_cli.fleet import _show as show_fleet
+from flight_cli.output import show_flight
 from flight_cli.replay import replay
 from flight_cli.report import report
+from flight_core.modes import Mode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -403,3 +419,71 @@ def test_python_says_nothing_of_a_log_that_lacks_nothing(whole: Path) -> None:
     assert run.tape.notes == ()
     assert run.account.lacks == ()
     assert rise_di.best_error(run.tape)[0] == "true error"
+
+
+@pytest.fixture(scope="module")
+def half(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
+    """A flight whose log ends in the middle, with a failsafe in its last ticks and a model."""
+    run = tmp_path_factory.mktemp("half") / "run"
+    flight = read_flight(damage(whole, run / "run_0.mcap", "", DAMAGES["ends in the middle"]))
+    rms = dict.fromkeys(flight.summary["errors"], 0.1)
+    models = [{"model": 1, "start": 0.0, "stop": 1.0, "rms": rms}]
+    return flight._replace(summary=flight.summary | {"models": models})
+
+
+def test_every_table_of_the_page_says_its_share(half: RecordedFlight) -> None:
+    """The samples of a process and the margins are no figures of the flight."""
+    events = [Interval("gust", 0.0, 1.0, "1 s")]
+    tables = flight_tables(half.summary, half.units, events)
+    captions = [table.caption for table in tables]
+    assert len(captions) >= 5
+    assert all("over 49 % of " in caption for caption in captions), captions
+
+
+def test_every_line_of_the_commands_says_its_share(
+    half: RecordedFlight, capsys: pytest.CaptureFixture[str]
+) -> None:
+    show_flight(Console(width=200), half)
+    printed = capsys.readouterr().out
+    for line in printed.splitlines():
+        if re.search("Tracking|Inputs|Rms|commands flown|ticks:|y sent|age of u", line):
+            assert "over 49 % of " in line
+    assert len(re.findall("over 49 % of (?:truth|y|u|internals)", printed)) >= 5
+
+
+def test_comparison_says_the_share_of_each_flight(
+    half: RecordedFlight, whole: Path, tmp_path: Path
+) -> None:
+    flights = [half, read_flight(whole)]
+    write_page(tmp_path / "page.html", flights)
+    write_latex(tmp_path / "tables.tex", flights)
+    assert "flown, over 49 % of truth" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    titles = [
+        line
+        for line in (tmp_path / "tables.tex").read_text(encoding="utf-8").splitlines()
+        if line.startswith(("% Tracking", "% Inputs"))
+    ]
+    assert ["over 49 % of" in title for title in titles] == [True, True, False, False]
+
+
+def test_fleet_says_the_share_of_the_ticks_engaged(
+    half: RecordedFlight,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert half.scenario is not None
+    flown = Flown(Member("two", half.scenario), tmp_path, "completed")
+    show_fleet("pair", [flown], {"two": FleetResult(half.summary, 0.9365)})
+    assert "93.65 %, over 49 % of internals" in capsys.readouterr().out
+
+
+def test_note_on_the_modes_says_the_share_of_the_ticks(half: RecordedFlight) -> None:
+    signal = half.tape["internals"]
+    values = signal.values.copy()
+    values[-20:, signal.names.index("mode")] = Mode.HOLD
+    held = replace(signal, values=values)
+    tape = replace(half.tape, signals={**half.tape.signals, "internals": held})
+    notes = summarise(tape, half.scenario)["notes"]
+    assert any("HOLD in 20% of the ticks, over 49 % of internals:" in note for note in notes)

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from flight_analysis.report.run_folder import remove_empty, write_empty_summary, write_report
+from flight_analysis.report.summary import taken_over
 from flight_bringup.fleet import Flown, fly_fleet, new_runs, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_core.environment import require_ros_environment
@@ -122,7 +123,7 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
             each.member.name,
             "-" if summary["duration"] is None else f"{summary['duration']:.1f}",
             "-" if ticks is None else str(ticks["ticks"]),
-            "-" if engaged is None else f"{100.0 * engaged:.4g} %",
+            "-" if engaged is None else f"{100.0 * engaged:.4g} %{taken_over(summary, 'ticks')}",
             summary["outcome"],
         )
         lines.append(f"{each.member.name}: {display_path(each.run)}")

@@ -41,6 +41,7 @@ from flight_analysis.report.summary import (
     parts_legend,
     table_rows,
     taken_over,
+    time_flown,
 )
 from flight_core.files import write_file, writing
 
@@ -63,10 +64,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         return
     if busy := (summary["account"] or {}).get("busy"):
         console.print(busy, style="bold", highlight=False, soft_wrap=True)
-    title = (
-        f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} "
-        f"flown{taken_over(summary, 'errors')}"
-    )
+    title = f"Tracking error ({summary['error']}), {time_flown(summary)}"
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
     console.print(
         grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units))
@@ -80,9 +78,11 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
             _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance"))
         )
         if legs := leg_results(summary["guidance"]["legs"]):
-            console.print(legs, highlight=False, soft_wrap=True)
+            console.print(
+                f"{legs}{taken_over(summary, 'guidance')}", highlight=False, soft_wrap=True
+            )
     if summary["models"]:
-        console.print(model_table(summary["models"], units))
+        console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
     if commands := command_results(summary):
         console.print(commands, highlight=False, soft_wrap=True)
     console.print(
@@ -132,11 +132,15 @@ def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
     return table
 
 
-def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]) -> Table:
-    """The rms of the error before the first learned model and under each."""
+def model_table(
+    models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str = ""
+) -> Table:
+    """The rms of the error before the first learned model and under each. `part` of the flight that
+    the log has.
+    """
     headings, rows = model_rows(models, units)
     table = new_table(
-        "Rms of the error by model",
+        f"Rms of the error by model{part}",
         ["", *(heading.replace(" ", "\n") for heading in headings)],
         left_aligned=("",),
     )

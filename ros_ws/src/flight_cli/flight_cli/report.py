@@ -12,7 +12,7 @@ from rich.console import Console
 from flight_analysis.report import comparison
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
-from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
+from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_over
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, show_flight
 from flight_cli.repair import repair_log
@@ -136,7 +136,8 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
     for k, (label, flight) in enumerate(
         zip(comparison.labels(flights), flights, strict=True), start=1
     ):
-        console.print(f"{k}: {label}, {flight.summary['outcome']}", highlight=False, soft_wrap=True)
+        result = f"{flight.summary['outcome']}{taken_over(flight.summary, 'errors')}"
+        console.print(f"{k}: {label}, {result}", highlight=False, soft_wrap=True)
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table(
         "Tracking error, and its ratio to the first", headings, left_aligned=("channel", "")

@@ -36,6 +36,7 @@ from flight_analysis.report.summary import (
     format_seconds,
     format_value,
     parts_legend,
+    time_flown,
 )
 from flight_core.files import replacing
 from flight_core.outcome import COMPLETED
@@ -230,8 +231,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:
     controller = scenario.controller
     return (
-        f"{format_seconds(flight.summary['duration'])} flown at {controller.rate:g} Hz with "
-        f"the {controller.summary()}"
+        f"{time_flown(flight.summary)}, at {controller.rate:g} Hz with the {controller.summary()}"
     )
 
 

@@ -24,6 +24,7 @@ from flight_analysis.report.summary import (
     channel_label,
     columns_of,
     table_rows,
+    taken_over,
 )
 from flight_core.arguments import as_names
 from flight_core.files import replacing, write_file
@@ -287,7 +288,8 @@ def write_latex(path: Path, flights: Sequence[RecordedFlight]) -> None:
             columns = columns_of(known, flight.summary[key])
             heads = [" ".join(filter(None, (column.group, column.head))) for column in columns]
             rows = table_rows(flight.summary[key], columns, units)
-            parts.append(_tabular(f"{title}, {label}", ["channel", *heads], rows))
+            caption = f"{title}, {label}{taken_over(flight.summary, key)}"
+            parts.append(_tabular(caption, ["channel", *heads], rows))
     write_file(path, "% needs \\usepackage{booktabs}\n" + "\n".join(parts))
 
 

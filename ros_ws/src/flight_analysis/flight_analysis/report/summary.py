@@ -223,7 +223,7 @@ def summarise(
             *notes,
             *late_u(scenario, age),
             *(note for note in tape.notes if note != flight_account.busy),
-            *mode_notes(tape),
+            *mode_notes(tape, flight_account.over(*FIGURES["ticks"])),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),
         ],
@@ -382,6 +382,11 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
     return f", {part}" if part else ""
 
 
+def time_flown(summary: Mapping[str, Any]) -> str:
+    """The duration of a flight and the part of the flight that the errors are of."""
+    return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
+
+
 def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
     """Sentences on the engagements of a flight with a bridge, with figures unless shorter than a
     sample.
@@ -405,9 +410,9 @@ def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -
     ]
 
 
-def mode_notes(tape: Tape) -> list[str]:
+def mode_notes(tape: Tape, part: str) -> list[str]:
     """A sentence on a controller that did not fly the law for more than 1 % of the ticks from its
-    first engagement on.
+    first engagement on. `part`: that the log has of the ticks.
     """
     if "internals" not in tape:
         return []
@@ -416,11 +421,12 @@ def mode_notes(tape: Tape) -> list[str]:
     if not engaged.any() or np.mean(ticks == Mode.ENGAGED) >= WHOLE:
         return []
     absent = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
-    parts = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
+    modes = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
+    over = f", {part}" if part else ""
     return [
         (
-            f"the controller was {parts} of the ticks: the figures are of the whole flight, with u "
-            "held or at trim"
+            f"the controller was {modes} of the ticks{over}: the figures are of the whole flight, "
+            "with u held or at trim"
         )
     ]
 

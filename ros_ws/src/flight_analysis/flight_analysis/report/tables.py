@@ -179,7 +179,7 @@ def flight_tables(
             INPUT_LEGEND + SATURATION_LEGEND,
         ),
         Table(
-            "Events",
+            f"Events{taken_over(summary, 'ticks')}",
             times,
             [
                 (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
@@ -253,9 +253,8 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
 
 def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
     headings, rows = model_rows(summary["models"], units)
-    return Table(
-        "Rms of the error by model", [Column("", head) for head in headings], rows, MODEL_LEGEND
-    )
+    caption = f"Rms of the error by model{taken_over(summary, 'errors')}"
+    return Table(caption, [Column("", head) for head in headings], rows, MODEL_LEGEND)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
