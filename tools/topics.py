@@ -7,7 +7,8 @@ from flight_core.topics.
 from pathlib import Path
 from xml.etree import ElementTree
 
-from autopilot_bridge.params import LIBRARY, MAVLINK, load_map
+from autopilot_bridge.map_rows import MAVLINK
+from autopilot_bridge.params import LIBRARY, load_map
 from flight_core.topics import FLIGHT, NODES, TOPICS, VECTOR, Topic, published_by
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -36,7 +36,8 @@ from autopilot_bridge.channel_map import (
     to_raw,
 )
 from autopilot_bridge.map_check import check_map, definitions_below
-from autopilot_bridge.params import BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
+from autopilot_bridge.map_rows import MeasuredRow, OverrideRow
+from autopilot_bridge.params import BridgeConfig, ChannelMap, load_map
 from flight_cli.cli import application
 from flight_core import installation
 from flight_core.parameters import ParameterError

@@ -16,8 +16,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.maps import named_map
 
 from autopilot_bridge.channel_map import set_field
+from autopilot_bridge.map_rows import LinkConfig
 from autopilot_bridge.mavlink_link import COMPANION, Link, message_type
-from autopilot_bridge.params import ChannelMap, LinkConfig
+from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 

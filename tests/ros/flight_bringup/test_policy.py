@@ -13,7 +13,7 @@ from tests.maps import MAP_FILES, named_map
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer
 
-from autopilot_bridge.params import MAVLINK
+from autopilot_bridge.map_rows import MAVLINK
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, parameter_overrides

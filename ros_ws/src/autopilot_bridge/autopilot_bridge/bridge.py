@@ -16,14 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.params import (
-    ROUNDING,
-    ChannelMap,
-    ConditionRow,
-    InputRow,
-    MeasuredRow,
-    OutputRow,
-)
+from autopilot_bridge.map_rows import ConditionRow, InputRow, MeasuredRow, OutputRow
+from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import (

@@ -17,7 +17,8 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.channel_map import QUATERNION, STEP, versioned_topic
-from autopilot_bridge.params import MAVLINK, ChannelMap
+from autopilot_bridge.map_rows import MAVLINK
+from autopilot_bridge.params import ChannelMap
 from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from autopilot_bridge.autopilot_lock import AutopilotLock
+from autopilot_bridge.map_rows import MAVLINK, LinkConfig
 from autopilot_bridge.message_rates import MessageRates
-from autopilot_bridge.params import MAVLINK, LinkConfig
 from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError

@@ -26,10 +26,8 @@ from std_srvs.srv import SetBool, Trigger
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, version_fault
-from autopilot_bridge.mavlink_link import MavlinkPublisher, MavlinkReader
-from autopilot_bridge.params import (
+from autopilot_bridge.map_rows import (
     MAVLINK,
-    BridgeConfig,
     ConditionRow,
     InputRow,
     MeasuredRow,
@@ -37,8 +35,9 @@ from autopilot_bridge.params import (
     OverrideRow,
     QosRow,
     WatchedRow,
-    load_map,
 )
+from autopilot_bridge.mavlink_link import MavlinkPublisher, MavlinkReader
+from autopilot_bridge.params import BridgeConfig, load_map
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require

@@ -21,7 +21,8 @@ from autopilot_bridge.map_check import (
     installed_definitions,
     is_known,
 )
-from autopilot_bridge.params import MAVLINK, ChannelMap, InputRow, OutputRow, load_map
+from autopilot_bridge.map_rows import MAVLINK, InputRow, OutputRow
+from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json

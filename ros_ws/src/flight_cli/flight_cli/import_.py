@@ -10,7 +10,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from autopilot_bridge.params import UNITS, find_map, load_map
+from autopilot_bridge.map_rows import UNITS
+from autopilot_bridge.params import find_map, load_map
 from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table
 from flight_core.files import display_path, dump_yaml, write_file, writing

@@ -18,7 +18,8 @@ import yaml
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from autopilot_bridge.channel_map import to_channel
-from autopilot_bridge.params import UNITS, ChannelMap
+from autopilot_bridge.map_rows import UNITS
+from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.loop_margins import LoopMargins, linear_loop, loop_assessment
 from flight_core.files import comment, dump_yaml

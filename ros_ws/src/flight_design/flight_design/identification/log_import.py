@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autopilot_bridge.channel_map import Line, to_channel
-from autopilot_bridge.params import ChannelMap, InputRow
+from autopilot_bridge.map_rows import InputRow
+from autopilot_bridge.params import ChannelMap
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds

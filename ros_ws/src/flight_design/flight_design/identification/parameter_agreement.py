@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from autopilot_bridge.channel_map import Line, to_raw
-from autopilot_bridge.params import MOTIONS, ChannelMap
+from autopilot_bridge.map_rows import MOTIONS
+from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray

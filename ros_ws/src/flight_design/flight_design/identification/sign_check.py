@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from autopilot_bridge.params import MOTIONS, UNITS, ChannelMap, InputRow, OutputRow
+from autopilot_bridge.map_rows import MOTIONS, UNITS, InputRow, OutputRow
+from autopilot_bridge.params import ChannelMap
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import ParameterError, require, require_channels
