@@ -171,20 +171,22 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
 def _with_history(
     state: ControllerState,
     stepped: ControllerState,
-    y_m: FloatArray,
-    dt: float,
+    inputs: TickInputs,
     missed: int,
     guard: GuardParams,
 ) -> ControllerState:
     """The state after a step of the law with the past ticks, missed ticks included."""
-    assert stepped.y is not None  # noqa: S101 - the step took a y
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
     lost = (
         PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),
     ) * missed
     last = PastTick(
-        stepped.y.value - y_m, stepped.u - state.u_trim - stepped.u_ff, y_m, np.float64(dt), scale
+        inputs.y - inputs.y_m,
+        stepped.u - state.u_trim - stepped.u_ff,
+        inputs.y_m,
+        np.float64(inputs.dt),
+        scale,
     )
     return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
 
@@ -231,44 +233,55 @@ def tick(
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
     inputs = TickInputs(y.stamp_ns, y.value, reference, seconds(y_m[-1].stamp_ns - y.stamp_ns), 0.0)
-    if state.law is None or state.y is None or state.y_m is None or state.mode is not Mode.ENGAGED:
+    return _with_sample(state, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
+
+
+def _with_sample(
+    state: ControllerState,
+    y: StampedVector,
+    inputs: TickInputs,
+    vane: FloatArray | None,
+    guard: GuardParams,
+    law: TunedLaw,
+    u_ff_recorded: FloatArray | None,
+    vane_m_recorded: FloatArray | None,
+) -> tuple[ControllerState, TickInputs | None]:
+    """A tick with fresh inputs: an engagement, a step of the law, or nothing without a new y."""
+    last = state.y
+    if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
-    if y.stamp_ns <= state.y.stamp_ns:
+    if y.stamp_ns <= last.stamp_ns:
         return state, None
-    nominal = seconds(guard.period_ns)
-    dt = min(
-        max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal
-    )
-    control_law, params = law
+    period = seconds(guard.period_ns)
+    shortest, longest = (factor * period for factor in DT_RANGE)
+    dt = min(max(seconds(y.stamp_ns - last.stamp_ns), shortest), longest)
     law_state = state.law
     u_trim = state.u_trim
     u_ff = state.u_ff
     ff_state = state.feedforward
-    missed = max(round(dt / nominal) - 1, 0)
+    missed = max(round(dt / period) - 1, 0)
     if missed:
-        held = Measurements(
-            state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u
-        )
+        held = Measurements(last.value, state.y_m, np.zeros_like(u_ff), u_trim + u_ff, state.u)
         for _ in range(missed):
-            law_state = control_law.missed(law_state, held, params)
+            law_state = law.control_law.missed(law_state, held, law.params)
     model = _nominal(guard, law_state)
     if model is not None and ff_state is not None:
-        ff_state, u_ff = feedforward.step(ff_state, reference, dt, model)
+        ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model)
         u_trim = u_trim + u_ff
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
-    slope = (reference - state.y_m) / dt
+    slope = (inputs.y_m - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference
-    measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
+    measured = Measurements(y.value, inputs.y_m, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
     after, u_free, u, effectors = law_within_limits(
         law_state, measured, dt, law, guard, state.effectors
     )
     stepped = state._replace(
         law=after,
         y=y,
-        y_m=reference,
+        y_m=inputs.y_m,
         u=u,
         u_free=u_free,
         u_ff=u_ff,
@@ -278,9 +291,10 @@ def tick(
     )
     if not _is_finite(stepped):
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
+    inputs = inputs._replace(dt=dt)
     if guard.history:
-        stepped = _with_history(state, stepped, reference, dt, missed, guard)
-    return stepped, inputs._replace(dt=dt)
+        stepped = _with_history(state, stepped, inputs, missed, guard)
+    return stepped, inputs
 
 
 def _fresh_reference(
@@ -443,39 +457,49 @@ def retune(
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
         if other_model or other_nominal:
-            # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes
-            # the part of the law: what the law has integrated beside an observer stays there, which
-            # would take it long to integrate again.
-            law_part = state.u - state.u_trim - state.u_ff
-            limits = observers[1].limits
-            acted, acts = (
-                (params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers
-            )
-            goes_on = np.where(acted, observing.u_o - change, law_part)
-            u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-            inner = shifted(
-                observing.law,
-                law_part - u_o - (law_part + change - observing.u_o),
-                observers[1].law,
-            )
             filters = observers_of(new.params, [tick.scale for tick in state.history])
             z = observer.estimates_after(state.history, change, filters)
-            started = ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
-            law = law._replace(law=started) if isinstance(law, ScheduleState) else started
-        return state._replace(law=law)
-    if other_model and not _same_model(*observers):
-        z = observer.initial_estimates(y.value - y_m, observers[1])
-        state = state._replace(u_trim=state.u_trim + observing.u_o)
-        started = observing._replace(
-            z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
-        )
-        law = law._replace(law=started) if isinstance(law, ScheduleState) else started
-    if other_nominal:
-        start = None if after is None else feedforward.initial_state(y_m, after)
-        state = state._replace(
-            u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
-        )
-    return state._replace(law=law)
+            observing = _with_estimates(state, observing, z, change, observers)
+    else:
+        if other_model and not _same_model(*observers):
+            z = observer.initial_estimates(y.value - y_m, observers[1])
+            state = state._replace(u_trim=state.u_trim + observing.u_o)
+            observing = observing._replace(
+                z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
+            )
+        if other_nominal:
+            start = None if after is None else feedforward.initial_state(y_m, after)
+            state = state._replace(
+                u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
+            )
+    if isinstance(law, ScheduleState):
+        observing = law._replace(law=observing)
+    return state._replace(law=observing)
+
+
+def _with_estimates(
+    state: ControllerState,
+    observing: ObserverState,
+    z: Array,
+    change: Array,
+    observers: tuple[ObserverParams, ...],
+) -> ObserverState:
+    """The observer of new parameters in the same motion, from its estimates z and the change of
+    u_ff, (m,).
+
+    u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
+    of the law: what the law has integrated beside an observer stays there, which would take it long
+    to integrate again.
+    """
+    law_part = state.u - state.u_trim - state.u_ff
+    limits = observers[1].limits
+    acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
+    goes_on = np.where(acted, observing.u_o - change, law_part)
+    u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
+    inner = shifted(
+        observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law
+    )
+    return ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
 
 
 def _with_nominal(
