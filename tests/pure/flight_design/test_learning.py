@@ -37,8 +37,13 @@ from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
+from rise_di_controller.learned_channels import (
+    acting_inputs,
+    authority,
+    authority_names,
+    without_models,
+)
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.proposals import acting_inputs, authority, authority_names, without_models
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

@@ -20,6 +20,16 @@ from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import StampedVector
 from rise_di_controller.controller import Controller, ControlOutput
+from rise_di_controller.learned_channels import (
+    acting_inputs,
+    authority,
+    authority_names,
+    coupled,
+    fallen_back,
+    outputs_without,
+    with_channels_of,
+    without_models,
+)
 from rise_di_controller.proposals import (
     DESIGNED,
     Event,
@@ -27,16 +37,8 @@ from rise_di_controller.proposals import (
     Learning,
     Proposal,
     Updates,
-    acting_inputs,
-    authority,
-    authority_names,
     changes,
-    coupled,
     designed,
-    fallen_back,
-    outputs_without,
-    with_channels_of,
-    without_models,
 )
 from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 

@@ -39,7 +39,7 @@ from flight_design.identification.model_quality import (
 )
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from rise_di_controller import divergence
-from rise_di_controller.proposals import outputs_without, with_channels_of, without_models
+from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
