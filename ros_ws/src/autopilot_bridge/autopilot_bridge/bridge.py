@@ -20,12 +20,7 @@ from autopilot_bridge.map_rows import ConditionRow, InputRow, MeasuredRow, Outpu
 from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
-from flight_core.vectors import (
-    ChannelError,
-    FloatArray,
-    StampedVector,
-    require_newer,
-)
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
 UNBOUNDED = (
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "

@@ -9,14 +9,7 @@ from typing import Annotated, Literal, get_args
 
 from autopilot_bridge.channel_map import PATH, Line
 from flight_core.fields import Field
-from flight_core.parameters import (
-    Config,
-    NonNegative,
-    Number,
-    Numbers,
-    Positive,
-    require,
-)
+from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, require
 
 MAVLINK = "mavlink"  # the package of the types of MAVLink messages, and the begin of their topics
 

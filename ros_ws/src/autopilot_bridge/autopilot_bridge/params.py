@@ -29,14 +29,7 @@ from autopilot_bridge.map_rows import (
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
-from flight_core.parameters import (
-    Config,
-    Name,
-    NodeConfig,
-    NonNegative,
-    Positive,
-    require,
-)
+from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 PARAMETER = re.compile(

@@ -424,8 +424,9 @@ def flying_scenario(
             "D": [1] * len(ones),
             "sign": "auto",
             "softening": gain_selection.SOFTENING,
-        }
-        | {"lag": list(lag.values()), "delay": delay},
+            "lag": list(lag.values()),
+            "delay": delay,
+        },
         "controller",
     )
     manoeuvre = Manoeuvre(

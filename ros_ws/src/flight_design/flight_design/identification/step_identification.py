@@ -463,15 +463,19 @@ def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Sel
     aircraft's order.
     """
     controller = selection.chosen
-    rows = [list(OUTPUTS).index(name) for name in controller.outputs]
-    columns = [list(INPUTS).index(name) for name in controller.inputs]
     size = sizes(OUTPUTS[name] for name in controller.outputs)
     needed = selection.setting.requirement
     needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
     observed = with_extended_state_observer(
-        controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed
+        controller, _in_law_order(Omega, controller), size / NOISE_SHARE, size, margin, needed
     )
     return replace(selection, chosen=observed.controller)
+
+
+def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
+    rows = [list(OUTPUTS).index(name) for name in controller.outputs]
+    columns = [list(INPUTS).index(name) for name in controller.inputs]
+    return Omega[np.ix_(rows, columns)]
 
 
 def that_learns(
@@ -481,10 +485,8 @@ def that_learns(
     the aircraft's order.
     """
     start = selection.chosen
-    rows = [list(OUTPUTS).index(name) for name in start.outputs]
-    columns = [list(INPUTS).index(name) for name in start.inputs]
     name = Path(condition.name).stem
-    rough = sketch(name, Omega[np.ix_(rows, columns)], start.outputs, start.inputs, condition.speed)
+    rough = sketch(name, _in_law_order(Omega, start), start.outputs, start.inputs, condition.speed)
     noise = np.array([NOISE[output] for output in start.outputs])
     axes = tuple(rough.gusts)
     gains = gains_beside_sketch(
@@ -588,15 +590,11 @@ def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
             "inputs": inputs,
             "k_g": 1.0,
             "k_d": ones[1:],
-        }
-        | {
             "D": [1] * len(inputs),
             "sign": "auto",
             "lag": lag.tolist(),
             "delay": DELAY,
             "softening": gain_selection.SOFTENING,
-        }
-        | {
             "max_age": 0.1,
             "hold": 0.5,
             "ramp": 2.0,
