@@ -20,7 +20,8 @@ from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law import MIN_GAIN
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.model_sections import FeedforwardConfig, ObserverConfig
+from rise_di_controller.params import ControllerConfig
 
 REGISTERED = {
     "rise": "rise_di",

@@ -349,8 +349,8 @@ class Learning:
             if end.value.digest in self._diverged:
                 refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
-                bare_outputs = outputs_without(end.value.parameters)
-                without = f", without {', '.join(bare_outputs)}" if bare_outputs else ""
+                bare_outputs = ", ".join(outputs_without(end.value.parameters))
+                without = f", without {bare_outputs}" if bare_outputs else ""
                 what = f"flies {proposal.sentence}{without}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters

@@ -26,7 +26,8 @@ from rise_di_controller.linear_loop import (
     linear_law,
 )
 from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
-from rise_di_controller.params import AllocationConfig, ControllerConfig
+from rise_di_controller.model_sections import AllocationConfig
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 

@@ -8,11 +8,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from control_laws.observer_design import (
-    ExtendedStateWeights,
-)
+from control_laws.observer_design import ExtendedStateWeights
 from flight_core.vectors import FloatArray
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig
+from rise_di_controller.model_sections import FeedforwardConfig
+from rise_di_controller.params import ControllerConfig
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
     "q": (0.183, 0.0077, 0.665, 0.256),

@@ -15,7 +15,7 @@ from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
 from rise_di_controller.decomposition import search
-from rise_di_controller.params import AllocationConfig
+from rise_di_controller.model_sections import AllocationConfig
 
 # s, servos and engine of a light aircraft, assumed
 SURFACE_LAG = 0.05

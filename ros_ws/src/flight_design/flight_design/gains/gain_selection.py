@@ -46,7 +46,8 @@ from flight_design.gains.requirement import (
 from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig
+from rise_di_controller.model_sections import FeedforwardConfig
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {

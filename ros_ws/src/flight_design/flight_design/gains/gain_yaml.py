@@ -11,23 +11,20 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.closed_loop.loop_margins import (
-    LoopMargins,
-    law_order,
-)
+from flight_analysis.closed_loop.loop_margins import LoopMargins, law_order
 from flight_core.arguments import as_instance
 from flight_core.files import parse_yaml
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_selection import Selection, response
 from rise_di_controller.law import Sign
-from rise_di_controller.params import (
+from rise_di_controller.model_sections import (
     AllocationConfig,
-    ControllerConfig,
     FeedforwardConfig,
     ObserverConfig,
     VanesConfig,
 )
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 PLAIN = re.compile(

@@ -49,7 +49,6 @@ from flight_design.gains.requirement import (
     nominal_conditions,
 )
 from rise_di_controller.control_law import TunedLaw
-from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import MIN_GAIN, gain
 from rise_di_controller.linear_loop import (
     LinearLaw,
@@ -60,13 +59,14 @@ from rise_di_controller.linear_loop import (
     spectral_radius,
 )
 from rise_di_controller.margins import loop_margins, phase_margins
-from rise_di_controller.observer import without_frozen
-from rise_di_controller.params import (
-    ControllerConfig,
+from rise_di_controller.model_sections import (
     FeedforwardConfig,
     ObserverConfig,
     VanesConfig,
+    require_signs,
 )
+from rise_di_controller.observer import without_frozen
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
 
 RELAXATION = 1.05
@@ -230,7 +230,7 @@ def with_aircraft_observer(
     )
     rows, columns = law_order(airframe, controller)
     Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
-    _require_signs(Omega, controller, f"airframe {airframe.name}")
+    require_signs(Omega, controller.D, f"airframe {airframe.name}")
     base = with_feedforward(
         controller.model_copy(update={"observer": None, "schedule": None}), airframe
     )
@@ -331,20 +331,14 @@ class AtSpeed(NamedTuple):
 
     def model(self, slower: FloatArray) -> SpeedConfig:
         """The models of feedforward and observer."""
-        design = self.design(slower)
-        matrices = {
-            key: tuple(getattr(design, key).ravel().tolist()) for key in ("Phi", "Gamma", "L", "F")
-        }
         nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
-        return SpeedConfig(ratio=self.ratio, **nominal, **matrices)
+        return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
         """What flies at this speed; not checked."""
         assert controller.observer is not None  # noqa: S101 - it was designed
-        model = self.model(slower)
-        matrices = {key: getattr(model, key) for key in ("Phi", "Gamma", "L", "F")}
         changed = {
-            "observer": controller.observer.model_copy(update=matrices),
+            "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
             "feedforward": self.feedforward,
             "input_scale": tuple((np.array(controller.input_scale) * self.scale).tolist()),
         }
@@ -368,7 +362,7 @@ def with_extended_state_observer(
     units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
     """
     m = len(controller.outputs)
-    _require_signs(Omega, controller, "Omega")
+    require_signs(Omega, controller.D, "Omega")
     values = controller.model_dump() | {
         "observer": None,
         "feedforward": integrator_model(controller, Omega).model_dump(),
@@ -427,21 +421,6 @@ def with_extended_state_observer(
                 needed,
             )
         ]
-    )
-
-
-def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) -> None:
-    try:
-        D = [int(sign) for sign in signs(Omega)]
-    except DecompositionError as error:
-        raise ParameterError(
-            f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}"
-        ) from None
-    require(
-        list(controller.D) == D,
-        where,
-        f"a C B with D = {D}",
-        f"D = {list(controller.D)}, that of the controller",
     )
 
 
@@ -571,14 +550,15 @@ def _within_margin(
         )
         if selected.relaxation.max() > MAX_RELAXATION or ended:
             lacking = _lacking(selected, nominal, loop, margin, needed)
-            elsewhere = (
-                "speeds: found less than the margins at another speed, expected speeds "
-                "nearer to that of the trim"
+            uncertain = (
+                f"of {WORST_OF} uncertain aircraft: found a phase margin below "
+                f"{np.degrees(needed.uncertain_phase):.0f} deg, expected at least this"
             )
             raise ParameterError(
-                elsewhere
+                "speeds: found less than the margins at another speed, expected speeds nearer to "
+                "that of the trim"
                 if others and not lacking
-                else f"--margin: {lacking or _phases(needed)}; {MEND}"
+                else f"--margin: {lacking or uncertain}; {MEND}"
             )
         if selected.fraction < 1.0:
             stepped = best(selected.relaxation * steps)
@@ -633,12 +613,10 @@ def _lacking(
     return "; ".join(dict.fromkeys(lacking))
 
 
-def _phases(needed: Requirement) -> str:
-    phase = np.degrees(needed.uncertain_phase)
-    return (
-        f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, "
-        "expected at least this"
-    )
+def _matrices(design: ObserverDesign) -> dict[str, Any]:
+    """The matrices of an observer, row by row."""
+    names = ("Phi", "Gamma", "L", "F")
+    return {name: tuple(getattr(design, name).ravel().tolist()) for name in names}
 
 
 def _parameters(
@@ -657,9 +635,6 @@ def _parameters(
     permitted[-1] = MIN_K
     share = K / permitted
     k_g = MIN_K - 1.0
-    Phi, Gamma, L, F = (
-        tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F)
-    )
     require(
         spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0,
         "observer.F",
@@ -669,10 +644,7 @@ def _parameters(
     observer = ObserverConfig(
         rate=base.rate,
         states=design.states,
-        Phi=Phi,
-        Gamma=Gamma,
-        L=L,
-        F=F,
+        **_matrices(design),
         margin=0.0,
         vanes=vanes,
     )
