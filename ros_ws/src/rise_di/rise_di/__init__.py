@@ -138,11 +138,8 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
         "flight_design.gains.airframe_properties": ("airframe_facts",),
-        "flight_design.gains.gain_selection": (
-            "GainAssessment",
-            "Selection",
-            "as_yaml as gains_yaml",
-        ),
+        "flight_design.gains.gain_selection": ("GainAssessment", "Selection"),
+        "flight_design.gains.gain_yaml": ("as_yaml as gains_yaml",),
         "flight_analysis.metrics": ("error_metrics",),
         "flight_analysis.report.account": ("best_error_over as best_error",),
         "flight_analysis.report.data_frame": ("data_frame",),
