@@ -64,7 +64,19 @@ class Product(Config):
 
 
 class Airframe(Config):
-    """An airframe in the units of the file. `matrix_a` to `products` give SI arrays."""
+    """An airframe in the units of the file. `matrix_a` to `products` give SI arrays.
+
+    Args:
+        values: Values by key, as in an airframe file.
+
+    Raises:
+        ParameterError: A value is invalid, or the airframe contradicts physics.
+
+    Examples:
+        >>> airframe = rise_di.load_airframe("osprey")
+        >>> airframe.matrix_b().shape, airframe.index("q")
+        ((8, 4), 2)
+    """
 
     name: str
     source: str = Field(description="where the figures come from")
@@ -205,7 +217,14 @@ class Airframe(Config):
         return {name: self.states.get(name) or self.output_units[name] for name in self.outputs}
 
     def index(self, state: str) -> int:
-        """Index of a state in x."""
+        """Index of a state in x.
+
+        Args:
+            state: Name of the state.
+
+        Returns:
+            The place, 0 to n - 1.
+        """
         return list(self.states).index(state)
 
     def matrix_a(self) -> FloatArray:
@@ -269,6 +288,14 @@ class Airframe(Config):
         `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`.
         Sampled and identified entries need not meet the identities of physics, so the copy is not
         checked for these.
+
+        Args:
+            A: Shape (n, n), SI.
+            B: Shape (n, m), SI.
+            wind_factor: Factors of the effect of wind, shape (n, G).
+
+        Returns:
+            The copy, unchecked for physics.
         """
         state = _si(self.states.values())
         inputs = _si(i.unit for i in self.inputs.values())
@@ -289,6 +316,13 @@ class Airframe(Config):
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
         """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order;
         physics unchecked.
+
+        Args:
+            T: Matrix of u = T v, shape (p, m).
+            inputs: Names of the m inputs v.
+
+        Returns:
+            The copy with m inputs.
         """
         B = self.matrix_b() @ T / _si(self.states.values())[:, None]
         channels = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
@@ -304,8 +338,16 @@ class Airframe(Config):
         )
 
     def gust_direction(self, gust: str) -> FloatArray:
-        """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an
-        axis not in the file.
+        """Change of x_dot for 1 m/s of wind along an axis, shape (n,).
+
+        Args:
+            gust: Name of the axis.
+
+        Returns:
+            Shape (n,), units of x_dot per m/s.
+
+        Raises:
+            ParameterError: The axis is not in the file.
         """
         require(
             gust in self.gusts,
@@ -342,13 +384,33 @@ def check_identities(airframe: Airframe) -> None:
 
 
 def airframes() -> list[str]:
-    """Names of the airframes in the library."""
+    """Names of the airframes in the library.
+
+    Returns:
+        The names, sorted.
+
+    Examples:
+        >>> "osprey" in rise_di.airframes()
+        True
+    """
     return names_in(LIBRARY)
 
 
 def load_airframe(name: FilePath | Airframe) -> Airframe:
-    """An airframe by name in the library, or by the path of a file; an Airframe as it is. Raises
-    ParameterError.
+    """An airframe by name in the library, or by the path of a file; an Airframe as it is.
+
+    Args:
+        name: Name in the library, path of an airframe file (.yaml), or an Airframe.
+
+    Returns:
+        The airframe, validated.
+
+    Raises:
+        ParameterError: No airframe has the name, or the file is invalid.
+
+    Examples:
+        >>> rise_di.load_airframe("osprey").matrix_a().shape
+        (8, 8)
     """
     if isinstance(name, Airframe):
         return name

@@ -184,7 +184,23 @@ def true_error(tape: Tape) -> Signal | None:
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
-    """Name and signal of the best error on a tape: the true error, or else the measured error."""
+    """Name and signal of the best error on a tape: the true error, or else the measured error.
+
+    Args:
+        tape: A flight with y and y_m.
+
+    Returns:
+        "true error" or "measured error", and e = y - y_m, shape (N, m), SI.
+
+    Raises:
+        ParameterError: `tape` is no Tape, or has no y and y_m.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> kind, e = rise_di.best_error(tape)
+        >>> kind, e["q"].shape
+        ('true error', (51,))
+    """
     error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
 
@@ -368,7 +384,21 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
     """Root mean square and max abs(e) of samples of shape (N,); NaN where N = 0.
 
     rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,), of equal times sqrt(mean
-    e^2). Raises ParameterError.
+    e^2).
+
+    Args:
+        errors: Samples e of a channel, shape (N,), in any unit.
+        times: Time that a sample stands for, shape (N,), s; None: equal times.
+
+    Returns:
+        `rms` and `max`, in the unit of the errors.
+
+    Raises:
+        ParameterError: `errors` are no numbers of shape (N,).
+
+    Examples:
+        >>> rise_di.error_metrics([3.0, -4.0]).max
+        4.0
     """
     e = as_array(errors, "errors", expected := "samples of one channel, (N,)")
     require(e.ndim == 1, "errors", f"an array of shape {e.shape}", expected)

@@ -375,10 +375,25 @@ def fly_and_report(
     """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly
     --in-process` does.
 
-    `progress` is called with the flight time once per simulated second, `learn` is as for
-    `simulate`. A scenario that differs from its file is written beside the log. The log holds the
-    outcome of a flight that ended early. Raises ParameterError where nothing can be written, and
-    for a flight that ended before its first sample.
+    A scenario that differs from its file is written beside the log. The log holds the
+    outcome of a flight that ended early.
+
+    Args:
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        runs: Folder for the folder of the run.
+        progress: Called with the flight time, s, once per simulated second.
+        learn: Makes the learner of a scenario with a learner, as for `simulate`.
+
+    Returns:
+        The flight, and the paths of log and report.
+
+    Raises:
+        ParameterError: Nothing can be written, or the flight ended before the first sample.
+
+    Examples:
+        >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> flight.flight.tape.outcome, flight.report.name
+        ('completed', 'report.html')
     """
     require(
         progress is None or callable(progress),

@@ -290,7 +290,17 @@ class FieldInfo:
 def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> Any:  # noqa: N802 - the name in pydantic
     """Declare the default, the meaning and the rules of a field.
 
-    Rules are gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string,
-    min_length and max_length of a tuple and of a dict.
+    Args:
+        default: Value of a field that a file leaves out; absent: the field is required.
+        description: Meaning and unit, a sentence.
+        rules: gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string,
+            min_length and max_length of a tuple and of a dict.
+
+    Returns:
+        The default of a field in a subclass of `ControllerConfig`.
+
+    Examples:
+        >>> rise_di.Field(2.0, description="Gain, 1/s.", gt=0).default
+        2.0
     """
     return FieldInfo(default, description, rules)

@@ -24,6 +24,14 @@ from flight_core.text import bounded
 class ParameterError(ValueError):
     """An invalid parameter or parameter set. The message is one sentence for the user, printable
     and bounded.
+
+    Args:
+        sentence: The key, the value that was found, and the expected value.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo", duration=-1.0)
+        Traceback (most recent call last):
+        flight_core.parameters.ParameterError: flight.duration: ...
     """
 
     def __init__(self, sentence: str) -> None:
@@ -272,7 +280,19 @@ def one_of(known: Sequence[str], name: str) -> str:
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
-    """Raise ParameterError unless the number of values is the number of channels."""
+    """Raise ParameterError unless the number of values is the number of channels.
+
+    Args:
+        key: Name of the parameter, for the sentence.
+        values: Values of the parameter.
+        names: Names of the channels.
+
+    Raises:
+        ParameterError: The numbers differ.
+
+    Examples:
+        >>> rise_di.require_length("gain", [1.0, 2.0], ["q", "V"])
+    """
     require(
         len(values) == len(names),
         key,

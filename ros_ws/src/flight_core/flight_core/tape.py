@@ -24,6 +24,11 @@ class Signal:
 
     stamp_ns: shape (N,), int64, the instants of the samples, ascending. values: shape (N, k), of a
     log with a channel contiguous in memory.
+
+    Examples:
+        >>> q = rise_di.Signal(np.array([0, 2_000_000]), ("q",), np.array([[0.0], [0.1]]))
+        >>> q["q"].tolist(), q.until(0)["q"].tolist()
+        ([0.0, 0.1], [0.0])
     """
 
     stamp_ns: NDArray[np.int64]
@@ -39,23 +44,51 @@ class Signal:
         return self.values[:, self.names.index(name)]
 
     def until(self, end_ns: int) -> "Signal":
-        """The samples up to and including an instant."""
+        """The samples up to and including an instant.
+
+        Args:
+            end_ns: The last instant, ns.
+
+        Returns:
+            The signal, values of shape (n, k).
+        """
         count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
         return Signal(self.stamp_ns[:count], self.names, self.values[:count])
 
     def where(self, keep: NDArray[np.bool_]) -> "Signal":
-        """The samples of a mask, shape (N,)."""
+        """The samples of a mask, shape (N,).
+
+        Args:
+            keep: Mask, shape (N,), bool.
+
+        Returns:
+            The signal, values of shape (n, k).
+        """
         return Signal(self.stamp_ns[keep], self.names, self.values[keep])
 
     def after(self, earlier: "Signal | None") -> "Signal":
-        """The samples of an earlier part, if any, then these; the channels are the same."""
+        """The samples of an earlier part, if any, then these; the channels are the same.
+
+        Args:
+            earlier: A signal with the same channels, or None.
+
+        Returns:
+            The signal, values of shape (n, k).
+        """
         if earlier is None:
             return self
         stamp_ns = np.concatenate([earlier.stamp_ns, self.stamp_ns])
         return Signal(stamp_ns, self.names, np.concatenate([earlier.values, self.values]))
 
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
-        """The samples inside windows (first, last instant), ns."""
+        """The samples inside windows (first, last instant), ns.
+
+        Args:
+            windows: First and last instant of each window, ns.
+
+        Returns:
+            The signal, values of shape (n, k).
+        """
         inside = [(self.stamp_ns >= first) & (self.stamp_ns <= last) for first, last in windows]
         keep = (
             np.logical_or.reduce(inside, axis=0)
@@ -65,7 +98,14 @@ class Signal:
         return self.where(keep)
 
     def group(self, prefix: str) -> "Signal":
-        """The channels "prefix.name", as a signal with channels "name"."""
+        """The channels "prefix.name", as a signal with channels "name".
+
+        Args:
+            prefix: The part of the names before the dot.
+
+        Returns:
+            The signal of the group, values of shape (N, number of channels).
+        """
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
         adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)  # then without a copy
@@ -111,6 +151,11 @@ class Tape:
     `simulate`: `scenario`, and `changes` of the controller's parameters in flight. Of a log:
     `recording` by topic, `duration`, s, of a whole flight where the log has it, `processes` by
     name, how many samples of a topic were `refused`, and the `account` of `rise_di.read_run`.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> tape["y"].names, tape.time("y")[-1].item()
+        (('q', 'V', 'p', 'r'), 0.1)
     """
 
     signals: Mapping[str, Signal]
@@ -138,7 +183,17 @@ class Tape:
         return isinstance(topic, str) and topic in self.signals
 
     def time(self, topic: str) -> FloatArray:
-        """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
+        """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9.
+
+        Args:
+            topic: Name of the topic.
+
+        Returns:
+            The times, shape (N,), s.
+
+        Raises:
+            ParameterError: The tape has no such topic.
+        """
         return (self[topic].stamp_ns - self.start_ns) / NANOSECONDS
 
 

@@ -60,7 +60,20 @@ class _Floats:
 def array_namespace(array: Scalar) -> Any:
     """The array namespace of an array by the array API standard; `_Floats` for a Python float.
 
-    NumPy 1 arrays lack `__array_namespace__`. Raises ParameterError for a list.
+    NumPy 1 arrays lack `__array_namespace__`.
+
+    Args:
+        array: An array of NumPy or of JAX, or a float.
+
+    Returns:
+        The namespace: the functions for arrays of the type.
+
+    Raises:
+        ParameterError: `array` is a list.
+
+    Examples:
+        >>> rise_di.array_namespace(np.ones(2)).sign(-2.0 * np.ones(2)).tolist()
+        [-1.0, -1.0]
     """
     if isinstance(array, (np.ndarray, np.generic)):
         return _NUMPY
@@ -84,7 +97,17 @@ def as_array(value: Any, key: str, expected: str) -> FloatArray:
 
 
 class StampedVector(NamedTuple):
-    """The values of a sample, shape (m,), the instant of the values, and the publisher."""
+    """The values of a sample, shape (m,), the instant of the values, and the publisher.
+
+    Attributes:
+        stamp_ns: Instant, ns.
+        value: Values, shape (m,), SI.
+        sender: Publisher.
+
+    Examples:
+        >>> rise_di.StampedVector(2_000_000, np.zeros(4)).value.shape
+        (4,)
+    """
 
     stamp_ns: int
     value: FloatArray

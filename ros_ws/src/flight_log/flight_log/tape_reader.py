@@ -136,6 +136,12 @@ class RecordedRun(NamedTuple):
     def require(self, *names: str) -> None:
         """Raise ParameterError with the topics of the log where a topic of a flight has no sample,
         or every topic.
+
+        Args:
+            names: Topics that need a sample; none: the topics of a flight.
+
+        Raises:
+            ParameterError: A topic has no sample.
         """
         missing = [name for name in names if name not in self.tape]
         if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):

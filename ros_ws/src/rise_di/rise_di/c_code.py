@@ -67,8 +67,17 @@ def export(
         px4: Write the code as an external module of PX4.
         proof: Whether to prove.
 
-    Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C
-    code, without a compiler, and for a folder that cannot be written.
+    Returns:
+        The files, the proof and the text of the report. `proof.holds` says whether the proof holds.
+
+    Raises:
+        ParameterError: The controller has no C code, no compiler runs, or the folder cannot be
+            written.
+
+    Examples:
+        >>> exported = rise_di.export("osprey_servo", "c", proof=False)
+        >>> [path.name for path in exported.files]
+        ['rise_di.h', 'rise_di.c', 'rise_di_parameters.h']
     """
     chosen = find_scenario(scenario)
     folder = as_path(folder, "c", "the path of a folder")

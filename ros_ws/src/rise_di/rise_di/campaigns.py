@@ -62,7 +62,7 @@ def fly_campaign(
     progress: Progress | None = None,
 ) -> CampaignResult:
     """Fly thousands of uncertain aircraft around the airframe of a scenario, and write the report
-    of the campaign.
+    of the campaign. After Ctrl-C `resume_campaign` continues.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
@@ -87,8 +87,16 @@ def fly_campaign(
         runs: Folder that the folder of the campaign is made in.
         progress: Called with the flights so far and all flights, after each chunk.
 
-    Raises ParameterError with one sentence for what a campaign cannot fly. After Ctrl-C
-    `resume_campaign` continues.
+    Returns:
+        The folder, the report and the figures of the campaign.
+
+    Raises:
+        ParameterError: A campaign cannot fly the scenario or the arguments.
+
+    Examples:
+        >>> scenario = rise_di.find_scenario("osprey_servo", duration=0.1)
+        >>> rise_di.fly_campaign(scenario, 2, workers=1).rows().height
+        2
     """
     chosen = find_scenario(scenario, duration)
     spread = chosen.aircraft.uncertainty.spread()
@@ -110,8 +118,24 @@ def fly_campaign(
 def resume_campaign(
     folder: FilePath, *, workers: int | None = None, progress: Progress | None = None
 ) -> CampaignResult:
-    """Fly the aircraft that an interrupted campaign has not flown. Raises ParameterError for a
-    folder without a campaign.
+    """Fly the aircraft that an interrupted campaign has not flown.
+
+    Args:
+        folder: The folder of the campaign.
+        workers: Threads, with a learner processes; None: as many as cores.
+        progress: Called with the flights so far and all flights, after each chunk.
+
+    Returns:
+        The folder, the report and the figures of the campaign.
+
+    Raises:
+        ParameterError: The folder has no campaign.
+
+    Examples:
+        >>> scenario = rise_di.find_scenario("osprey_servo", duration=0.1)
+        >>> campaign = rise_di.fly_campaign(scenario, 2, workers=1)
+        >>> rise_di.resume_campaign(campaign.folder).figures == campaign.figures
+        True
     """
     campaign = Campaign.resume(as_path(folder, "folder", "the folder of a campaign"))
     return _fly(campaign, _engine(campaign.definition, workers), _progress(progress))

@@ -109,8 +109,16 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             `aircraft.uncertainty`. None: every episode has the aircraft, the noise and the
             turbulence of the scenario.
 
-    Raises ParameterError without gymnasium, for an aircraft of JSBSim with an uncertainty, and for
-    an output without a score.
+    Raises:
+        ParameterError: gymnasium is missing, an aircraft of JSBSim has an uncertainty, or an output
+            has no score.
+
+    Examples:
+        >>> env = rise_di.FlightEnv(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> observation, info = env.reset(seed=1)
+        >>> observation, reward, terminated, truncated, info = env.step(np.zeros(4))
+        >>> observation.shape
+        (8,)
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -146,6 +154,13 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an
         episode.
+
+        Args:
+            seed: Seed of the draws; None: the draws go on.
+            options: As gymnasium has the argument.
+
+        Returns:
+            The observation, shape (2 m,), SI, and further facts by name.
         """
         super().reset(seed=seed, options=options)
         self._y = np.zeros(len(self.outputs))
@@ -168,8 +183,16 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._y_m = sample.value
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """Hold u for a period. Raises ParameterError outside an episode, and for an action that is
-        not m finite numbers.
+        """Hold u for a period.
+
+        Args:
+            action: u, shape (p,), SI, deviation from trim.
+
+        Returns:
+            Observation (2 m,), reward, whether terminated, whether truncated, and further facts.
+
+        Raises:
+            ParameterError: No episode runs, or the action is not p finite numbers.
         """
         require(0 <= self._k < self._ticks, "step", "a step outside an episode", "reset() first")
         u = _actions(action, (len(self.inputs),))
@@ -233,8 +256,15 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to
             1.
 
-    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of
-    JSBSim.
+    Raises:
+        ParameterError: gymnasium is missing, or a campaign cannot fly the scenario, as an aircraft
+            of JSBSim.
+
+    Examples:
+        >>> env = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_servo", duration=0.1), 2)
+        >>> observations, info = env.reset(seed=1)
+        >>> observations.shape
+        (2, 8)
     """
 
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
@@ -274,8 +304,17 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """N new aircraft in trim at t = 0. A seed repeats them. Raises ParameterError for a list of
-        seeds.
+        """N new aircraft in trim at t = 0. A seed repeats them.
+
+        Args:
+            seed: Seed of the draws; None: the draws go on.
+            options: As gymnasium has the argument.
+
+        Returns:
+            The observations, shape (N, 2 m), SI, and further facts by name.
+
+        Raises:
+            ParameterError: `seed` is a list.
         """
         seed = None if seed is None else as_count(seed, "seed", 0)
         super().reset(seed=seed, options=options)
@@ -284,8 +323,16 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     def step(
         self, actions: FloatArray
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Hold u for a period, (N, p). Raises ParameterError for another shape, and for an action
-        that is not finite.
+        """Hold u for a period.
+
+        Args:
+            actions: u, shape (N, p), SI, deviations from trim.
+
+        Returns:
+            Observations (N, 2 m), rewards (N,), terminated (N,), truncated (N,), and further facts.
+
+        Raises:
+            ParameterError: The shape is wrong, or a value is not finite.
         """
         u = _actions(actions, (self.num_envs, len(self._vehicle.inputs)))
         require(self._last > 0, "step", "a step before an episode", "reset() first")

@@ -79,8 +79,29 @@ def new_airframe(
         body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit
             of length, `length`.
 
-    Raises ParameterError with one sentence: for a model that contradicts physics, and for an
-    aircraft that no gains fly.
+    Returns:
+        The paths of the files, the airframe, and a note on the source.
+
+    Raises:
+        ParameterError: The model contradicts physics, no gains fly the aircraft, or a file cannot
+            be written.
+
+    Examples:
+        >>> A = [[-0.045, 0.036, 0.0, -9.81], [-0.369, -2.02, 53.64, 0.0]]
+        >>> A += [[0.0062, -0.130, -2.948, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        >>> B = [[0.0], [-8.586], [-11.044], [0.0]]
+        >>> from scipy.signal import StateSpace
+        >>> new = rise_di.new_airframe(
+        ...     StateSpace(A, B, np.eye(4), np.zeros((4, 1))),
+        ...     name="navion",
+        ...     speed=53.64,
+        ...     states="V: m/s, w: m/s, q: rad/s, theta: rad",
+        ...     inputs="elevator: rad nose down",
+        ...     outputs="q, V",
+        ...     thrust=True,
+        ... )
+        >>> new.scenario_file.name
+        'navion_flight.yaml'
     """
     airframe, note = import_airframe(
         source,

@@ -40,14 +40,17 @@ class Loop:
     """The controller behind its guard, a call a tick. The node runs the same `Controller`, so u has
     the same bits.
 
-        loop = rise_di.Loop(scenario.controller)
-        u = loop.step(t, y, y_m)
-
     Args:
         controller: Parameters of the controller, or a mapping of these as in the section
             `controller` of a scenario.
 
-    Raises ParameterError for parameters that the controller does not accept.
+    Raises:
+        ParameterError: The controller does not accept the parameters.
+
+    Examples:
+        >>> loop = rise_di.Loop(rise_di.find_scenario("osprey_servo").controller)
+        >>> loop.step(0.0, np.zeros(4), np.zeros(4)).tolist()
+        [0.0, 0.0, 0.0, 0.0]
     """
 
     def __init__(self, controller: ControllerConfig | Mapping[str, Any]) -> None:
@@ -78,16 +81,24 @@ class Loop:
         return self._controller.names
 
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
-        """A tick at t in s: u, shape (m,), SI, deviation from trim, in the order of `inputs`; 0
-        before the engagement.
+        """Compute u of a tick at t.
 
-        With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations
-        from trim, belong to t and have the order of `outputs`; y of an observer with vanes has the
-        order of `measured`. None is a lost sample, and so is one that no aircraft can give: `lost`
-        has the reason, and the first of a row is a RuntimeWarning. t may jitter; it never goes
-        back. The failsafe of the guard starts where samples are older than `max_age`. Raises
-        ParameterError for a t that goes back, for a wrong length and for a value that is not
-        finite.
+        A sample that no aircraft can give is lost, as None is: `lost` has the reason, and the first
+        of a row is a RuntimeWarning. y and y_m belong to t. t may jitter; it never goes
+        back. The failsafe of the guard starts where samples are older than `max_age`.
+
+        Args:
+            t: Instant of the tick, s.
+            y: Outputs, shape (m,), SI, deviations from trim, in the order of `outputs`; with vanes
+                of an observer in the order of `measured`. None is a lost sample.
+            y_m: Reference, shape (m,), SI, in the order of `outputs`. None is a lost sample.
+
+        Returns:
+            u, shape (m,), with an allocation (p,), SI, deviation from trim, in the order of
+            `inputs`; 0 before the engagement.
+
+        Raises:
+            ParameterError: t goes back, a length is wrong, or a value is not finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
         last_ns = self._now_ns
@@ -119,15 +130,30 @@ class Loop:
         return self._controller.state.command.copy()
 
     def retune(self, controller: ControllerConfig) -> None:
-        """Replace the parameters before the next tick, without a jump of u. Raises ParameterError
-        as `Controller.retune`.
+        """Replace the parameters before the next tick, without a jump of u.
+
+        Args:
+            controller: The new parameters, of the same law.
+
+        Raises:
+            ParameterError: As of `Controller.retune`.
         """
         self._controller.retune(controller)
         self.config = controller
 
     def vector(self, value: ArrayLike, key: str, names: Sequence[str]) -> FloatArray:
-        """A sample of y or y_m as an array of its own, a value a name. Raises ParameterError with
-        the key.
+        """A sample of y or y_m as an array of its own, a value a name.
+
+        Args:
+            value: The sample, shape (k,), SI.
+            key: Name of the sample, for the sentence.
+            names: The k channels.
+
+        Returns:
+            A copy, shape (k,), float64.
+
+        Raises:
+            ParameterError: The length is wrong, or a value is not finite.
         """
         expected = f"{len(names)} finite numbers: {', '.join(names)}"
         vector = as_array(value, key, expected)
@@ -148,8 +174,27 @@ def fly_plant(
 
     `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
     Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
-    flight early, with the reason in `outcome` of the tape. Raises ParameterError for parameters,
-    for a wrong y, and for outputs or rates that do not fit each other.
+    flight early, with the reason in `outcome` of the tape.
+
+    Args:
+        plant: plant(t, u, dt) -> y: t, dt in s, u (p,), y (m,), SI, deviations from trim.
+        controller: Parameters of the controller, or a mapping as in a scenario.
+        reference_model: Parameters of the reference model, or a mapping as in a scenario.
+        duration: Duration of the flight, s.
+
+    Returns:
+        The tape with y, y_m, u and internals, SI.
+
+    Raises:
+        ParameterError: Parameters or y are invalid, or outputs or rates do not fit together.
+
+    Examples:
+        >>> scenario = rise_di.find_scenario("osprey_servo")
+        >>> def still(t, u, dt):
+        ...     return np.zeros(4)
+        >>> tape = rise_di.fly_plant(still, scenario.controller, scenario.reference_model, 0.1)
+        >>> tape.outcome
+        'completed'
     """
     loop = Loop(controller)
     config = reference_model
@@ -210,9 +255,23 @@ def as_control(
     The period is that of the controller. The state is that of the law, then u and y_m of the last
     tick; from 0 the flight starts in trim. With an allocation the outputs are the effectors, at the
     end of the state. With `linear` the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots
-    and margins: inside the limits the effectors are T u. Raises ParameterError without
-    python-control, for a controller with a feedforward, whose model is beside the law, and with
-    `linear` for the literal sign.
+    and margins: inside the limits the effectors are T u.
+
+    Args:
+        controller: Parameters of the controller, or a mapping as in a scenario.
+        linear: Whether to return the law near e = 0 as a StateSpace.
+
+    Returns:
+        The system, inputs and outputs in SI, with the period of the controller.
+
+    Raises:
+        ParameterError: python-control is missing, the controller has a feedforward, whose model is
+            beside the law, or `linear` meets the literal sign.
+
+    Examples:
+        >>> law = rise_di.as_control(rise_di.find_scenario("osprey_servo").controller, linear=True)
+        >>> law.ninputs, law.noutputs
+        (4, 4)
     """
     require_package("control")
     import control  # noqa: PLC0415 - an extra

@@ -82,7 +82,20 @@ class TunedLaw(NamedTuple):
 def without_limits(
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]:
-    """The function `step` of a law from the function `limited`, with infinite limits."""
+    """The function `step` of a law from the function `limited`, with infinite limits.
+
+    Args:
+        limited: A tick inside limits: (state, measurements, dt, params, limits) -> (state, u before
+            saturation, u).
+
+    Returns:
+        A tick without limits: (state, measurements, dt, params) -> (state, u), u of shape (m,).
+
+    Examples:
+        >>> law = rise_di.find_scenario("osprey_servo").controller.control_law()
+        >>> callable(rise_di.without_limits(law.limited))
+        True
+    """
 
     def step(state: Any, measured: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
         infinite = array_namespace(measured.y).inf + 0.0 * measured.y

@@ -76,7 +76,22 @@ def prepared(parameters: ControllerConfig) -> Prepared:
 
 
 class Controller:
-    """`guard.tick` with state and the last samples of y and y_m."""
+    """`guard.tick` with state and the last samples of y and y_m.
+
+    Args:
+        parameters: Parameters of the controller.
+
+    Raises:
+        ParameterError: `parameters` are no ControllerConfig.
+
+    Examples:
+        >>> controller = rise_di.Controller(rise_di.find_scenario("osprey_servo").controller)
+        >>> sample = rise_di.StampedVector(10_000_000, np.zeros(4))
+        >>> controller.take_y(sample, 10_000_000) + controller.take_y_m(sample, 10_000_000)
+        ''
+        >>> controller.tick(10_000_000).u.tolist()
+        [0.0, 0.0, 0.0, 0.0]
+    """
 
     def __init__(self, parameters: ControllerConfig) -> None:
         as_controller(parameters, "parameters")
@@ -143,8 +158,11 @@ class Controller:
         """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal
         parameters change nothing.
 
-        Raises ParameterError for parameters with a different state: of a different law, or with an
-        observer added.
+        Args:
+            parameters: The new parameters, or the parameters as prepared outside of a tick.
+
+        Raises:
+            ParameterError: The state would differ: a different law, or an observer added.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -217,13 +235,21 @@ class Controller:
         return parameters.models() == self._first.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> str:
-        """Buffer a sample of y, in the law's order. Returns why the sample is lost, as a sentence;
-        empty for a sample taken.
+        """Buffer a sample of y, in the law's order.
 
         Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. A sample
-        whose jump is confirmed engages the law again. Raises ChannelError: reason "future" for a
-        stamp more than the age limit ahead of the clock, reason "order" for a stamp not later than
-        the stamp of the sample taken before.
+        whose jump is confirmed engages the law again.
+
+        Args:
+            sample: The sample, shape (m,), with vanes longer, SI, deviations from trim.
+            now_ns: The clock, ns.
+
+        Returns:
+            Why the sample is lost, a sentence; empty for a sample taken.
+
+        Raises:
+            ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
+                Reason "order": the stamp is not later than the stamp of the sample taken before.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
@@ -244,7 +270,19 @@ class Controller:
         return ""
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
-        """Buffer a sample of y_m, (m,), as `take_y` does; y_m may jump."""
+        """Buffer a sample of y_m, (m,), as `take_y` does; y_m may jump.
+
+        Args:
+            sample: The sample, shape (m,), SI, deviations from trim.
+            now_ns: The clock, ns.
+
+        Returns:
+            Why the sample is lost, a sentence; empty for a sample taken.
+
+        Raises:
+            ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
+                Reason "order": the stamp is not later than the stamp of the sample taken before.
+        """
         if lost := self._lost(self._y_m, sample, now_ns):
             return lost
         self._y_m.append(sample)
@@ -268,8 +306,15 @@ class Controller:
         return sentence
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """A tick at `now_ns`, `late_ns` after the deadline. Returns None where nothing is to be
-        published.
+        """A tick at `now_ns`, `late_ns` after the deadline.
+
+        Args:
+            now_ns: Instant of the tick, ns.
+            late_ns: Time since the deadline, ns.
+            active: Whether the controller may send u.
+
+        Returns:
+            u and the internals, SI; None where nothing is to be published.
         """
         y = self._newest_paired_y()
         was_engaged = self._state.mode is Mode.ENGAGED
@@ -311,6 +356,13 @@ class Controller:
 
         The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u
         of the controller to the failsafe u of the aircraft: the re-engagement is bumpless.
+
+        Args:
+            last_ns: Instant of the last tick, ns.
+            now_ns: Instant of the tick, ns.
+
+        Returns:
+            The instants, ns; empty without an overrun.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
@@ -326,7 +378,14 @@ class Controller:
         return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Ages of the newest received y and y_m, s; an input never received is absent."""
+        """Ages of the newest received y and y_m, s; an input never received is absent.
+
+        Args:
+            now_ns: The clock, ns.
+
+        Returns:
+            Ages by "y" and "y_m", s.
+        """
         newest = {"y": self._y, "y_m": self._y_m}
         return {
             name: seconds(now_ns - samples[-1].stamp_ns)
@@ -335,7 +394,14 @@ class Controller:
         }
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Names of the stale inputs: y or y_m never received or older than the age limit."""
+        """Names of the stale inputs: y or y_m never received or older than the age limit.
+
+        Args:
+            now_ns: The clock, ns.
+
+        Returns:
+            "y", "y_m", or none.
+        """
         ages = self.ages(now_ns)
         limit = seconds(self._guard.max_age_ns)
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)

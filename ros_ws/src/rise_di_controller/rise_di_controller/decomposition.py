@@ -73,10 +73,23 @@ def decompose(Omega: ArrayLike) -> SDU:
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
         S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
 
-    Raises DecompositionError if Omega is not square or not finite, or if a leading minor is zero or
-    nearly so. Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S.
+    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S.
     Morse, "A Gain Matrix Decomposition and Some of Its Applications", Systems & Control Letters 21,
     1993.
+
+    Args:
+        Omega: Matrix C B, shape (m, m), units of y_dot per unit of u.
+
+    Returns:
+        `S` (m, m), the diagonal `D` (m,) of signs, and `U` (m, m).
+
+    Raises:
+        DecompositionError: Omega is not square or not finite, or a leading minor is zero or
+            nearly so.
+
+    Examples:
+        >>> rise_di.decompose([[2.0, 1.0], [0.0, -1.0]]).D.tolist()
+        [1.0, -1.0]
     """
     L, p, W, L_inverse = _eliminate(Omega)
     D = np.sign(p)

@@ -71,6 +71,20 @@ def total_lag(lag: Array, delay: float, period: float) -> Array:
 def engage(y: Array, y_m: Array) -> LawState:
     """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at engagement (bumpless
     transfer).
+
+    Args:
+        y: Outputs, shape (m,), SI.
+        y_m: Reference, shape (m,), SI.
+
+    Returns:
+        The state for the first `step`.
+
+    Raises:
+        ParameterError: `y` is no array of NumPy or of JAX.
+
+    Examples:
+        >>> rise_di.engage(np.ones(2), np.zeros(2)).e_0.tolist()
+        [1.0, 1.0]
     """
     xp = array_namespace(y)
     e = y - y_m
@@ -94,11 +108,31 @@ def step(
     e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead)
     consistent with the prediction: backward Euler of (21), with an error of order dt^2 and without
     chatter. SOFT is for loops with lag. u is the deviation from the input at engagement. sgn(0) =
-    0. dt > 0.
+    0.
 
-    Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units of input_scale.
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
     docs/theory.md.
+
+    Args:
+        state: State after the previous tick, fields (m,).
+        y: Outputs, shape (m,), SI.
+        y_m: Reference, shape (m,), SI.
+        dt: Time since the previous tick, shape (), s, above 0.
+        params: Parameters, fields (m,).
+
+    Returns:
+        The state after the tick, and u, shape (m,), in the units of input_scale.
+
+    Raises:
+        ParameterError: `y` is no array of NumPy or of JAX.
+
+    Examples:
+        >>> params = rise_di.find_scenario("osprey_servo").rise_di().law_params()
+        >>> y = np.full(4, 0.01)
+        >>> state = rise_di.engage(y, y)
+        >>> state, u = rise_di.step(state, y, y, 0.01, params)
+        >>> u.shape
+        (4,)
     """
     xp = array_namespace(y)
     e = y - y_m

@@ -27,13 +27,33 @@ def _registered() -> EntryPoints:
 
 
 def names() -> tuple[str, ...]:
-    """Names of the laws, sorted."""
+    """Names of the laws, sorted.
+
+    Returns:
+        The names that `controller.law` of a scenario takes.
+
+    Examples:
+        >>> "rise_di" in rise_di.laws()
+        True
+    """
     return tuple(sorted({DEFAULT, *_registered().names}))
 
 
 def schema(name: object) -> type[ControllerConfig]:
-    """The parameters of a law. Raises ParameterError for a law not registered, registered twice, or
-    not loadable.
+    """The parameters of a law.
+
+    Args:
+        name: Name of a law, as in `laws`.
+
+    Returns:
+        The parameter set of the law. `model_fields` has the fields with descriptions.
+
+    Raises:
+        ParameterError: The law is not registered, registered twice, or not loadable.
+
+    Examples:
+        >>> rise_di.law_schema("rise_di").__name__
+        'RiseDiConfig'
     """
     if name == DEFAULT:
         return RiseDiConfig

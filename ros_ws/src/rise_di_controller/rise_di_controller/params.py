@@ -61,6 +61,16 @@ longest that the law takes."""
 class ControllerConfig(NodeConfig):
     """Parameters of the controller node that every control law has. A subclass has those of one
     law, as fields.
+
+    Args:
+        values: Values by name of the parameter.
+
+    Raises:
+        ParameterError: A value or a relation between values is invalid.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo").controller.outputs
+        ('q', 'p', 'r', 'V')
     """
 
     needs: ClassVar[str] = ""
@@ -344,8 +354,13 @@ class ControllerConfig(NodeConfig):
         return self.feedforward, self.observer
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Groups of channels of `internals` and the names in each; `law` is the result of
-        `tuned_law`, if known.
+        """Groups of channels of `internals` and the names in each.
+
+        Args:
+            law: The result of `control_law` of `tuned_law`; None: computed.
+
+        Returns:
+            Names of the channels by group.
         """
         estimates = () if self.observer is None else self.observer.states
         effectors = () if self.allocation is None else self.allocation.effectors

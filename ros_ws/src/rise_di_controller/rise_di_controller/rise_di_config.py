@@ -110,7 +110,18 @@ class LearnConfig(Config):
 
 
 class RiseDiConfig(ControllerConfig):
-    """The controller under RISE dynamic inversion, the paper's law."""
+    """The controller under RISE dynamic inversion, the paper's law.
+
+    Args:
+        values: Values by name of the parameter.
+
+    Raises:
+        ParameterError: A value or a relation between values is invalid.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo").rise_di().law_params().K.shape
+        (4,)
+    """
 
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
     k_d: tuple[Positive, ...] = Field(
@@ -265,6 +276,12 @@ class RiseDiConfig(ControllerConfig):
     def at_speed(self, ratio: float) -> Self:
         """The parameters that fly at a part of the trim speed in steady flight, with the models of
         there and no schedule.
+
+        Args:
+            ratio: Airspeed as a part of the trim speed.
+
+        Returns:
+            A copy with the models at the speed.
         """
         return self._at_speed(
             ratio, self._nominal_over_speed(self.known_nominal()), self.tuned_law().params.observer
@@ -359,7 +376,14 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Also the outputs that are given up, of a controller that learns."""
+        """Also the outputs that are given up, of a controller that learns.
+
+        Args:
+            law: As of `ControllerConfig.logged_groups`.
+
+        Returns:
+            Names of the channels by group.
+        """
         grouped = super().logged_groups(law)
         return grouped if self.learn is None else grouped | {internals.GIVEN_UP: self.outputs}
 

@@ -10,6 +10,15 @@ from flight_core.vectors import Array, array_namespace
 class Limits(NamedTuple):
     """Saturation limits, as deviations from trim in units of u; infinite where there is no
     limit.
+
+    Attributes:
+        lower: Least u, shape (m,).
+        upper: Largest u, shape (m,).
+        rate: Largest change of u, shape (m,), per s.
+
+    Examples:
+        >>> rise_di.Limits(np.array([-0.3]), np.array([0.3]), np.array([np.inf])).upper.tolist()
+        [0.3]
     """
 
     lower: Array  # (m,)
@@ -22,6 +31,20 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
     returns to the last bit.
 
     Where u_before is outside of new limits, u moves to the limits at the rate.
+
+    Args:
+        u: Command, shape (m,).
+        u_before: Command of the previous tick, shape (m,), in the units of u.
+        dt: Time since the previous tick, s.
+        limits: Limits, fields (m,).
+
+    Returns:
+        The command within the limits, shape (m,).
+
+    Examples:
+        >>> limits = rise_di.Limits(np.array([-0.3]), np.array([0.3]), np.array([2.0]))
+        >>> rise_di.saturate(np.array([0.5]), np.array([0.28]), 0.01, limits).tolist()
+        [0.3]
     """
     xp = array_namespace(u)
     low, high = bounds(u_before, dt, limits)
@@ -44,10 +67,23 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
         before + max(1 - beyond / change, 0) (after - before)
             where change beyond > 0, otherwise `after`, to the last bit
 
-    So u ends at the limit, and moves at the rate where a rate limit acts. Arguments: `change` of u
-    by the increment; `beyond`, u with the increment less u after saturation, in the same units.
+    So u ends at the limit, and moves at the rate where a rate limit acts.
     Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the
     reduced increment is this project's.
+
+    Args:
+        before: Integral before the tick, shape (m,).
+        after: Integral after the tick without limits, shape (m,).
+        change: Change of u by the increment, shape (m,), in the units of u.
+        beyond: u with the increment less u after saturation, shape (m,), in the units of u.
+
+    Returns:
+        The integral after the tick, shape (m,), in the units of `before`.
+
+    Examples:
+        >>> zero, unit = np.zeros(1), np.ones(1)
+        >>> rise_di.limited_integral(zero, unit, change=unit, beyond=0.25 * unit).tolist()
+        [0.75]
     """
     xp = array_namespace(before)
     outward = change * beyond > 0.0

@@ -73,8 +73,25 @@ def margins(
 
     Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread`
     says, the rows of angles excepted. The controller
-    gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError
-    for the literal sign, and for an aircraft of JSBSim under a controller without a model.
+    gives lags and delay. The uncertainty of the scenario itself is left out.
+
+    Args:
+        scenario: The flight: aircraft and controller.
+        aircraft: Number of uncertain aircraft.
+        uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        seed: Seed of the uncertain aircraft.
+        spread: Distribution of the deviations, and deviations by entry.
+
+    Returns:
+        Margins of the nominal and of the worst aircraft; delay margins in s.
+
+    Raises:
+        ParameterError: The law has the literal sign, or the aircraft is of JSBSim and the
+            controller has no model.
+
+    Examples:
+        >>> rise_di.margins(rise_di.find_scenario("osprey_servo")).delay > 0.03
+        True
     """
     flown = as_scenario(scenario)
     count = as_count(aircraft, "aircraft", 0)

@@ -116,7 +116,15 @@ class ReplayResult(NamedTuple):
         )
 
     def group(self, values: FloatArray, prefix: str) -> Signal:
-        """The channels "prefix.name" of `recorded` or `computed`, with flight time as stamps."""
+        """The channels "prefix.name" of `recorded` or `computed`, with flight time as stamps.
+
+        Args:
+            values: `recorded` or `computed`, shape (N, k).
+            prefix: Group of channels, as "u".
+
+        Returns:
+            The signal of the group, stamps in ns of flight time.
+        """
         return Signal(np.round(self.t * NANOSECONDS).astype(np.int64), self.names, values).group(
             prefix
         )
@@ -132,7 +140,20 @@ def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
     """The scenario of a run, by the run as read, by its folder, or by its scenario as stored.
-    Raises ParameterError.
+
+    Args:
+        run: Folder or file of a run, a run as read, or a scenario as stored.
+
+    Returns:
+        The scenario of the flight.
+
+    Raises:
+        ParameterError: The run cannot be read, or has no scenario.
+
+    Examples:
+        >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.recorded_scenario(flight.mcap).flight.duration
+        0.1
     """
     stored = run if isinstance(run, StoredFile) else _as_run(run).scenario_file()
     return parse_scenario(stored.content, Path(stored.name))
@@ -157,9 +178,6 @@ def replay(
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
 
-    `run` is the folder of a run, a run as read, or a tape. `parameters` are the parameters of the
-    recorded controller, by default from the log, or from the scenario of a simulated tape.
-
     A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the
     activity of the controller come from `internals`. The results are dt, mode, e, the integrals, Pi
     and u.
@@ -168,14 +186,27 @@ def replay(
     so a tick is judged alone. After a gap the state is the logged state of the first engaged tick.
     The ticks up to the first engaged tick are not checked, nor is u_ff until the next engagement.
 
-    `others` computes an open loop: the same inputs with these parameters, and the computed state
-    throughout. Where the log does not begin with the flight, the law engages in the first tick, at
-    the recorded u.
+    Args:
+        run: Folder or file of a run, a run as read, or a tape.
+        parameters: Parameters of the recorded controller; None: from the log, or from the
+            scenario of a simulated tape.
+        others: Parameters of an open loop: the same inputs with these parameters, and the computed
+            state throughout. Where the log does not begin with the flight, the law engages in the
+            first tick, at the recorded u.
+        changes: Parameter changes in flight, in order; None: from the log, none beside `others`. A
+            tick applies the changes up to the parameters of the channel "parameters".
 
-    `changes` are parameter changes in flight, in order, by default from the log, none beside
-    `others`. A tick applies the changes up to the parameters of the channel "parameters". Raises
-    ParameterError for `internals` of different channels or of a version with fewer channels, for
-    invalid changes, and for a log whose provenance names another arithmetic.
+    Returns:
+        N ticks of k channels, as recorded and as computed, shape (N, k), SI.
+
+    Raises:
+        ParameterError: `internals` has different channels or a version with fewer channels, the
+            changes are invalid, or the provenance of the log names a different arithmetic.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.replay(tape).equal()
+        True
     """
     if isinstance(run, Tape):
         return _replay(run, parameters, others, changes)

@@ -46,7 +46,13 @@ class FlightConfig(Config):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario file, read and validated."""
+    """A scenario file, read and validated.
+
+    Examples:
+        >>> scenario = rise_di.find_scenario("osprey_servo")
+        >>> scenario.vary(controller={"beta": [2.0, 2.0, 1.0, 1.0]}).rise_di().beta
+        (2.0, 2.0, 1.0, 1.0)
+    """
 
     name: str
     path: Path
@@ -63,7 +69,17 @@ class Scenario:
         recorder and guidance.
 
         The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays.
-        Without `recorder` the recorder writes at RECORDER_RATE. Raises ParameterError.
+        Without `recorder` the recorder writes at RECORDER_RATE.
+
+        Args:
+            name: Name of the scenario.
+            sections: Parameters, or a parameter set, by section.
+
+        Returns:
+            The scenario, validated.
+
+        Raises:
+            ParameterError: A section or a value is invalid.
         """
         needed = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
         missing = [key for key in needed if key not in sections]
@@ -88,7 +104,16 @@ class Scenario:
         The value of a section is a mapping of new parameters, or a whole parameter set such as the
         `controller` of a second scenario. Lists may be arrays. A different `law` starts without the
         gains of the former law. The copy is validated. A missing section of guidance begins with
-        the numbers by rule. Raises ParameterError.
+        the numbers by rule.
+
+        Args:
+            sections: New parameters, or a whole parameter set, by section.
+
+        Returns:
+            The copy.
+
+        Raises:
+            ParameterError: A section or a value is invalid.
         """
         varied = replace(
             self, **{name: self._varied(name, changes) for name, changes in sections.items()}
@@ -263,8 +288,22 @@ def scenario_yaml(
     """The text of a scenario file with every parameter, defaults included. `overrides` replace
     parameters by section.
 
-    A parameter with the value None or empty, the default, is left out. Raises ParameterError for
-    what is no scenario.
+    A parameter with the value None or empty, the default, is left out.
+
+    Args:
+        scenario: The scenario to write.
+        overrides: New values of parameters by section and name.
+
+    Returns:
+        The text, YAML.
+
+    Raises:
+        ParameterError: `scenario` is no Scenario.
+
+    Examples:
+        >>> text = rise_di.scenario_yaml(rise_di.find_scenario("osprey_servo"))
+        >>> "controller:" in text
+        True
     """
     as_scenario(scenario)
     sections = {}

@@ -19,7 +19,15 @@ LIBRARY = Path(str(files("flight_analysis"))) / "scenarios"
 
 
 def scenarios() -> list[str]:
-    """Names of the scenarios in LIBRARY."""
+    """Names of the scenarios in LIBRARY.
+
+    Returns:
+        The names, sorted.
+
+    Examples:
+        >>> "osprey_servo" in rise_di.scenarios()
+        True
+    """
     return names_in(LIBRARY)
 
 
@@ -27,9 +35,21 @@ def find_scenario(
     name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True
 ) -> Scenario:
     """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s.
-    Raises ParameterError.
 
-    A Scenario is returned as it is, or with the duration. `with_route` as of `load_scenario`.
+    Args:
+        name: Name in the library, path of a scenario file (.yaml), or a Scenario.
+        duration: Duration of the flight, s; None: as in the file.
+        with_route: As of `load_scenario`.
+
+    Returns:
+        The scenario, read and validated. A Scenario stays as given, or gets the duration.
+
+    Raises:
+        ParameterError: No scenario has the name, or the file is invalid.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo", duration=2.0).flight.duration
+        2.0
     """
     if isinstance(name, Scenario):
         scenario = name

@@ -62,10 +62,26 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The
-    rest is as `fly` says.
+    """Fly a scenario in memory. A flight that diverges or is interrupted (Ctrl-C) ends early.
 
-    Raises ParameterError for what is no scenario.
+    Args:
+        scenario: The flight.
+        progress: Called with the flight time, s, once per simulated second.
+        guide: Makes the guidance of a scenario with guidance.
+        control: Makes the controller from the parameters.
+        learn: Makes the learner of a scenario with a learner, as `learner` returns.
+        announce: Takes the events of the learning.
+
+    Returns:
+        The tape: signals of shape (N, k), SI and radians. `outcome` has the reason of an early end.
+
+    Raises:
+        ParameterError: `scenario` is no Scenario, or learns and `learn` is None.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> tape.outcome, tape["y"]["q"].shape
+        ('completed', (51,))
     """
     as_scenario(scenario)
     change = (

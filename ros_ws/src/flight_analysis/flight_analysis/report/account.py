@@ -162,8 +162,21 @@ class Account(NamedTuple):
 def best_error_over(tape: Tape) -> tuple[str, Signal]:
     """Name and signal of the best error on a tape: the true error, or else the measured error.
 
-    Of a log that lacks samples, the name has the part of the flight: "true error, over 49 % of
-    truth".
+    Args:
+        tape: A flight with y and y_m.
+
+    Returns:
+        "true error" or "measured error", of a log that lacks samples with the part of the flight,
+        as "true error, over 49 % of truth", and e = y - y_m, shape (N, m), SI.
+
+    Raises:
+        ParameterError: `tape` is no Tape, or has no y and y_m.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> kind, e = rise_di.best_error(tape)
+        >>> kind, e["q"].shape
+        ('true error', (51,))
     """
     kind, error = best_error(tape)
     part = ""

@@ -20,6 +20,20 @@ def data_frame(tape: Tape) -> "pl.DataFrame":
     The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a
     sample at an instant has nulls there. Of two samples with equal stamps the table holds the
     later.
+
+    Args:
+        tape: A flight.
+
+    Returns:
+        A data frame of polars, in SI and radians.
+
+    Raises:
+        ParameterError: `tape` is no Tape, or has no topic.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.data_frame(tape)["y.q"].drop_nulls().len()
+        51
     """
     import polars as pl  # noqa: PLC0415
 

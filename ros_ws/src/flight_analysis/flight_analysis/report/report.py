@@ -70,7 +70,16 @@ def report(
         scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in
             each log.
 
-    Raises ParameterError for a run that cannot be read, and for a file that cannot be written.
+    Returns:
+        The path of the page, and the flights on the page.
+
+    Raises:
+        ParameterError: A run cannot be read, or a file cannot be written.
+
+    Examples:
+        >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.report(flight.mcap, csv="flight.csv").page.name
+        'report.html'
     """
     require(bool(runs), "runs", "none", A_RUN)
     folders = [as_path(run, "run", A_RUN) for run in runs]

@@ -125,12 +125,27 @@ def read_accounted(
 
     The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several
     files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
-    `run.account` has the share of each topic, and `run.tape.notes` say what the log lacks; a log
-    without a scenario has no account. The file `scenario` replaces the scenario in the log.
-    `remaps` gives topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of
-    remapped nodes without these names. Raises ParameterError for a missing bag, for a bag without a
-    sample, for several aircraft, in a namespace each, of which `namespace` names none, and for a
-    scenario file that cannot be read.
+    `run.tape.account` has the share of each topic, and `run.tape.notes` say what the log lacks; a
+    log without a scenario has no account.
+
+    Args:
+        run: Folder of a run, or a file of the bag.
+        namespace: Namespace of the aircraft, for a log with several aircraft.
+        scenario: Scenario file in place of the scenario in the log.
+        remaps: Topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of
+            remapped nodes without these names.
+
+    Returns:
+        The content of the log: a tape with signals of shape (N, k), SI, the scenario and the files.
+
+    Raises:
+        ParameterError: The bag is missing or has no sample, the log has several aircraft and no
+            `namespace` selects, or the scenario file cannot be read.
+
+    Examples:
+        >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.read_run(flight.mcap).tape["u"].values.shape
+        (11, 4)
     """
     recorded = read_run(run, namespace, scenario, remaps)
     flight_account = log_account(recorded)

@@ -169,9 +169,23 @@ def summarise(
     """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains
     the keys.
 
-    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the
-    argument. `flight_account`: the account of the whole flight where the tape is a part. Raises
-    ParameterError for a tape without y and y_m.
+    Args:
+        tape: A flight with y and y_m.
+        scenario: The scenario of the flight; None: the scenario on the tape. The tape of a log
+            needs the argument.
+        outcome: How the flight ended; None: the outcome on the tape.
+        flight_account: The account of the whole flight, where the tape is a part.
+
+    Returns:
+        The figures by key.
+
+    Raises:
+        ParameterError: The tape has no y and y_m, or no scenario is known.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> rise_di.summarise(tape)["outcome"]
+        'completed'
     """
     flown = as_tape(tape).scenario if scenario is None else scenario
     require(

@@ -114,6 +114,20 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     Zergeroglu. Zeros are of the linear part (A, B, C): f is left out. A published A may contain
     gravity. More inputs than outputs count as m inputs of the law through the pseudo-inverse of C
     B, in SI.
+
+    Args:
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
+
+    Returns:
+        The facts: `poles` (n,) and `zeros`, 1/s, `Omega` (m, m), `D` (m,) and the assumptions.
+
+    Raises:
+        ParameterError: No airframe has the name, or the file is invalid.
+
+    Examples:
+        >>> facts = rise_di.airframe_facts("osprey")
+        >>> facts.poles.shape, facts.Omega.shape
+        ((8,), (4, 4))
     """
     airframe = load_airframe(airframe)
     if len(airframe.inputs) > len(airframe.outputs):

@@ -113,8 +113,17 @@ def select_gains(
             inputs than outputs always have an allocation.
         progress: Called with a sentence before a step of the search for the observer.
 
-    Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with
-    its outputs.
+    Returns:
+        The gain set of Theorem 1 and the engineering gains, with the conditions on the gains.
+
+    Raises:
+        ParameterError: An argument is invalid, or the inputs of the airframe cannot be paired with
+            the outputs.
+
+    Examples:
+        >>> selection = rise_di.select_gains("osprey", samples=1)
+        >>> len(selection.chosen.beta)
+        4
     """
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe)
@@ -180,10 +189,25 @@ def check_gains(
     samples: int = 100,
     seed: int = 1,
 ) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gains of a scenario under any law, and the margins of the loop;
-    arguments as for `select_gains`.
+    """Every condition on the gains of a scenario under any law, and the margins of the loop.
 
-    Raises ParameterError.
+    Args:
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
+        samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
+        seed: Seed of the uncertain airframes.
+
+    Returns:
+        The controller, the conditions and the margins.
+
+    Raises:
+        ParameterError: An argument is invalid.
+
+    Examples:
+        >>> rise_di.check_gains("osprey", samples=1).delay_margin > 0.03
+        True
     """
     chosen = find_scenario(scenario)
     frame = through_allocation(load_airframe(airframe), chosen.controller)

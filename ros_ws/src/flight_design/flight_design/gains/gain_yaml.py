@@ -112,7 +112,20 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file, with units and
     reasons in comments.
 
-    With `theorem` the gain set of Theorem 1 in place of the engineering gains.
+    Args:
+        selection: The result of `select_gains`.
+        theorem: Whether to write the gain set of Theorem 1 in place of the engineering gains.
+
+    Returns:
+        The text of the section, YAML.
+
+    Raises:
+        ParameterError: `selection` is no Selection.
+
+    Examples:
+        >>> text = rise_di.gains_yaml(rise_di.select_gains("osprey", samples=1))
+        >>> "beta:" in text
+        True
     """
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering

@@ -33,7 +33,22 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
 
     The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim
     the rough model is the controller's feedforward. In real time the loop has the delay of the
-    controller's section; in one process and in lockstep u acts at once. Raises ParameterError.
+    controller's section; in one process and in lockstep u acts at once.
+
+    Args:
+        scenario: The flight.
+        real_time: Whether the learner works beside a controller in real time.
+
+    Returns:
+        A function from the parameters of the controller to a learner, or None.
+
+    Raises:
+        ParameterError: The scenario has nothing to learn with.
+
+    Examples:
+        >>> scenario = rise_di.find_scenario("osprey_learn", duration=0.1)
+        >>> rise_di.simulate(scenario, learn=rise_di.learner(scenario)).outcome
+        'completed'
     """
     controller = scenario.controller
     aircraft = scenario.aircraft
