@@ -50,6 +50,15 @@ def test_sections_fit_the_signature(name: str) -> None:
         assert (section(function, "Returns") is None) == returns_nothing
 
 
+DESCRIBED = [name for name in CLASSES if section(CLASSES[name], "Attributes")]
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_attributes_fit_the_fields(name: str) -> None:
+    attributes = section(CLASSES[name], "Attributes") or ""
+    assert re.findall(r"^ {4}(\w+): ", attributes, re.MULTILINE) == parameters(CLASSES[name])
+
+
 def test_every_function_has_an_example() -> None:
     assert set(FUNCTIONS) <= set(EXAMPLES)
 

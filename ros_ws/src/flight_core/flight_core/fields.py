@@ -297,7 +297,7 @@ def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> An
             min_length and max_length of a tuple and of a dict.
 
     Returns:
-        The default of a field in a subclass of `ControllerConfig`.
+        The declaration, for the body of a subclass of `ControllerConfig`.
 
     Examples:
         >>> rise_di.Field(2.0, description="Gain, 1/s.", gt=0).default

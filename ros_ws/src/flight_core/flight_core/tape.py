@@ -22,8 +22,10 @@ from flight_core.vectors import FloatArray
 class Signal:
     """A topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instants of the samples, ascending. values: shape (N, k), of a
-    log with a channel contiguous in memory.
+    Attributes:
+        stamp_ns: Instants of the samples, shape (N,), int64, ns, ascending.
+        names: The k channels.
+        values: Samples, shape (N, k), of a log with a channel contiguous in memory.
 
     Examples:
         >>> q = rise_di.Signal(np.array([0, 2_000_000]), ("q",), np.array([[0.0], [0.1]]))

@@ -138,7 +138,7 @@ class RecordedRun(NamedTuple):
         or every topic.
 
         Args:
-            names: Topics that need a sample; none: the topics of a flight.
+            names: Topics that need a sample; none: at least a topic of a flight.
 
         Raises:
             ParameterError: A topic has no sample.

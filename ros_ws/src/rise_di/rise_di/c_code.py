@@ -26,8 +26,12 @@ LONGEST = 20.0  # s, of a flight without a duration
 
 
 class Exported(NamedTuple):
-    """An exported controller: its files, the proof, None without one, and the text of the
-    report.
+    """An exported controller.
+
+    Attributes:
+        files: The files that were written.
+        proof: The proof; None without a proof.
+        report: The text of the report.
     """
 
     files: list[Path]

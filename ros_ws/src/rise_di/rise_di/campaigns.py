@@ -28,7 +28,13 @@ Progress = Callable[[int, int], None]
 
 
 class CampaignResult(NamedTuple):
-    """A campaign that has flown. `figures` is its summary.json."""
+    """A campaign that has flown.
+
+    Attributes:
+        folder: Folder of the campaign.
+        report: Page of the report.
+        figures: Content of summary.json.
+    """
 
     folder: Path
     report: Path

@@ -157,10 +157,10 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         Args:
             seed: Seed of the draws; None: the draws go on.
-            options: As gymnasium has the argument.
+            options: Unused; gymnasium has the argument.
 
         Returns:
-            The observation, shape (2 m,), SI, and further facts by name.
+            The observation, shape (2 m,), SI, and an empty mapping.
         """
         super().reset(seed=seed, options=options)
         self._y = np.zeros(len(self.outputs))
@@ -308,10 +308,10 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
 
         Args:
             seed: Seed of the draws; None: the draws go on.
-            options: As gymnasium has the argument.
+            options: Unused; gymnasium has the argument.
 
         Returns:
-            The observations, shape (N, 2 m), SI, and further facts by name.
+            The observations, shape (N, 2 m), SI, and an empty mapping.
 
         Raises:
             ParameterError: `seed` is a list.

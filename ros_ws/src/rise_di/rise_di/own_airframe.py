@@ -30,7 +30,14 @@ LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identi
 
 
 class NewAirframe(NamedTuple):
-    """The files that are written, the airframe, and what it was made of."""
+    """An airframe that is written.
+
+    Attributes:
+        airframe_file: Path of the airframe file.
+        scenario_file: Path of the scenario file.
+        airframe: The airframe.
+        note: The source of the airframe, a sentence.
+    """
 
     airframe_file: Path
     scenario_file: Path

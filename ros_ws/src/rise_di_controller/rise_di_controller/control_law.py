@@ -73,7 +73,16 @@ class ControlLaw(NamedTuple):
 
 
 class TunedLaw(NamedTuple):
-    """A control law with parameters."""
+    """A control law with parameters.
+
+    Attributes:
+        control_law: The law.
+        params: Parameters of the law, a NamedTuple of arrays.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo").controller.tuned_law().params.K.shape
+        (4,)
+    """
 
     control_law: ControlLaw
     params: Any

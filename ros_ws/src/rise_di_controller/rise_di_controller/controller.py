@@ -400,7 +400,7 @@ class Controller:
             now_ns: The clock, ns.
 
         Returns:
-            "y", "y_m", or none.
+            The names; empty where y and y_m are fresh.
         """
         ages = self.ages(now_ns)
         limit = seconds(self._guard.max_age_ns)

@@ -32,25 +32,51 @@ class LawParams(NamedTuple):
     The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii)
     about 1. So K is a bandwidth in rad/s, and beta has units of y / s^2. The theorem holds for v as
     for u.
+
+    Attributes:
+        K: Diagonal of equation (22), shape (m,), 1/s.
+        Lambda: Diagonal of Lambda, shape (m,), 1/s.
+        beta: Diagonal of beta, shape (m,), units of y / s^2.
+        D: Diagonal of D, shape (m,), +1 or -1.
+        input_scale: u per scaled input, shape (m,), units of u s / units of y.
+        omega: abs(Omega_ii) in scaled inputs, or an over-estimate, shape (m,); for Sign.IMPLICIT.
+        eps: Half-width of the softened sign, shape (m,), units of y, > 0; for Sign.SOFT.
+        sign: How the sign is sampled. None in the parameters of many aircraft: the control law has
+            the sign then.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo").rise_di().law_params().D.shape
+        (4,)
     """
 
-    K: Array  # (m,) diagonal of equation (22), 1/s
-    Lambda: Array  # (m,) diagonal of Lambda, 1/s
-    beta: Array  # (m,) diagonal of beta, units of y / s^2
-    D: Array  # (m,) diagonal of D, +1 or -1
-    input_scale: Array  # (m,) u per scaled input: units of u s / units of y
-    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, or an over-estimate; for Sign.IMPLICIT only
-    eps: Array  # (m,) half-width of the softened sign, units of y, > 0; for Sign.SOFT only
-    sign: Sign | None  # None in the parameters of many aircraft: the control law has the sign then
+    K: Array
+    Lambda: Array
+    beta: Array
+    D: Array
+    input_scale: Array
+    omega: Array
+    eps: Array
+    sign: Sign | None
 
 
 class LawState(NamedTuple):
-    """State of the law between two ticks, fields of shape (m,)."""
+    """State of the law between two ticks, fields of shape (m,).
 
-    e_0: Array  # e at engagement
-    e: Array  # e at the previous tick
-    integral_e: Array  # integral of e
-    Pi: Array  # equation (21), scaled input
+    Attributes:
+        e_0: e at engagement, units of y.
+        e: e at the previous tick, units of y.
+        integral_e: Integral of e, units of y s.
+        Pi: Equation (21), scaled input.
+
+    Examples:
+        >>> rise_di.engage(np.ones(2), np.zeros(2)).Pi.tolist()
+        [0.0, 0.0]
+    """
+
+    e_0: Array
+    e: Array
+    integral_e: Array
+    Pi: Array
 
 
 def gain(k_g: Array, k_d: Array) -> Array:

@@ -357,7 +357,7 @@ class ControllerConfig(NodeConfig):
         """Groups of channels of `internals` and the names in each.
 
         Args:
-            law: The result of `control_law` of `tuned_law`; None: computed.
+            law: The law of `tuned_law`, if known; None: computed.
 
         Returns:
             Names of the channels by group.

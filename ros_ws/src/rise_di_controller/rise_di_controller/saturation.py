@@ -21,9 +21,9 @@ class Limits(NamedTuple):
         [0.3]
     """
 
-    lower: Array  # (m,)
-    upper: Array  # (m,)
-    rate: Array  # (m,) per s
+    lower: Array
+    upper: Array
+    rate: Array
 
 
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:

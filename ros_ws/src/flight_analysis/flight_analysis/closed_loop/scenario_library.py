@@ -39,7 +39,7 @@ def find_scenario(
     Args:
         name: Name in the library, path of a scenario file (.yaml), or a Scenario.
         duration: Duration of the flight, s; None: as in the file.
-        with_route: As of `load_scenario`.
+        with_route: Whether guidance keeps the route and the program of the file.
 
     Returns:
         The scenario, read and validated. A Scenario stays as given, or gets the duration.

@@ -23,7 +23,12 @@ A_FILE = "the path of a file"
 
 
 class Report(NamedTuple):
-    """A report that is written: the path of the page, and the flights on the page."""
+    """A report that is written.
+
+    Attributes:
+        page: Path of the page.
+        flights: The flights on the page.
+    """
 
     page: Path
     flights: list[RecordedFlight]

@@ -51,7 +51,13 @@ PROVENANCE = "provenance.yaml"
 
 
 class FlightResult(NamedTuple):
-    """A finished flight, with the paths of log and report."""
+    """A finished flight.
+
+    Attributes:
+        flight: The flight with tape and figures.
+        mcap: Path of the log.
+        report: Path of the page.
+    """
 
     flight: RecordedFlight
     mcap: Path

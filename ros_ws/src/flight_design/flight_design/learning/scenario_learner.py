@@ -43,7 +43,7 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         A function from the parameters of the controller to a learner, or None.
 
     Raises:
-        ParameterError: The scenario has nothing to learn with.
+        ParameterError: The schedule or the rough model does not fit the airframe.
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_learn", duration=0.1)
