@@ -247,7 +247,7 @@ def test_option_that_became_a_setting_names_it() -> None:
     unknown = CliRunner().invoke(
         application(["export"]), ["export", "osprey_servo", "--set", "rate=50"]
     )
-    assert str(unknown.exception) == "--set: found 'rate=50', expected one of no settings"
+    assert str(unknown.exception) == "--set: found 'rate=50', expected one of drawn, runner, seed"
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:

@@ -267,10 +267,10 @@ def rise_di(*arguments: str) -> Result:
 @pytest.mark.parametrize(
     ("airframe", "sentence"),
     [
-        ("osprey", "airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
+        ("osprey", "aircraft: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
         (
             "jsbsim:f61",
-            "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH ",
+            "aircraft: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH ",
         ),
     ],
 )

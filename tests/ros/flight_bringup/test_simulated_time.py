@@ -42,6 +42,7 @@ def error(run: Path) -> float:
     return float(np.sqrt(np.mean(internals["e.q"][part] ** 2)))
 
 
+@pytest.mark.alone
 @pytest.mark.longest_pause(0.03)  # s: at 3 times real time near the age limit
 @pytest.mark.parametrize("order", ["nodes first", "simulator first"])
 def test_same_errors_at_any_speed_and_in_lockstep(

@@ -48,9 +48,12 @@ def export(
         ),
     ] = None,
     drawn: Annotated[
-        int, typer.Option(min=1, max=10_000_000, help="Number of drawn steps of the proof.")
+        int,
+        typer.Option(
+            "--set drawn", min=1, max=10_000_000, help="Number of drawn steps of the proof."
+        ),
     ] = 50_000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn inputs.")] = 1,
+    seed: Annotated[int, typer.Option("--set seed", min=0, help="Seed of the drawn inputs.")] = 1,
     compiler: Annotated[
         list[str] | None,
         typer.Option(
@@ -59,7 +62,10 @@ def export(
         ),
     ] = None,
     runner: Annotated[
-        str, typer.Option(help="Command that starts what the compiler makes, as qemu-aarch64.")
+        str,
+        typer.Option(
+            "--set runner", help="Command that starts what the compiler makes, as qemu-aarch64."
+        ),
     ] = "",
     fmu: Annotated[
         bool,

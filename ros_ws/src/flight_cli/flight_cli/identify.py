@@ -211,6 +211,8 @@ def identify(
     """
     needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
     log = None if source is None or source.startswith(PREFIX) else Path(source)
+    if log is not None and not log.exists() and speed is not None:
+        log = None  # the name of an aircraft without its prefix
     aircraft = source if log is None else None
     if bridge is not None:
         unused: dict[str, object] = {
@@ -324,11 +326,14 @@ def _identify_by_steps(
 ) -> None:
     require(
         airframe.startswith(PREFIX),
-        "airframe",
+        "aircraft",
         f"{airframe!r}",
         f"an aircraft of JSBSim, {PREFIX}NAME or {PREFIX}PATH",
     )
-    name = require_aircraft(airframe)
+    try:
+        name = require_aircraft(airframe)
+    except ParameterError as error:  # the option --airframe is that of a log
+        raise ParameterError(f"aircraft{str(error).removeprefix('airframe')}") from None
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
     require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
     path = output or Path(f"jsbsim_{Path(name).stem}.yaml")
