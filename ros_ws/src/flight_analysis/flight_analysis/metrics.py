@@ -186,20 +186,8 @@ def true_error(tape: Tape) -> Signal | None:
 def best_error(tape: Tape) -> tuple[str, Signal]:
     """Name and signal of the best error on a tape: the true error, or else the measured error.
 
-    Args:
-        tape: A flight with y and y_m.
-
-    Returns:
-        "true error" or "measured error", and e = y - y_m, shape (N, m), SI.
-
-    Raises:
-        ParameterError: `tape` is no Tape, or has no y and y_m.
-
-    Examples:
-        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> kind, e = rise_di.best_error(tape)
-        >>> kind, e["q"].shape
-        ('true error', (51,))
+    "true error" or "measured error", and e = y - y_m, shape (N, m), SI. Raises ParameterError for a
+    tape without y and y_m.
     """
     error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)

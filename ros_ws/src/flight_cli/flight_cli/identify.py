@@ -211,7 +211,7 @@ def identify(
     """
     needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
     log = None if source is None or source.startswith(PREFIX) else Path(source)
-    if log is not None and not log.exists() and speed is not None:
+    if bridge is None and log is not None and not log.exists() and speed is not None:
         log = None  # the name of an aircraft without its prefix
     aircraft = source if log is None else None
     if bridge is not None:
