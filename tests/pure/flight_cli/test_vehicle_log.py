@@ -483,6 +483,17 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
             )
 
 
+def test_gains_from_imported_log_state_for_which_link_they_are(
+    flight: Flight, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
+    identify = ["identify", str(bag), "--bridge", "ardupilot", "--speed", "25", "--set", "accept"]
+    result = CliRunner().invoke(app, [*identify, "--write", str(tmp_path / "found")])
+    assert "for 50 ms of further delay over the link (link_delay)" in result.output
+    assert result.exit_code == 0
+
+
 def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
     flight: Flight, tmp_path: Path
 ) -> None:

@@ -39,6 +39,7 @@ from flight_design.identification.bridge_identification import (
     join,
     map_text,
     measured_trims,
+    over_link,
     within_range,
 )
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
@@ -123,6 +124,20 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> N
     assert rms["p"] < 0.020
     assert rms["r"] < 0.015
     assert rms["V"] < 0.05
+
+
+def test_gains_from_log_of_the_board_are_for_the_delay_of_the_link_too(
+    identified: Identified,
+) -> None:
+    link_delay = 0.07
+    later = over_link(identified.channels, link_delay)
+    slower = flying_scenario(MAP, later, SPEED, str(identified.folder / "over_link.yaml"))
+    board = identified.flying
+    assert slower.controller.delay == pytest.approx(board.controller.delay + link_delay)
+    # bandwidth times total lag is constant by the engineering procedure: a longer delay, a lower K
+    slow_gains = slower.controller.law_params()
+    fast_gains = board.controller.law_params()
+    assert (slow_gains.K * slow_gains.input_scale < fast_gains.K * fast_gains.input_scale).all()
 
 
 @pytest.fixture(scope="module")

@@ -66,6 +66,11 @@ class ChannelMap(Config):
         "condition tells the transmitter's loss",
     )
     silence: SilenceConfig = Field(description="failsafe for a u that times out")
+    link_delay: NonNegative | None = Field(
+        default=None,
+        description="delay from y on the autopilot's board to u on the surface by way of the "
+        "link, beyond the delay in a log of the board, s; gains from such a log are for both",
+    )
     outputs: Annotated[dict[Name, OutputRow], Field(min_length=1)] = Field(
         description="the channels of y"
     )

@@ -40,6 +40,7 @@ from flight_design.identification.bridge_identification import (
     join,
     map_text,
     measured_trims,
+    over_link,
     require_envelope,
     within_range,
 )
@@ -59,9 +60,13 @@ def identify_behind_bridge(
     as_json: bool,
     needed: Requirement,
     accept: bool,
+    link_delay: float | None,
 ) -> None:
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it
     into `folder`.
+
+    Gains from an imported log are for `link_delay`, s, beyond the delay in the log; None for that
+    of the map.
     """
     channel_map = load_map(map_name)
     require(
@@ -87,6 +92,17 @@ def identify_behind_bridge(
         trims, response, channels = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
         raise ParameterError("; ".join(filter(None, (str(error), ended)))) from None
+    if COMMANDS in tape:
+        later = channel_map.link_delay if link_delay is None else link_delay
+        channels = over_link(channels, later or 0.0)
+        _show_link(console, channel_map, later)
+    else:
+        require(
+            link_delay is None,
+            "link_delay",
+            link_delay,
+            "a log of rise-di import: an experiment over the link contains its delay",
+        )
     channel_map, narrower = within_range(channel_map, trims)
     for sentence in narrower:
         console.print(sentence, highlight=False, soft_wrap=True)
@@ -336,6 +352,21 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
         )
 
 
+def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | None) -> None:
+    """State for which link the gains from a log of the autopilot's board are."""
+    if link_delay is None:
+        sentence = (
+            f"The map {channel_map.name} states no link_delay. Gains and margins are without the "
+            "link: --set link_delay=SECONDS adds its delay."
+        )
+    else:
+        sentence = (
+            f"The log is of the autopilot's board. Gains and margins are for {1e3 * link_delay:.0f}"
+            " ms of further delay over the link (link_delay)."
+        )
+    console.print(sentence, highlight=False, soft_wrap=True)
+
+
 def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:
     controller = flyable.controller
     params = flyable.controller.law_params()
@@ -351,7 +382,7 @@ def _show_gains(console: Console, channels: Channels, response: Response, flyabl
     console.print(table)
     if flyable.delay_margin is not None:
         console.print(
-            f"delay margin beyond the identified delay: {1e3 * flyable.delay_margin:.0f} ms",
+            f"delay margin beyond the delay of the gains: {1e3 * flyable.delay_margin:.0f} ms",
             highlight=False,
         )
 

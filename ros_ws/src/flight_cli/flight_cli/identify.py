@@ -196,6 +196,14 @@ def identify(
             "command; repeat for more.",
         ),
     ] = None,
+    link_delay: Annotated[
+        float | None,
+        typer.Option(
+            "--set link_delay",
+            help="With --bridge and a log of rise-di import: delay of the link beyond the log, s; "
+            "by default that of the map.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a
@@ -238,8 +246,15 @@ def identify(
             )
         require(speed is None or 0.0 < speed < math.inf, "speed", f"{speed}", "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
-        identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
+        require(
+            link_delay is None or 0.0 <= link_delay < math.inf,
+            "link_delay",
+            link_delay,
+            "0 or more",
+        )
+        identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept, link_delay)
         return
+    require(link_delay is None, "link_delay", link_delay, "--bridge beside it")
     require(amplitude is None, "amplitude", amplitude, "--bridge beside it")
     require(
         margin is None or refly or observer or learn,

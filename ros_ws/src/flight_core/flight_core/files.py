@@ -167,7 +167,8 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     expected = f"one of {', '.join(names_in(library))}, or the path of {kind} (.yaml)"
     text = os.fspath(as_path(name, key, expected))
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
-    require(is_file(path), key, repr(text), expected)
+    searched = f", no file in {Path.cwd()}" if text.endswith(".yaml") and text[:1] != "/" else ""
+    require(is_file(path), key, f"{text!r}{searched}", expected)
     return path
 
 

@@ -361,6 +361,13 @@ def join(
     return Channels(Omega, deviation, lag, delay, damping, stiffness, zero, misfit)
 
 
+def over_link(channels: Channels, link_delay: float) -> Channels:
+    """Channels identified from a log of the autopilot's board, as the law meets them over the link:
+    delay + link_delay, s.
+    """
+    return channels._replace(delay=channels.delay + link_delay)
+
+
 class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for a flight."""
 
