@@ -463,9 +463,9 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     surfaces = [key for key in inputs if key != "thrust"]
     dead = surfaces[number % len(surfaces)] if cell.kind == "dead" else ""
     hit = {dead} if dead else {"elevator", "aileron"}
-    key = "lost_at" if dead else "weak_at"
+    kind = "lost" if dead else "weak"
     actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
-    actuators[key] = [DAMAGED if channel in hit else math.inf for channel in inputs]
+    actuators["faults"] = [f"{channel} {kind} {DAMAGED:g}" for channel in inputs if channel in hit]
     chosen = learning(cell, number, END, actuators=actuators)
     flown, start = fly(name, number, chosen), start_of(chosen)
     aircraft = chosen.aircraft.sampled_airframe()

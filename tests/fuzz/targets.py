@@ -545,7 +545,7 @@ _BODIES = [
     {"do": "check", "values": {"k_g": 2.0, "beta": [1.0, 2.0, 3.0, 4.0]}},
     {
         "do": "fault",
-        "values": {"actuators.stuck_at": [None, 2.0, None, None], "sensors.dropout": 0.1},
+        "values": {"actuators.faults": ["elevator stuck 2"], "sensors.dropout": 0.1},
     },
     {"do": "gust", "axis": "vertical", "speed": 10.0, "length": 15.0},
     {"do": "target", "values": {"heading": 1.0, "altitude": 100.0}},

@@ -5,6 +5,7 @@ position saturation.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def positions(
     return history
 
 
-def osprey(step_ms: float = 2.0, **actuators: list[float]) -> PlantParams:
+def osprey(step_ms: float = 2.0, **actuators: Any) -> PlantParams:
     return aircraft_parameters(step=step_ms / 1e3, actuators=actuators).plant()
 
 
@@ -127,7 +128,7 @@ def test_dead_zone_has_no_jump_and_never_reverses_command(
     assert abs(first) <= abs(command)
 
 
-def position_history(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
+def position_history(times_ms: range, command: float, **actuators: Any) -> FloatArray:
     """Positions of the four actuators 10 ms after each of the given instants, with one command for
     all four.
     """
@@ -141,9 +142,9 @@ def position_history(times_ms: range, command: float, **actuators: list[float]) 
 
 def test_stuck_surface_stays_where_it_is_from_instant_on() -> None:
     # Lag 20 ms, elevator stuck at 50 ms: it moves normally until then and keeps its position.
-    lag, never = [0.02] * 4, math.inf
+    lag = [0.02] * 4
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
-    stuck = position_history(range(0, 100, 10), 0.2, lag=lag, stuck_at=[0.05, never, never, never])
+    stuck = position_history(range(0, 100, 10), 0.2, lag=lag, faults=["elevator stuck 0.05"])
     assert (stuck[:, 1:] == healthy[:, 1:]).all()
     assert (stuck[:5, 0] == healthy[:5, 0]).all()
     assert (stuck[5:, 0] == healthy[4, 0]).all()
@@ -151,12 +152,15 @@ def test_stuck_surface_stays_where_it_is_from_instant_on() -> None:
 
 
 def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
-    never = math.inf
     lost = position_history(
         range(0, 80, 10),
         0.2,
-        lost_at=[0.05, never, never, 0.06],
-        stuck_at=[never, never, 0.03, 0.03],
+        faults=[
+            "elevator lost 0.05",
+            "rudder lost 0.06",
+            "aileron stuck 0.03",
+            "rudder stuck 0.03",
+        ],
     )
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
     assert lost[:, 3].tolist() == [0.2] * 6 + [0.0] * 2
@@ -166,14 +170,16 @@ def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
 
 
 def test_fault_within_step_acts_from_next_step_on() -> None:
-    lost = position_history(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)
+    lost = position_history(
+        range(0, 40, 10), 0.2, faults=["elevator lost 0.015", "thrust failed 0.015"]
+    )
     assert lost[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
     assert lost[:, 1].tolist() == [0.2, 0.2, -0.5, -0.5]
 
 
 def test_lost_aileron_acts_like_zero_column_of_b() -> None:
     params, u = (
-        osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]),
+        osprey(faults=["aileron lost 0"]),
         np.array([0.01, 0.1, -0.02, 0.03]),
     )
     without = osprey()
@@ -189,7 +195,7 @@ def test_lost_aileron_acts_like_zero_column_of_b() -> None:
 @pytest.mark.parametrize(("part", "thrust"), [(0.5, 0.35), (0.0, 0.0), (1.0, 0.7), (-1.0, -0.7)])
 def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float) -> None:
     """0.5 in trim and 0.2 above it; without any effect it is an engine that is lost."""
-    params = osprey(weak_at=[math.inf, 0.0, math.inf, math.inf], weak_effect=[part] * 4).actuators
+    params = osprey(faults=[f"thrust weak 0 {part}"]).actuators
     _, mean = move(0.0, np.zeros(4), np.array([0.0, 0.2, 0.0, 0.0]), 0.01, params)
     assert 0.5 + mean[1] == pytest.approx(thrust, abs=1e-15)
     assert mean[[0, 2, 3]].tolist() == [0.0] * 3
@@ -198,12 +204,45 @@ def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float
 def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
     # From 50 ms on at 0.2 (1 - exp(-2.5)) with a lag of 0.2 s; the thrust, which has 1 s, stays as
     # it is.
-    lag, at = [0.02, 1.0, 0.02, 0.02], [0.05, 0.05, math.inf, math.inf]
-    slow = position_history(range(0, 100, 10), 0.2, lag=lag, slow_at=at)
+    lag, faults = [0.02, 1.0, 0.02, 0.02], ["elevator slow 0.05", "thrust slow 0.05"]
+    slow = position_history(range(0, 100, 10), 0.2, lag=lag, faults=faults)
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
     assert (slow[:5] == healthy[:5]).all()
     assert (slow[:, 1:] == healthy[:, 1:]).all()
     assert slow[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5) * math.exp(-0.05 / 0.2)))
+
+
+def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> None:
+    """From 0.1 rad at 0.02 s to the lower stop of -0.3 rad at 2 rad/s: 0.4 / 2 = 0.2 s, behind any
+    lag. The mean of a step of this motion is that of its ends.
+    """
+    params = osprey(
+        lag=[0.05] * 4,
+        rate=[2.0] * 4,
+        lower=[-0.3] * 4,
+        upper=[0.3] * 4,
+        faults=["elevator hard_over 0.02 lower", "aileron hard_over 0 upper"],
+    ).actuators
+    position = np.array([0.1, 0.0, 0.0, 0.0])
+    command = np.array([0.1, 0.0, -0.2, 0.0])
+    history, means = [], []
+    for k in range(30):
+        position, mean = move(0.01 * k, position, command, 0.01, params)
+        history.append(position)
+        means.append(mean)
+    t = 0.01 * np.arange(1, 31)
+    expected = np.maximum(0.1 - 2.0 * np.maximum(t - 0.02, 0.0), -0.3)
+    assert np.array(history)[:, 0] == pytest.approx(expected, abs=1e-12)
+    assert np.array(means)[2:20, 0] == pytest.approx(expected[2:20] + 0.01, abs=1e-12)
+    assert np.array(history)[:, 2] == pytest.approx(np.minimum(2.0 * t, 0.3), abs=1e-12)
+    assert np.array(history)[:, 3].tolist() == [0.0] * 30
+
+
+def test_runaway_without_a_rate_limit_is_at_its_stop_at_once() -> None:
+    found = position_history(
+        range(0, 30, 10), 0.0, upper=[0.3] * 4, faults=["rudder hard_over 0.01 upper"]
+    )
+    assert found[:, 3].tolist() == [0.0, 0.3, 0.3]
 
 
 def test_loose_surface_follows_play_operator() -> None:

@@ -151,7 +151,7 @@ EVERYTHING = {
     "actuators": {
         "lag": [0.02, 0.1, 0.02, 0.02],
         "dead_zone": [0.001] * 4,
-        "stuck_at": [math.inf, math.inf, 0.3, math.inf],
+        "faults": ["aileron stuck 0.3"],
     },
 }
 

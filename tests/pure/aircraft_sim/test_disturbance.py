@@ -279,10 +279,10 @@ SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
         {"A": 0.0, "B": 0.1, "seed": 5},
     ),
     "dead_zone": ("actuators", {"dead_zone": NONE}, {"dead_zone": [1e-4, 0.0, 0.0, 0.0]}),
-    "loose_at": (
+    "loose": (
         "actuators",
-        {"loose_at": [NEVER] * 4},
-        {"loose_at": [0.6, NEVER, NEVER, NEVER], "loose_play": [1e-4] * 4},
+        {"faults": []},
+        {"faults": ["elevator loose 0.6 1e-4"]},
     ),
     "drift of A and B": (
         "drift",

@@ -41,46 +41,43 @@ def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
     return scenario.vary(aircraft=values).aircraft
 
 
-@pytest.mark.parametrize("name", ["osprey_gust", "jsbsim_c172p"])
+THRUST = {"osprey_gust": "thrust", "jsbsim_c172p": "throttle"}
+
+
+@pytest.mark.parametrize("name", THRUST)
 @pytest.mark.parametrize(
-    ("now", "scheduled"),
+    "sentences",
     [
-        (
-            {"actuators": {"stuck_at": [0.0, NEVER, 0.0, NEVER]}},
-            {"actuators": {"stuck_at": [BEGIN, NEVER, BEGIN, NEVER]}},
-        ),
-        (
-            {"actuators": {"lost_at": [0.0, NEVER, NEVER, NEVER]}},
-            {"actuators": {"lost_at": [BEGIN, NEVER, NEVER, NEVER]}},
-        ),
-        (
-            {"actuators": {"weak_at": [0.0, NEVER, NEVER, NEVER]}},
-            {"actuators": {"weak_at": [BEGIN, NEVER, NEVER, NEVER]}},
-        ),
-        (
-            {"actuators": {"lost_at": [NEVER, 0.0, NEVER, NEVER]}},
-            {"actuators": {"lost_at": [NEVER, BEGIN, NEVER, NEVER]}},
-        ),
-        (
-            {"actuators": {"weak_at": [NEVER, 0.0, NEVER, NEVER]}},
-            {"actuators": {"weak_at": [NEVER, BEGIN, NEVER, NEVER]}},
-        ),
-        (
-            {"actuators": {"slow_at": [0.0, NEVER, NEVER, NEVER]}},
-            {"actuators": {"slow_at": [BEGIN, NEVER, NEVER, NEVER]}},
-        ),
-        (
-            {"actuators": {"loose_at": [0.0, NEVER, NEVER, NEVER]}},
-            {"actuators": {"loose_at": [BEGIN, NEVER, NEVER, NEVER]}},
-        ),
-        ({"gusts": {"vertical": GUST}}, {"gusts": {"vertical": GUST}}),
+        ("elevator stuck {}", "aileron stuck {}"),
+        ("elevator lost {}",),
+        ("elevator weak {}",),
+        ("thrust failed {}",),
+        ("thrust weak {}",),
+        ("elevator slow {}",),
+        ("elevator loose {}",),
+        ("elevator hard_over {} upper",),
+        (),
     ],
-    ids=["stuck", "lost", "weak", "engine lost", "engine weak", "slow", "loose", "gust"],
+    ids=lambda sentences: " ".join(sentences) or "gust",
 )
 def test_fault_that_begins_now_is_one_that_was_scheduled(
-    name: str, now: dict[str, Any], scheduled: dict[str, Any]
+    name: str, sentences: tuple[str, ...]
 ) -> None:
-    scenario = find_scenario(name).vary(aircraft={"gusts": {}, "rate": 500.0, "step": 0.002})
+    def section(begin: float) -> dict[str, Any]:
+        if not sentences:
+            return {"gusts": {"vertical": GUST}}
+        faults = [text.format(begin).replace("thrust", THRUST[name]) for text in sentences]
+        return {"actuators": {"upper": [0.1] * 4, "faults": faults}}
+
+    now, scheduled = section(0.0), section(BEGIN)
+    scenario = find_scenario(name).vary(
+        aircraft={
+            "gusts": {},
+            "rate": 500.0,
+            "step": 0.002,
+            "actuators": {"upper": [0.1] * 4} if sentences else {},
+        }
+    )
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
     whole = flown(varied(scenario, **scheduled), varied(scenario, **scheduled))
@@ -135,8 +132,7 @@ def test_drift_that_is_scheduled_in_flight_is_one_of_the_scenario(osprey_gust: S
 def test_faults_may_change_in_flight_and_nothing_else() -> None:
     names = AircraftConfig.tunable()
     assert {
-        "actuators.stuck_at",
-        "actuators.weak_effect",
+        "actuators.faults",
         "sensors.noise",
         "gusts.lateral.start",
         "drift.start",

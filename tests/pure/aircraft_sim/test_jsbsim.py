@@ -160,9 +160,7 @@ def test_actuators_act_before_the_aircraft() -> None:
 
 
 def with_lost_throttle(lost_at: float) -> AircraftConfig:
-    return aircraft_parameters(
-        **SECTION, actuators={"lost_at": [math.inf, lost_at, math.inf, math.inf]}
-    )
+    return aircraft_parameters(**SECTION, actuators={"faults": [f"throttle failed {lost_at}"]})
 
 
 def thrusts(model: JsbsimModel) -> list[float]:

@@ -24,14 +24,15 @@ STEP_NS = 10_000
 HEXAROTOR = str(REPOSITORY / "examples" / "hexarotor" / "hexarotor.yaml")
 
 
-def configured(airframe: str, lost: str, **actuators: Any) -> AircraftConfig:
-    """The aircraft whose effector `lost` is lost at t = 0."""
-    times = [0.0 if name == lost else math.inf for name in load_airframe(airframe).inputs]
+def configured(airframe: str, lost: str, *others: str, **actuators: Any) -> AircraftConfig:
+    """The aircraft whose effector `lost` fails at t = 0, with other faults of each effector."""
+    inputs = load_airframe(airframe).inputs
+    beside = [f"{name} {kind} 0" for name in inputs for kind in others]
     values = {
         "airframe": airframe,
         "rate": 100.0,
         "step": STEP,
-        "actuators": {"lost_at": times} | actuators,
+        "actuators": {"faults": [f"{lost} failed 0", *beside]} | actuators,
     }
     return AircraftConfig.validate_mapping(values, "aircraft")
 
@@ -126,36 +127,74 @@ def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
     nothing = {"osprey_twin": -0.5, "osprey_vtail": -0.5, "x8_elevons": -3.46, HEXAROTOR: -2.45}[
         airframe
     ]
-    always = [0.0] * count  # s
-    beside: tuple[dict[str, list[float]], ...] = (
-        {},
-        {
-            "lag": [0.1] * count,
-            "rate": [0.5] * count,
-            "lower": [-0.1] * count,
-            "upper": [0.1] * count,
-        },
-        {"stuck_at": always},
-        {"slow_at": always, "loose_at": always},
-        {"weak_at": always},
-    )
-    for properties in beside:
+    behind = {
+        "lag": [0.1] * count,
+        "rate": [0.5] * count,
+        "lower": [-0.1] * count,
+        "upper": [0.1] * count,
+    }
+    nothing_else: dict[str, Any] = {}
+    for others, properties in (
+        ((), nothing_else),
+        ((), behind),
+        (("stuck",), nothing_else),
+        (("slow", "loose"), nothing_else),
+        (("weak",), nothing_else),
+    ):
         for command in (-5.0, 0.0, 5.0):
-            found = positions(configured(airframe, effector, **properties), [command] * count)
+            found = positions(
+                configured(airframe, effector, *others, **properties), [command] * count
+            )
             assert found[:, place].tolist() == [nothing] * len(found)
 
 
-@pytest.mark.parametrize("key", ["lost_at", "weak_at"])
-def test_loss_of_an_unknown_thrust_is_refused_with_the_way_out(key: str) -> None:
+def refusal(airframe: str, *faults: str, **actuators: Any) -> str:
+    """The sentence that refuses these faults; empty for possible ones."""
+    values = {"airframe": airframe, "rate": 100.0, "step": 0.01}
+    try:
+        section = actuators | {"faults": list(faults)}
+        AircraftConfig.validate_mapping(values | {"actuators": section}, "aircraft")
+    except ParameterError as refused:
+        return str(refused).removeprefix("aircraft.actuators.")
+    return ""
+
+
+def test_loss_of_an_unknown_thrust_is_refused_with_the_way_out() -> None:
     """An input that is no angle may be a thrust: where it gives none is not guessed."""
-    never = math.inf
-    values = {"airframe": "navion_longitudinal", "rate": 100.0, "step": 0.01}
-    with pytest.raises(ParameterError) as refused:
-        AircraftConfig.validate_mapping(values | {"actuators": {key: [never, 5.0]}}, "aircraft")
-    assert str(refused.value) == (
-        f"aircraft.actuators.{key}: found 5 s for thrust, expected .inf, or no_thrust of thrust "
-        "in the airframe"
-        " navion_longitudinal: its value without thrust, from trim, in 1; 0 for a surface"
+    unknown = (
+        "faults[0]: found thrust {} at 5 s, expected no_thrust of thrust in the airframe "
+        "navion_longitudinal: its value without thrust, from trim; 0 for a surface"
     )
-    for accepted in ([5.0, never], [never, never], []):
-        AircraftConfig.validate_mapping(values | {"actuators": {key: accepted}}, "aircraft")
+    assert refusal("navion_longitudinal", "thrust failed 5") == unknown.format("failed")
+    assert refusal("navion_longitudinal", "elevator lost 5") == ""
+    assert refusal("navion_longitudinal") == ""
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        ("aileron lots 60", "found 'lots', expected lost perhaps, or another of stuck, lost,"),
+        ("ailron lost 60", "found 'ailron', expected aileron perhaps, or another of elevator,"),
+        ("aileron lost", "found 'aileron lost', expected INPUT KIND AT, as aileron lost 60"),
+        ("aileron lost soon", "found 'soon', expected a time in s, as 60"),
+        ("aileron lost -1", "found -1 s, expected a time from 0 on"),
+        ("aileron lost 60 0.5", "found 'aileron lost 60 0.5', expected aileron lost 60 alone"),
+        ("aileron failed 60", "found aileron failed at 60 s, expected lost, of a surface"),
+        ("thrust lost 60", "found thrust lost at 60 s, expected failed, of a thrust"),
+        ("rudder hard_over 60", "found no end stop, expected rudder hard_over 60 lower, or upper"),
+        (
+            "rudder hard_over 60 upper",
+            "found rudder hard_over at 60 s, expected an end stop of rudder in actuators.",
+        ),
+    ],
+)
+def test_fault_that_cannot_be_is_refused_with_the_mend(fault: str, sentence: str) -> None:
+    assert refusal("osprey", fault).startswith(f"faults[0]: {sentence}")
+
+
+def test_keys_of_earlier_versions_and_second_faults_of_a_kind_are_refused() -> None:
+    assert refusal("osprey", lost_at=[0.0] * 4) == (
+        "lost_at: found a key of earlier versions, expected aircraft.actuators.faults, a list of "
+        "INPUT KIND AT, as aileron lost 60"
+    )
+    assert refusal("osprey", "rudder slow 1", "rudder slow 2").endswith("expected one of each kind")

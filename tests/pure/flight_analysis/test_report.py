@@ -204,6 +204,17 @@ def test_each_event_listed_once_in_order_of_start() -> None:
     ]
 
 
+def test_faults_of_effectors_are_events_up_to_the_end(servo: Scenario) -> None:
+    faults = ["rudder hard_over 0.2 upper", "thrust failed 0.4", "aileron lost 7"]
+    flown = servo.vary(
+        aircraft={"actuators": servo.aircraft.actuators.model_dump() | {"faults": faults}}
+    )
+    assert [tuple(event) for event in events(flight(101), {}, flown)] == [
+        ("fault: rudder hard_over", 0.2, 1.0, "upper"),
+        ("fault: thrust failed", 0.4, 1.0, ""),
+    ]
+
+
 def test_every_mode_but_engaged_is_interval_with_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}

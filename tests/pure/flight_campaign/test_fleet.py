@@ -120,34 +120,35 @@ VARIATIONS: dict[str, dict[str, Any]] = {
         "aircraft": {
             "actuators": {
                 "lag": LAG,
-                "weak_at": [np.inf, np.inf, 2.0, np.inf],
-                "slow_at": [np.inf, np.inf, np.inf, 2.0],
-                "loose_at": [1.0, np.inf, np.inf, np.inf],
-                "loose_play": [0.001] * 4,
+                "faults": ["aileron weak 2", "rudder slow 2", "elevator loose 1 0.001"],
             },
             "drift": {"start": 1.0, "duration": 4.0, "A": 0.3, "B": 0.3},
         },
         "flight": {"duration": 8.0},
     },
     "thrust and rudder lost": {
-        "aircraft": {"actuators": {"lag": LAG, "lost_at": [np.inf, 2.0, np.inf, 3.0]}},
+        "aircraft": {"actuators": {"lag": LAG, "faults": ["thrust failed 2", "rudder lost 3"]}},
         "flight": {"duration": 8.0},
     },
     "thrust weak": {
         "aircraft": {
             "actuators": {
                 "lag": LAG,
-                "weak_at": [np.inf, 2.0, np.inf, np.inf],
-                "weak_effect": [0.3] * 4,
+                "faults": ["thrust weak 2 0.3"],
             }
         },
         "flight": {"duration": 8.0},
     },
-    "bias, sines, thrust stuck": {
+    "bias, sines, thrust stuck, rudder hard over": {
         "aircraft": {
             "bias": {"q": {"start": 1.0, "value": 0.5, "rise": 0.5}},
             "sines": {"p": {"amplitude": 0.3, "frequency": 3.0}},
-            "actuators": {"lag": LAG, "stuck_at": [np.inf, 2.0, np.inf, np.inf]},
+            "actuators": {
+                "lag": LAG,
+                "rate": [0.1] * 4,
+                "upper": [0.5, 0.5, 0.5, 0.02],
+                "faults": ["thrust stuck 2", "rudder hard_over 1 upper"],
+            },
         }
     },
 }

@@ -139,8 +139,8 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
             r"\.upper\[0\]: found -0.1, expected greater than or equal to 0",
         ),
         (
-            {"weak_effect": [3.0] * 4},
-            r"\.weak_effect\[0\]: found 3.0, expected less than or equal to 2",
+            {"faults": ["elevator weak 60 3"]},
+            r"\.faults\[0\]: found 3, expected weak_effect from -2 to 2",
         ),
     ],
     "sensors": [
@@ -348,11 +348,6 @@ ENDLESS = {
         "lower",
         "upper",
         "rate",
-        "stuck_at",
-        "lost_at",
-        "weak_at",
-        "slow_at",
-        "loose_at",
     },
     "DriftConfig": {"start"},
     "Gust": {"every"},

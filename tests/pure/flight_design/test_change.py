@@ -4,8 +4,6 @@
 start.
 """
 
-import math
-
 import numpy as np
 import pytest
 
@@ -22,10 +20,7 @@ pytestmark = pytest.mark.slow
 
 
 ACTUATION = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)
-LOST, WEAK = (
-    [0.0, math.inf, math.inf, math.inf],
-    [math.inf, math.inf, 0.0, math.inf],
-)  # s: elevator; aileron, of half effect
+FAULTS = ["elevator lost 0", "aileron weak 0"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +35,7 @@ def damaged() -> tuple[Recording, Airframe]:
             "gusts": {},
             "turbulence": {"altitude": 100.0, "wind": 7.7},
         }
-        | {"actuators": {"lag": ACTUATION.lag.tolist(), "lost_at": LOST, "weak_at": WEAK}},
+        | {"actuators": {"lag": ACTUATION.lag.tolist(), "faults": FAULTS}},
         reference_model={
             "rate": 100.0,
             "pulses": {"p": {"start": [3.0, 5.0], "stop": [4.0, 6.0], "value": [0.2, -0.2]}},

@@ -185,10 +185,7 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
     15 mrad/s; u inside.
     """
     scenario = find_scenario(name)
-    inputs = list(scenario.aircraft.channels().inputs)
-    lost = scenario.aircraft.actuators.model_dump() | {
-        "lost_at": [1.0 if key == effector else np.inf for key in inputs]
-    }
+    lost = scenario.aircraft.actuators.model_dump() | {"faults": [f"{effector} lost 1"]}
     scenario = scenario.vary(
         aircraft={"actuators": lost, "rate": 200.0, "step": 0.005},
         reference_model={"rate": 200.0},

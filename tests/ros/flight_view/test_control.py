@@ -112,7 +112,7 @@ def test_flight_commanded_from_page_recorded_and_replayed(
     page.until(flight, logged=state["digest"])
 
     assert page.post("fault", values={"sensors.bias": [0.01, 0.0, 0.0, 0.0]})[0] == 200
-    assert page.post("fault", values={"actuators.stuck_at": [None, None, None, 0]})[0] == 200
+    assert page.post("fault", values={"actuators.faults": ["rudder stuck 0"]})[0] == 200
     assert (
         page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200
     )  # 4 s: a pause of the host hides no gust
@@ -135,7 +135,7 @@ def test_flight_commanded_from_page_recorded_and_replayed(
         run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None}
     )
     assert [sorted(change) for change in changes[-3:]] == [
-        ["sensors.bias"], ["actuators.stuck_at"],
+        ["sensors.bias"], ["actuators.faults"],
         ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
     ]  # fmt: skip
     log = Flight(run)

@@ -39,7 +39,12 @@ class Actuators(NamedTuple):
         None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
     )
     loose_play: Array | None = None  # (m,) half-width of the backlash
+    hard_over_at: Array | None = (
+        None  # (m,) when it runs away to `hard_over_to`, s of flight time, inf = never
+    )
+    hard_over_to: Array | None = None  # (m,) end stop, deviation from trim
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
+    runs_to: Array | None = None  # (m,) end stop of a runaway in force; nan: follows the command
     no_thrust: Array | None = (
         None  # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
     )
@@ -51,7 +56,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
         wanted  = command - clip(command, -dead_zone, dead_zone)
             dead zone: zero inside, no jump at the edge
         input   = clip(position, wanted - backlash, wanted + backlash)
-            the play operator; wanted without backlash
+            the play operator; wanted without backlash; the end stop of a runaway
         lagged  = input - (input - position) exp(-dt / lag)  exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
@@ -123,7 +128,7 @@ def move(
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
     """Parameters of a step from t on: a slow actuator has at least `slow_lag`, a loose one the
-    backlash `loose_play`.
+    backlash `loose_play`, and a runaway goes to `hard_over_to` at the rate limit, without a lag.
     """
     xp = array_namespace(position)
     if params.slow_at is not None:
@@ -134,6 +139,13 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
     if params.loose_at is not None:
         params = params._replace(
             backlash=xp.where(t >= params.loose_at, params.loose_play, 0.0 * position)
+        )
+    if params.hard_over_at is not None:
+        runs = t >= params.hard_over_at
+        lag = 0.0 * position if params.lag is None else params.lag
+        params = params._replace(
+            lag=xp.where(runs, 0.0, lag),
+            runs_to=xp.where(runs, params.hard_over_to, xp.nan),
         )
     return params
 
@@ -158,9 +170,12 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
     xp = array_namespace(command)
     if params.dead_zone is not None:
         command = command - xp.minimum(xp.maximum(command, -params.dead_zone), params.dead_zone)
-    if params.backlash is None:
+    if params.backlash is not None:
+        most = command + params.backlash
+        command = xp.minimum(xp.maximum(position, command - params.backlash), most)
+    if params.runs_to is None:
         return command
-    return xp.minimum(xp.maximum(position, command - params.backlash), command + params.backlash)
+    return xp.where(xp.isnan(params.runs_to), command, params.runs_to)
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:

@@ -4,14 +4,13 @@
 equations.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from aircraft_sim import uncertainty
+from aircraft_sim import effector_faults, uncertainty
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.airspeed import over_airspeed
@@ -29,8 +28,6 @@ from aircraft_sim.jsbsim_aircraft import (
 from aircraft_sim.plant import Drift, PlantParams
 from aircraft_sim.pose import every
 from aircraft_sim.sections import (
-    EFFECTOR_FAULTS,
-    SEVERITIES,
     ActuatorConfig,
     BiasConfig,
     DriftConfig,
@@ -165,12 +162,11 @@ class AircraftConfig(NodeConfig):
         drift.
         """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
-        effectors = {f"actuators.{key}" for key in (*EFFECTOR_FAULTS, *SEVERITIES)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
             "vanes.frozen_at",
             "vanes.dropout",
         }
-        return frozenset(gusts | effectors | sensors | {"drift.start"})
+        return frozenset(gusts | sensors | {"actuators.faults", "drift.start"})
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
@@ -202,11 +198,17 @@ class AircraftConfig(NodeConfig):
                 f"{gust.every:g} s",
                 least,
             )
-        for key, values in self.actuators.model_dump(exclude={"delay"}).items():
+        for key, values in self.actuators.model_dump(exclude={"delay", "faults"}).items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
-        if not self.is_jsbsim:
-            self._check_losses()
+        owner = self.airframe if self.is_jsbsim else f"the airframe {self.airframe}"
+        effector_faults.require_possible(
+            self.actuators.read_faults(),
+            self._stops(),
+            list(channels.inputs),
+            self._no_thrust(),
+            owner,
+        )
         for key in ("bias", "drift", "noise", "quantisation"):
             if values := getattr(self.sensors, key):
                 parameters.require_length(f"sensors.{key}", values, list(channels.outputs))
@@ -292,23 +294,17 @@ class AircraftConfig(NodeConfig):
             )
             require(airframe.speed > 0.0, "vanes.channels", name, f"none: {has_none} speed")
 
-    def _check_losses(self) -> None:
-        """An effector that loses thrust has a known position without thrust."""
-        airframe = load_airframe(self.airframe)
-        for key in ("lost_at", "weak_at"):
-            begins = getattr(self.actuators, key) or (math.inf,) * len(airframe.inputs)
-            for name, begin, position in zip(
-                airframe.inputs, begins, airframe.no_thrust(), strict=True
-            ):
-                required = f".inf, or no_thrust of {name} in the airframe {airframe.name}"
-                meaning = (
-                    "its value without thrust, from trim, in "
-                    f"{airframe.inputs[name].unit}; 0 for a surface"
-                )
-                known = math.isinf(begin) or math.isfinite(position)
-                require(
-                    known, f"actuators.{key}", f"{begin:g} s for {name}", f"{required}: {meaning}"
-                )
+    def _stops(self) -> dict[str, Sequence[float]]:
+        """The end stops by their keys."""
+        return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
+
+    def _no_thrust(self) -> FloatArray:
+        """The inputs without thrust, deviations from trim, SI: nan where unknown. Of JSBSim the
+        throttle is -1 until the model has its trim.
+        """
+        if self.is_jsbsim:
+            return np.array([-float(command.each_engine) for command in INPUTS.values()])
+        return load_airframe(self.airframe).no_thrust()
 
     def _check_jsbsim(self) -> None:
         require_aircraft(self.airframe)
@@ -440,19 +436,16 @@ class AircraftConfig(NodeConfig):
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
-        lists = self.actuators.model_dump(exclude={"delay"})
-        arrays = {key: _array(values, key in {"lag", "dead_zone"}) for key, values in lists.items()}
-        for key, severity in EFFECTOR_FAULTS.items():
-            times = arrays[key]
-            if times is None or np.isinf(times).all():
-                arrays[key] = None
-            elif severity is not None and arrays[severity] is None:
-                arrays[severity] = np.full(len(times), SEVERITIES[severity])
-        fails = arrays["lost_at"] is not None or arrays["weak_at"] is not None
+        section = self.actuators
+        columns: dict[str, Any] = {
+            key: _array(values, key in {"lag", "dead_zone"})
+            for key, values in section.model_dump(exclude={"delay", "faults"}).items()
+        }
+        inputs = list(self.channels().inputs)
+        columns |= effector_faults.arrays(section.read_faults(), self._stops(), inputs)
+        fails = "lost_at" in columns or "weak_at" in columns
         known = fails and not self.is_jsbsim  # the model of JSBSim has its own trim
-        return Actuators(
-            **arrays, no_thrust=load_airframe(self.airframe).no_thrust() if known else None
-        )
+        return Actuators(**columns, no_thrust=self._no_thrust() if known else None)
 
     def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear

@@ -3,12 +3,14 @@
 """The sections of the parameters of the simulated aircraft."""
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
+from aircraft_sim import effector_faults
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
 from flight_core import parameters
-from flight_core.fields import Field
+from flight_core.fields import Field, Problems
 from flight_core.parameters import (
     Config,
     NonNegative,
@@ -173,19 +175,9 @@ class ActuatorConfig(Config):
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
-    stuck_at: Times = Field(default=(), description="from when on each keeps its position, s")
-    lost_at: Times = Field(
-        default=(), description="from when on each gives no thrust or floats at trim, s"
-    )
-    weak_at: Times = Field(default=(), description="from when on each has `weak_effect`, s")
-    weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
-        default=(), description="factors of the effect, below 0 reversed; none: 0.5"
-    )
-    slow_at: Times = Field(default=(), description="from when on each has `slow_lag`, s")
-    slow_lag: NonNegativesOrNone = Field(default=(), description="least lags, s; none: 0.2 s")
-    loose_at: Times = Field(default=(), description="from when on each has `loose_play`, s")
-    loose_play: NonNegativesOrNone = Field(
-        default=(), description="half-widths of the backlash, SI; none: 0.01"
+    faults: tuple[str, ...] = Field(
+        default=(),
+        description="faults: INPUT KIND AT, at a time in s, perhaps how strong: aileron lost 60",
     )
     delay: float = Field(
         default=0.0,
@@ -194,20 +186,27 @@ class ActuatorConfig(Config):
         description="delay of u before the actuators, s; whole periods of the aircraft",
     )
 
+    @classmethod
+    def read(
+        cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
+    ) -> Self | None:
+        """See `Config.read`; a key of earlier versions is refused with the new key."""
+        old = sorted(effector_faults.OLD_KEYS.intersection(values))
+        if not old:
+            return super().read(values, key, problems, check=check)
+        form = f"{key}.faults, a list of {effector_faults.FORM}"
+        problems.unknown.append(f"{key}.{old[0]}: found a key of earlier versions, expected {form}")
+        return None
 
-EFFECTOR_FAULTS = {
-    "stuck_at": None,
-    "lost_at": None,
-    "weak_at": "weak_effect",
-    "slow_at": "slow_lag",
-    "loose_at": "loose_play",
-}
-"""Times at which faults of effectors begin, with the parameter that says how strong."""
+    def _check(self) -> None:
+        self.read_faults()
 
-
-SEVERITIES = {"weak_effect": 0.5, "slow_lag": 0.2, "loose_play": 0.01}
-"""How strong a fault is where the scenario does not say it: half of the effect, ten times the lag
-of a servo of the osprey, and 0.57 deg, or 1 % of thrust."""
+    def read_faults(self) -> tuple[effector_faults.Fault, ...]:
+        """The faults. Raises ParameterError."""
+        return tuple(
+            effector_faults.read(sentence, f"faults[{number}]")
+            for number, sentence in enumerate(self.faults)
+        )
 
 
 class SensorConfig(Config):

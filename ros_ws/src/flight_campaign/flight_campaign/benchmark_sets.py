@@ -9,10 +9,11 @@ and no gains.
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.turbulence import MODERATE
@@ -121,11 +122,13 @@ class Sets:
                 key: getattr(scenario, key)
                 for key in ("flight", "aircraft", "reference_model", "guidance")
             }
+            described = {
+                key: section and section.model_dump(mode="json", exclude_defaults=True)
+                for key, section in sections.items()
+            }
+            _as_published(described["aircraft"]["actuators"], scenario)
             content[name] = {
-                **{
-                    key: section and section.model_dump(mode="json", exclude_defaults=True)
-                    for key, section in sections.items()
-                },
+                **described,
                 "controller": frame(scenario),
                 "airframe": _airframe(scenario) if flight_set.fleet else None,
                 "rules": [
@@ -156,10 +159,9 @@ def _flown(name: str, scenario: Scenario, release: str) -> Scenario:
             "turbulence": MODERATE | {"seed": seed_of(name, release, "turbulence")},
         }
     if flight_set.damaged:
-        times = [
-            DAMAGE if key in DAMAGED else math.inf for key in scenario.aircraft.channels().inputs
-        ]
-        aircraft["actuators"] = scenario.aircraft.actuators.model_dump() | {"weak_at": times}
+        actuators = scenario.aircraft.actuators.model_dump()
+        hit = [key for key in scenario.aircraft.channels().inputs if key in DAMAGED]
+        aircraft["actuators"] = actuators | {"faults": [f"{key} weak {DAMAGE:g}" for key in hit]}
         scenario = scenario.vary(reference_model={"pulses": _repeated(scenario)})
     if flight_set.fleet:
         aircraft |= {"rate": RATE, "step": STEP}
@@ -184,6 +186,13 @@ def frame(scenario: Scenario) -> dict[str, Any]:
     """The parameters of the controller that every law gets."""
     values = scenario.controller.model_dump()
     return {key: values[key] for key in FRAME}
+
+
+def _as_published(actuators: dict[str, Any], scenario: Scenario) -> None:
+    """Replace the faults of a described section by the lists of the version that was published."""
+    if actuators.pop("faults", None):
+        begins = scenario.aircraft.actuator_model().weak_at
+        actuators["weak_at"] = np.asarray(begins).tolist()
 
 
 def _airframe(scenario: Scenario) -> dict[str, Any]:

@@ -322,10 +322,8 @@ class Control:
         """Read the faults; at first, and where the digest in the log differs, also the controller's
         parameters.
         """
-        stale = not self._digest or self._flight.digest not in {
-            0,
-            self._digest,
-        }  # 0 before the first tick
+        # the digest is 0 before the first tick
+        stale = not self._digest or self._flight.digest not in {0, self._digest}
         scenario = self._flight.scenario
         nodes = self._link.nodes()
         if scenario is not None and "controller" in nodes and stale:
@@ -432,16 +430,18 @@ class Control:
                     HTTPStatus.BAD_REQUEST,
                     f"{short_repr(name)}: no fault, expected one of {', '.join(known)}",
                 )
-        chosen = {name: _numbers(name, value) for name, value in values.items()}
+        chosen = {
+            name: value if _is_sentences(value) else _numbers(name, value)
+            for name, value in values.items()
+        }
         if not (refusal := self._link.set_parameters("aircraft", chosen)):
             self._faults |= chosen
         return refusal
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = request.get("axis")
-        if (
-            not isinstance(axis, str) or not axis.isidentifier()
-        ):  # ROS has no name for half a surrogate pair
+        # ROS has no name for half a surrogate pair
+        if not isinstance(axis, str) or not axis.isidentifier():
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST,
                 f"axis: found {short_repr(axis)}, expected the name of an axis",
@@ -577,6 +577,10 @@ def _number(name: str, value: Any) -> float:
             f"{short_repr(name)}: found {short_repr(value)}, expected a number",
         )
     return number
+
+
+def _is_sentences(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(fault, str) for fault in value)
 
 
 def _numbers(name: str, value: Any) -> Any:

@@ -14,6 +14,8 @@ from autopilot_bridge.client import EngagementClient
 from flight_guidance.client import TargetClient
 from flight_ros.client import Client
 
+STRINGS = Parameter.Type.STRING_ARRAY
+
 
 class ControlClient(Client):
     """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait,
@@ -56,8 +58,10 @@ class ControlClient(Client):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
+        # rclpy takes an empty list for bytes; the one list that may be empty is of faults
         request.parameters = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+            Parameter(name, STRINGS if value == [] else None, value).to_parameter_msg()
+            for name, value in values.items()
         ]
         result = self._call(
             SetParametersAtomically, f"{node}/set_parameters_atomically", request

@@ -91,8 +91,8 @@ class Table(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A gust, a failsafe mode, a saturation or a still vane, from the first to the last instant in
-    s.
+    """A gust, a fault, a failsafe mode, a saturation or a still vane, from the first to the last
+    instant in s.
     """
 
     name: str
@@ -116,7 +116,8 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 
 
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Interval]:
-    """Gusts, modes but ENGAGED, saturations of the inputs, and still vanes, in order of the start.
+    """Gusts, faults of effectors, modes but ENGAGED, saturations of the inputs, and still vanes, in
+    order of the start.
 
     The scenario comes from the tape; the tape of a log has no scenario and needs the argument.
     """
@@ -134,6 +135,11 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                 f"{sum(stop - start for start, stop in spans):.2f} s{times}",
             )
         )
+    end = figures.flight_end(tape)
+    faults = flown.aircraft.actuators.read_faults() if isinstance(flown, Scenario) else ()
+    for fault in faults:
+        if fault.at < end:
+            listed.append(Interval(f"fault: {fault.subject}", fault.at, end, fault.extent))
     if "internals" in tape:
         limited = tape["internals"].group("limited")
         t = tape.time("internals")

@@ -5,7 +5,7 @@ const RENEW = 1500; // ms; the lease lasts 5 s
 const HOLD = 1000; // ms that the button of an engagement is held
 const CHECK = 400; // ms after the last change of a slider
 const ANGLES = ["phi", "theta", "heading", "course"]; // shown in degrees
-const KINDS = ["stuck", "lost", "weak", "slow", "loose"]; // faults of an effector
+const KINDS = ["stuck", "lost", "failed", "weak", "slow", "loose", "hard_over upper", "hard_over lower"]; // faults of an effector
 const DEGREE = Math.PI / 180;
 
 const $ = id => document.getElementById(id);
@@ -178,19 +178,19 @@ function guidance() {
     route, element("div", {className: "row"}, button("Fly this route", fly)));
 }
 
-const since = (kind, k) => state.faults[`actuators.${kind}_at`]?.[k] ?? null; // s, from when on; null is never
+const FAULTS = "actuators.faults"; // sentences "INPUT KIND AT", s: at 0 is now
+const faultsNow = () => state.faults[FAULTS] ?? [];
 
 function faults() {
   const {inputs, outputs, axes} = state.aircraft;
-  const actuators = inputs.map((name, k) => {
+  const actuators = inputs.map(name => {
     const choice = element("select", {}, ...["", ...KINDS].map(kind => new Option(kind || "works", kind)));
     choice.setAttribute("aria-label", `Actuator ${name}`);
-    choice.dataset.actuator = k;
+    choice.dataset.actuator = name;
     choice.addEventListener("change", () => {
-      for (const kind of KINDS) { // the others stay as they are
-        state.faults[`actuators.${kind}_at`] = inputs.map((_, j) => (j === k ? (choice.value === kind ? 0 : null) : since(kind, j)));
-      }
-      const values = Object.fromEntries(KINDS.map(kind => [`actuators.${kind}_at`, state.faults[`actuators.${kind}_at`]]));
+      const [kind, end = ""] = choice.value.split(" ");
+      const others = faultsNow().filter(fault => fault.split(" ")[0] !== name);
+      const values = {[FAULTS]: kind ? [...others, `${name} ${kind} 0 ${end}`.trim()] : others};
       act({do: "fault", values}, `${name}: ${choice.selectedOptions[0].text}`);
     });
     return element("label", {}, `${name} `, choice);
@@ -225,7 +225,8 @@ function faults() {
 function show() {
   if (!state) return;
   for (const choice of document.querySelectorAll("[data-actuator]")) {
-    choice.value = KINDS.findLast(kind => since(kind, Number(choice.dataset.actuator)) !== null) ?? "";
+    const fault = faultsNow().findLast(text => text.split(" ")[0] === choice.dataset.actuator)?.split(" ") ?? [];
+    choice.value = [fault[1], fault[1] === "hard_over" ? fault[3] : ""].filter(Boolean).join(" ");
   }
   const body = $("control-gains");
   if (!body) return;

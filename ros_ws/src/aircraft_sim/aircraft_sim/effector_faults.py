@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of effectors: a list of sentences in a scenario, and the arrays of `actuators`.
+
+    faults: [aileron lost 60, elevator weak 60 0.3, rudder hard_over 20 upper]
+
+A fault is INPUT KIND AT, AT in s of flight time, and for some kinds how strong the fault is.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.parameters import LARGEST, one_of, require
+from flight_core.vectors import FloatArray
+
+
+class Kind(NamedTuple):
+    """A kind of fault: its keys in `actuators.Actuators`, and how strong a fault is."""
+
+    begin: str
+    strength: str = ""  # "": the kind has none
+    default: float = math.nan  # of the strength; nan: the fault says the strength
+    least: float = 0.0
+    most: float = LARGEST
+
+
+HARD_OVER = "hard_over"
+ENDS = ("lower", "upper")
+"""Ends of a runaway, as the keys of the stops."""
+
+KINDS = {
+    "stuck": Kind("stuck_at"),
+    "lost": Kind("lost_at"),
+    "failed": Kind("lost_at"),
+    HARD_OVER: Kind("hard_over_at", "hard_over_to"),
+    "weak": Kind("weak_at", "weak_effect", 0.5, -2.0, 2.0),
+    "slow": Kind("slow_at", "slow_lag", 0.2),
+    "loose": Kind("loose_at", "loose_play", 0.01),
+}
+"""The kinds. Without a strength: half of the effect, ten times the lag of a servo of the osprey in
+s, and a half-width of 0.57 deg, or 1 % of thrust."""
+
+OLD_KEYS = frozenset(key for kind in KINDS.values() for key in (kind.begin, kind.strength) if key)
+"""Keys of earlier versions, lists with a value per input, and of the arrays."""
+
+FORM = "INPUT KIND AT, as aileron lost 60"
+
+
+class Fault(NamedTuple):
+    """A fault of an effector."""
+
+    input: str
+    kind: str
+    at: float  # s of flight time
+    strength: float | None = None  # SI; None without a strength
+    end: str = ""  # of a runaway: one of ENDS
+
+    @property
+    def subject(self) -> str:
+        """As in "aileron lost"."""
+        return f"{self.input} {self.kind}"
+
+    @property
+    def extent(self) -> str:
+        """How strong the fault is; "" for a kind without a strength."""
+        return self.end or ("" if self.strength is None else f"{self.strength:g}")
+
+
+def read(sentence: str, key: str) -> Fault:
+    """The fault of a sentence. Raises ParameterError."""
+    words = sentence.split()
+    require(len(words) in {3, 4}, key, repr(sentence), FORM)
+    name, chosen, at, *how = words
+    require(chosen in KINDS, key, repr(chosen), one_of(tuple(KINDS), chosen))
+    kind = KINDS[chosen]
+    begin = _number(at, key, "a time in s, as 60")
+    require(begin >= 0.0, key, f"{begin:g} s", "a time from 0 on")
+    if chosen == HARD_OVER:
+        end = how[0] if how else "no end stop"
+        require(end in ENDS, key, end, f"{name} {chosen} {at} lower, or upper")
+        return Fault(name, chosen, begin, end=end)
+    require(not how or bool(kind.strength), key, repr(sentence), f"{name} {chosen} {at} alone")
+    if not kind.strength:
+        return Fault(name, chosen, begin)
+    strength = _number(how[0], key, f"{kind.strength} as a number") if how else kind.default
+    bounds = f"{kind.strength} from {kind.least:g} to {kind.most:g}"
+    require(kind.least <= strength <= kind.most, key, f"{strength:g}", bounds)
+    return Fault(name, chosen, begin, strength)
+
+
+def _number(word: str, key: str, expected: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    require(math.isfinite(value), key, repr(word), expected)
+    return value
+
+
+def require_possible(
+    faults: Sequence[Fault],
+    stops: dict[str, Sequence[float]],
+    inputs: Sequence[str],
+    no_thrust: FloatArray,
+    owner: str,
+) -> None:
+    """Raise ParameterError for a fault that these inputs of `owner` cannot have.
+
+    `stops`: the end stops by ENDS; `no_thrust`: the positions without thrust, nan where unknown, 0
+    of a surface.
+    """
+    effects = [(fault.input, KINDS[fault.kind].begin) for fault in faults]
+    for number, fault in enumerate(faults):
+        key = f"actuators.faults[{number}]"
+        require(fault.input in inputs, key, repr(fault.input), one_of(tuple(inputs), fault.input))
+        is_first = effects.index(effects[number]) == number
+        require(is_first, key, f"a second fault {fault.kind} of {fault.input}", "one of each kind")
+        place = list(inputs).index(fault.input)
+        position = no_thrust[place]
+        meant = f"{fault.subject} at {fault.at:g} s"
+        if fault.kind in {"lost", "failed", "weak"}:
+            meaning = "its value without thrust, from trim; 0 for a surface"
+            needed = f"no_thrust of {fault.input} in {owner}: {meaning}"
+            require(bool(np.isfinite(position)), key, meant, needed)
+        is_surface = position == 0.0
+        require(fault.kind != "failed" or is_surface == 0.0, key, meant, "lost, of a surface")
+        require(fault.kind != "lost" or is_surface, key, meant, "failed, of a thrust")
+        if fault.kind == HARD_OVER:
+            values = stops[fault.end]
+            is_bounded = bool(values) and math.isfinite(values[place])
+            needed = f"an end stop of {fault.input} in actuators.{fault.end}"
+            require(is_bounded, key, meant, needed)
+
+
+def arrays(
+    faults: Sequence[Fault], stops: dict[str, Sequence[float]], inputs: Sequence[str]
+) -> dict[str, Any]:
+    """The faults as fields of `actuators.Actuators`, shapes (m,): infinite for never."""
+    columns: dict[str, Any] = {}
+    for fault in faults:
+        kind = KINDS[fault.kind]
+        place = list(inputs).index(fault.input)
+        begins = columns.setdefault(kind.begin, np.full(len(inputs), np.inf))
+        begins[place] = min(begins[place], fault.at)
+        if kind.strength:
+            strengths = columns.setdefault(kind.strength, np.zeros(len(inputs)))
+            strengths[place] = stops[fault.end][place] if fault.end else fault.strength
+    return columns
