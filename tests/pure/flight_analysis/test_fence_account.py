@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flight_analysis.report.account import Account, account_of_json, final_outcome
-from flight_analysis.report.guided import Outside, time_outside
+from flight_analysis.report.guided import Outside, orbit_missed_by, time_outside
 from flight_core.outcome import (
     COMPLETED,
     INTERRUPTED,
@@ -16,9 +16,10 @@ from flight_core.outcome import (
 )
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
-from flight_guidance.guidance_state import LARGEST
+from flight_guidance.guidance import digest
+from flight_guidance.guidance_state import LARGEST, Lateral
 from flight_guidance.notices import Notices
-from flight_guidance.params import GuidanceConfig
+from flight_guidance.params import GuidanceConfig, RouteConfig
 
 SECTION = GuidanceConfig.validate_mapping(
     {
@@ -104,3 +105,21 @@ def test_notices_say_when_an_aircraft_is_outside() -> None:
         "outside of the fence: the shortest way inside, then home",
         "inside of the fence after 4.0 s outside, 300 m at most",
     ]
+
+
+def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
+    """An orbit of 180 m is joined within a radius of the circle."""
+    route = {"north": [0.0, 1000.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
+    section = SECTION.model_copy(update={"fence": {}, "route": RouteConfig(**route), "radius": 180})
+    planned = section.plan(section.waypoints())
+    names = ("mode.lateral", "joining", "leg", "route", "xtrack")
+
+    def off(distance: float, leg: int = len(planned.legs) - 1) -> float:
+        values = np.array([[float(Lateral.ROUTE), 0.0, leg, float(digest(planned)), distance]])
+        return orbit_missed_by(Tape({"guidance": Signal(np.zeros(1), names, values)}, 0), section)
+
+    assert (off(-720.0), off(170.0), off(190.0), off(720.0, 0)) == (720.0, 0.0, 190.0, 0.0)
+    outcome = final_outcome(COMPLETED, Account(10.0, {}, (), off_orbit=720.0))
+    assert outcome == "completed, the last orbit not joined: 720 m"
+    assert exit_status(outcome) == STATUS_INCOMPLETE
+    assert final_outcome(outcome, Account(10.0, {}, ())) == COMPLETED

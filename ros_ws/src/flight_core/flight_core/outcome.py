@@ -12,6 +12,7 @@ OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how
 NOT_FLOWN = (
     "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
 )
+NOT_JOINED = "the last orbit not joined"  # after an outcome and a comma, before how far away
 LANDED = " landed "  # in an outcome, between the aircraft and the time
 IMPORT = "imported"  # of a log that an autopilot wrote
 NEVER_FLEW = "never flew"  # before the reason
@@ -19,9 +20,7 @@ UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # 0 completed or landed
-STATUS_INCOMPLETE = (
-    4  # completed with an incomplete log, a leg missed or not flown, or outside of the fence
-)
+STATUS_INCOMPLETE = 4  # completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside
 LOST_CONTACT = (
     "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 )

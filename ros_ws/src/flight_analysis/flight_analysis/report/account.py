@@ -15,7 +15,14 @@ import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import TRUE_ERROR, best_error
-from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
+from flight_analysis.report.guided import (
+    FlownLeg,
+    Outside,
+    flown_legs,
+    orbit_missed_by,
+    time_outside,
+    unflown_legs,
+)
 from flight_core.modes import Mode
 from flight_core.outcome import (
     COMPLETED,
@@ -24,6 +31,7 @@ from flight_core.outcome import (
     MISSED,
     NEVER_FLEW,
     NOT_FLOWN,
+    NOT_JOINED,
     OUTSIDE,
     UNKNOWN,
     ended_early,
@@ -49,7 +57,8 @@ AIRCRAFT = re.compile(
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(
-    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{INCOMPLETE}).*", re.DOTALL
+    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|{INCOMPLETE}).*",
+    re.DOTALL,
 )  # of an outcome
 
 
@@ -126,6 +135,7 @@ class Account(NamedTuple):
         None  # s, flight time of the first u of a flight that flew less than half of its time
     )
     outside: Outside | None = None  # of the fence; None without one
+    off_orbit: float = 0.0  # m from the last orbit at the end; 0 of an orbit that is joined
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -153,6 +163,7 @@ class Account(NamedTuple):
             "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy,
             "unguided": self.unguided,
             "unflown": list(self.unflown),
+            "off_orbit": self.off_orbit,
             "processes": {name: process._asdict() for name, process in self.processes.items()},
             "commands": None if self.commands is None else self.commands._asdict(),
             "late": self.late,
@@ -222,6 +233,8 @@ def final_outcome(outcome: str, account: Account) -> str:
         parts.append(
             f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}"
         )
+    if account.off_orbit:
+        parts.append(f"{NOT_JOINED}: {account.off_orbit:.0f} m")
     if account.lacks:
         parts.append(f"{INCOMPLETE}: {'; '.join(account.lacks)}")
     return ", ".join(parts)
@@ -363,12 +376,13 @@ def account(
     section = None if scenario is None else scenario.guidance
     legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
     unflown = unflown_legs(tape, section) if legs and section is not None else ()
+    off_orbit = orbit_missed_by(tape, section) if legs and section is not None else 0.0
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
     return Account(
         end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided,
         tuple(legs), tuple(unflown),
         _processes(tape), late=first if first is not None and first > end / 2.0 else None,
-        outside=time_outside(tape, section),
+        outside=time_outside(tape, section), off_orbit=off_orbit,
     )  # fmt: skip
 
 
@@ -712,4 +726,5 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
         commands,
         late,
         outside,
+        content.get("off_orbit", 0.0),
     )

@@ -25,7 +25,7 @@ from flight_guidance.guidance_state import (
 )
 from flight_guidance.notices import LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Route, leg_places, lengths_after, route_outline
+from flight_guidance.path import Route, is_orbit, leg_places, lengths_after, route_outline
 from flight_guidance.zones import clearance
 
 UNITS: Mapping[str, str] = {
@@ -183,6 +183,21 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     )
     route = None if replaced else known_routes(tape, section).get(int(log["route"][last]))
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
+
+
+def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
+    """Distance from the circle of the last orbit at the end of the flight, m; 0 of an orbit that is
+    joined, within the distance at which a leg counts as flown, and of a flight that ends elsewhere.
+    """
+    log = tape["guidance"]
+    if log["mode.lateral"][-1] != Lateral.ROUTE or log["joining"][-1] != 0.0:
+        return 0.0
+    route = known_routes(tape, section).get(int(log["route"][-1]))
+    leg = int(log["leg"][-1])
+    if route is None or leg != len(route.legs) - 1 or not is_orbit(route.legs[leg]):
+        return 0.0
+    distance = abs(float(log["xtrack"][-1]))
+    return distance if distance > route.near(leg) else 0.0
 
 
 class Outside(NamedTuple):
