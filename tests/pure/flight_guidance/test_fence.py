@@ -614,3 +614,40 @@ def test_home_is_target_and_choice_after_loss() -> None:
     for k in range(3, 40):
         step(k, with_pose=False)
     assert step(40)["mode.lateral"] == Lateral.ORBIT
+
+
+def square(half: float, wind: float = 0.0) -> dict[str, Any]:
+    """The osprey's section of guidance, with home in the middle of a square."""
+    corners = {"north": [-half, half, half, -half], "east": [-half, -half, half, half]}
+    limits = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0}
+    return limits | {"wind": wind, "fence": {"field": corners}}
+
+
+def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -> None:
+    """The turn from home leaves home by twice its radius, 137 m with the slip of the prediction,
+    and by what the aircraft flies meanwhile: the orbit of 144 m alone fits into the square.
+    """
+    with pytest.raises(ParameterError) as refused:
+        GuidanceConfig.validate_mapping(square(200.0), "guidance")
+    assert str(refused.value) == (
+        "guidance.home: found a turn from home onto the orbit that is 76 m outside of the fence, "
+        "expected at least 12 m inside; with home 295 m inside every turn fits"
+    )
+    GuidanceConfig.validate_mapping(square(295.0), "guidance")
+    with pytest.raises(ParameterError, match="with home 417 m inside every turn fits"):
+        GuidanceConfig.validate_mapping(square(310.0, 10.0), "guidance")
+
+
+def test_turn_onto_the_orbit_that_fits_to_one_side_is_enough() -> None:
+    """A slot beside home: the better turn goes away from it."""
+    section = square(400.0)
+    section["fence"]["slot"] = {
+        "north": [-400.0, 400.0, 400.0, -400.0],
+        "east": [170.0, 170.0, 200.0, 200.0],
+        "exclude": True,
+    }
+    with pytest.raises(ParameterError, match="a turn from home onto the orbit"):
+        GuidanceConfig.validate_mapping(section, "guidance")
+    section["fence"]["field"]["east"] = [-600.0, -600.0, 600.0, 600.0]
+    section["fence"]["slot"]["east"] = [300.0, 300.0, 330.0, 330.0]
+    GuidanceConfig.validate_mapping(section, "guidance")

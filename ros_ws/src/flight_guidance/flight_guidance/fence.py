@@ -108,6 +108,30 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     return right_turn, left_turn
 
 
+COURSES = 24
+"""Courses and directions of the wind of `room_at_home`."""
+
+
+def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
+    """Least clearance of the better turn from home onto the orbit, m, of COURSES courses in a wind,
+    m/s, from COURSES sides.
+
+    `motion`: the aircraft at home. An aircraft comes over home on any course, and its turn onto the
+    orbit leaves the orbit by up to twice the radius of the turn.
+    """
+    angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
+    from_sides = angles if wind else angles[:1]
+    heading, side = (grid.ravel() for grid in np.meshgrid(angles, from_sides))
+    turning = motion._replace(
+        north=np.full(heading.shape, motion.north),
+        east=np.full(heading.shape, motion.east),
+        phi=np.zeros(heading.shape),
+        heading=heading,
+        wind=(wind * np.cos(side), wind * np.sin(side)),
+    )
+    return float(np.min(np.maximum(*turn_clearance(fence, turning))))
+
+
 def _integral(rate: Array, longest: Array) -> Array:
     """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`, by the
     trapezoidal rule.

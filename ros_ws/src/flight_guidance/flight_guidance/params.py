@@ -30,7 +30,7 @@ from flight_core.units import GRAVITY
 from flight_guidance import protection, reach
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
-from flight_guidance.fence import MARGIN
+from flight_guidance.fence import MARGIN, Motion, room_at_home
 from flight_guidance.guidance_state import (
     TARGETS,
     GuidanceParams,
@@ -352,6 +352,27 @@ class GuidanceConfig(NodeConfig):
         inside = self.fence_clearance(self.home.north, self.home.east)
         expected = f"at least {needed:.0f} m inside, for the orbit round home"
         require(inside >= needed, "home", f"home {described(inside)}", expected)
+        if (fence := self.fence_zones()) is None:
+            return
+        margin = self.fence_margin(self.speed)
+        room = room_at_home(fence, self._at_home(), self.wind)
+        if room < margin:
+            turn = f"a turn from home onto the orbit that is {described(room)}"
+            north, east = fence.home
+            wide = Zone((north,), (east,), radius=20.0 * fence.radius)
+            left = room_at_home(fence._replace(zones=(wide,)), self._at_home(), self.wind)
+            reach = wide.radius - left
+            size = f"with home {math.ceil(reach + margin)} m inside every turn fits"
+            require(False, "home", turn, f"at least {margin:.0f} m inside; {size}")
+
+    def _at_home(self) -> Motion:
+        """The level aircraft over home, with the turns of the fence."""
+        params = self.params()
+        limits = params.limits
+        bank = protection.bank_limit(limits.bank, limits.stall_speed, self.speed)
+        lag = 0.5 / params.attitude.k_phi + params.turn_lag
+        home = (self.home.north, self.home.east)
+        return Motion(*home, 0.0, 0.0, self.speed, (0.0, 0.0), bank, params.attitude.roll_rate, lag)
 
     def fence_zones(self) -> Fence | None:
         """The fence of the equations; None without zones."""
