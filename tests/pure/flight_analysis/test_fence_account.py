@@ -110,13 +110,17 @@ def test_notices_say_when_an_aircraft_is_outside() -> None:
 def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
     """An orbit of 180 m is joined within a radius of the circle."""
     route = {"north": [0.0, 1000.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
-    section = SECTION.model_copy(update={"fence": {}, "route": RouteConfig(**route), "radius": 180})
+    section = SECTION.model_copy(
+        update={"fence": {}, "route": RouteConfig.validate_mapping(route, "route"), "radius": 180}
+    )
     planned = section.plan(section.waypoints())
     names = ("mode.lateral", "joining", "leg", "route", "xtrack")
 
     def off(distance: float, leg: int = len(planned.legs) - 1) -> float:
         values = np.array([[float(Lateral.ROUTE), 0.0, leg, float(digest(planned)), distance]])
-        return orbit_missed_by(Tape({"guidance": Signal(np.zeros(1), names, values)}, 0), section)
+        return orbit_missed_by(
+            Tape({"guidance": Signal(np.zeros(1, dtype=np.int64), names, values)}, 0), section
+        )
 
     assert (off(-720.0), off(170.0), off(190.0), off(720.0, 0)) == (720.0, 0.0, 190.0, 0.0)
     outcome = final_outcome(COMPLETED, Account(10.0, {}, (), off_orbit=720.0))

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from aircraft_sim import identities
 from aircraft_sim.disturbance import AXES
+from aircraft_sim.dynamics import EulerKinematics
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
 from flight_core.parameters import Config, Name, Names, NonNegative, Number, Numbers, require
-from flight_core.units import ANGLE, quantity, si_per_unit
+from flight_core.units import ANGLE, GRAVITY, quantity, si_per_unit
 from flight_core.vectors import FloatArray, selection_matrix
 
 EXPECTED = "an airframe file"
@@ -428,3 +429,26 @@ def _parsed(name: str, path: Path, content: bytes) -> Airframe:
     airframe = Airframe.validate_mapping(parsed, f"airframe {name}")
     check_identities(airframe)
     return airframe
+
+
+EULER_STATES = ("phi", "theta", "p", "q", "r")
+"""States of Euler's equations, in the order of `dynamics.EulerKinematics.select`."""
+
+
+def euler_kinematics(airframe: Airframe) -> EulerKinematics:
+    """The arrays of Euler's equations. Raises ParameterError without a trim speed."""
+    require(
+        airframe.speed > 0.0,
+        "kinematics",
+        "euler without a trim speed",
+        "linear, or an airframe with `speed`",
+    )
+    unit = np.eye(len(airframe.states))
+    rows = airframe.matrix_a()
+    alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
+    return EulerKinematics(
+        select=unit[[airframe.index(name) for name in EULER_STATES]],
+        into=unit[:, [alpha, phi, theta]],
+        linear=np.stack([0.0 * rows[alpha], rows[phi], rows[theta]]),
+        turn_rate=np.array(GRAVITY / airframe.speed),
+    )

@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 from aircraft_sim.airframe import Unit
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.turbulence import Turbulence
+from aircraft_sim.wind_field import RelativeWind
 from flight_core.parameters import ParameterError, require
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
@@ -182,6 +183,7 @@ class WindModel(NamedTuple):
 
     gusts: Gusts
     turbulence: Turbulence | None  # of one step; None without turbulence
+    over_place: RelativeWind | None = None  # None: the wind is the same everywhere
 
 
 @cache

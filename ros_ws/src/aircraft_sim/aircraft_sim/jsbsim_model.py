@@ -17,6 +17,7 @@ from aircraft_sim.jsbsim_commands import command_paths, engine_count, settle
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from aircraft_sim.vanes import ANGLES
+from aircraft_sim.wind_field import body_axes
 from flight_core.outcome import LANDED, FlightEnded
 from flight_core.rates import divide, seconds
 from flight_core.units import FOOT
@@ -108,13 +109,14 @@ class JsbsimModel:
             else turbulence.initial_state(wind_model.turbulence)
         )
         self._position = np.zeros(len(INPUTS))
+        self._altitude = self._node("position/h-sl-ft")
+        self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._apply_wind(self._wind(0))
         settle(
             self._fdm, seconds(condition.step_ns)
         )  # one step: the wind of t = 0 acts from t = 0 on
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
-        self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._velocity = self._ground_velocity()
         self.truth_names = (
             *(f"x.{name}" for name in STATES),
@@ -151,7 +153,9 @@ class JsbsimModel:
             if filters is not None:
                 self._z = turbulence.step(self._z, normals[k], filters)
             after_ns = t_ns + (k + 1) * step_ns
-            if self._wind_model.turbulence is not None or self._wind_model.gusts.speed.any():
+            air = self._wind_model
+            blows = air.turbulence is not None or air.over_place is not None
+            if blows or air.gusts.speed.any():
                 self._apply_wind(self._wind(after_ns))
             try:
                 self._fdm.run()
@@ -250,6 +254,11 @@ class JsbsimModel:
             np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
         )
         filters = self._wind_model.turbulence
+        if (over_place := self._wind_model.over_place) is not None:
+            altitude = self._altitude.get_double_value() * FOOT
+            north, east = self._position_ground.tolist()
+            here = over_place.at(seconds(t_ns), north, east, altitude)
+            gusts = gusts + body_axes(0.0, 0.0, self._heading.get_double_value()) @ here
         return np.asarray(gusts if filters is None else gusts + turbulence.wind(self._z, filters))
 
     def _apply_wind(self, wind: FloatArray) -> None:

@@ -12,10 +12,16 @@ import numpy as np
 
 from aircraft_sim import effector_faults, uncertainty
 from aircraft_sim.actuators import Actuators
-from aircraft_sim.airframe import Airframe, Unit, load_airframe
+from aircraft_sim.airframe import (
+    EULER_STATES,
+    Airframe,
+    Unit,
+    euler_kinematics,
+    load_airframe,
+)
 from aircraft_sim.airspeed import over_airspeed
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
-from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
+from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
     OUTPUTS,
@@ -26,23 +32,28 @@ from aircraft_sim.jsbsim_aircraft import (
     require_aircraft,
 )
 from aircraft_sim.plant import Drift, PlantParams
-from aircraft_sim.pose import every
+from aircraft_sim.pose import Start, every
 from aircraft_sim.sections import (
     ActuatorConfig,
     BiasConfig,
     DriftConfig,
     Gust,
+    MicroburstConfig,
     PoseConfig,
     SensorConfig,
+    ShearConfig,
     SineConfig,
     StartConfig,
     TurbulenceConfig,
     UncertaintyConfig,
     VaneSensorsConfig,
+    require_one_wind,
+    wind_field_of,
 )
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import Turbulence, dryden, filters
 from aircraft_sim.vanes import ANGLES, Vanes
+from aircraft_sim.wind_field import RelativeWind
 from flight_core import parameters
 from flight_core.channels import POSE
 from flight_core.fields import Field
@@ -56,7 +67,6 @@ from flight_core.parameters import (
     require,
 )
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
-from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 
 SHORTEST_STEP = 1e-5  # s: 100,000 integrations a second of flight, which take about as long as 5 s
@@ -118,6 +128,10 @@ class AircraftConfig(NodeConfig):
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
     )
+    shear: ShearConfig | None = Field(
+        default=None, description="how the steady wind changes with the height; none: not at all"
+    )
+    microburst: MicroburstConfig | None = Field(default=None, description="a microburst; none")
     uncertainty: UncertaintyConfig = Field(
         default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
     )
@@ -186,6 +200,7 @@ class AircraftConfig(NodeConfig):
             self._check_jsbsim()
         else:
             self._check_airframe()
+        require_one_wind(self.wind, self.shear, self.microburst)
         channels = self.channels()
         for axis, gust in self.gusts.items():
             least = (
@@ -422,7 +437,7 @@ class AircraftConfig(NodeConfig):
             else None,
             Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
             Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
-            _euler_kinematics(airframe) if self.kinematics == "euler" else None,
+            euler_kinematics(airframe) if self.kinematics == "euler" else None,
         )
 
     def plant(self) -> PlantParams:
@@ -463,9 +478,14 @@ class AircraftConfig(NodeConfig):
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on every axis."""
-        return WindModel(
-            self.gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES)
-        )
+        turbulence = self._turbulence(self.flight_condition().speed, AXES)
+        return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
+
+    def relative_wind(self) -> RelativeWind | None:
+        """The wind that differs from place to place; None without any."""
+        field = wind_field_of(self.wind, self.shear, self.microburst)
+        start = Start(**self.start.model_dump())
+        return None if field is None else RelativeWind(field, start, self.altitude or 0.0)
 
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
         """The gusts as arrays, along these axes."""
@@ -542,28 +562,6 @@ class AircraftConfig(NodeConfig):
         noise = np.array([pose.noise.get(name, 0.0) for name in POSE])
         walk = drift * np.sqrt(self.pose_every() / self.rate) if drift.any() else None
         return Sensors(noise, nanoseconds(pose.delay), 0.0, pose.seed + 2**64, bias, walk)
-
-
-EULER_STATES = ("phi", "theta", "p", "q", "r")
-"""States of Euler's equations, in the order of `dynamics.EulerKinematics.select`."""
-
-
-def _euler_kinematics(airframe: Airframe) -> EulerKinematics:
-    require(
-        airframe.speed > 0.0,
-        "kinematics",
-        "euler without a trim speed",
-        "linear, or an airframe with `speed`",
-    )
-    unit = np.eye(len(airframe.states))
-    rows = airframe.matrix_a()
-    alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
-    return EulerKinematics(
-        select=unit[[airframe.index(name) for name in EULER_STATES]],
-        into=unit[:, [alpha, phi, theta]],
-        linear=np.stack([0.0 * rows[alpha], rows[phi], rows[theta]]),
-        turn_rate=np.array(GRAVITY / airframe.speed),
-    )
 
 
 STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)

@@ -3,10 +3,11 @@
 """The sections of the parameters of the simulated aircraft."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
-from aircraft_sim import effector_faults
+from aircraft_sim import effector_faults, wind_field
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
 from flight_core import parameters
@@ -61,6 +62,105 @@ class TurbulenceConfig(Config):
                 actual,
                 f"{expected} at {self.altitude:g} m: it acts {where}",
             )
+
+
+NEEDS = {
+    "log": ("reference", "roughness"),
+    "power": ("reference", "exponent"),
+    "table": ("height", "north", "east"),
+}
+"""Keys of a wind shear by its law."""
+
+
+class ShearConfig(Config):
+    """The steady wind over the height above the ground: `aircraft.wind` at `reference`, or a
+    table.
+    """
+
+    law: Literal["log", "power", "table"] = Field(description="of the wind over the height")
+    ground: Number = Field(description="the altitude of the ground, m, as `pose`")
+    reference: Positive | None = Field(
+        default=None, description="log, power: the height of `aircraft.wind`, m"
+    )
+    roughness: Positive | None = Field(default=None, description="log: roughness length, m")
+    exponent: Positive | None = Field(default=None, description="power: the exponent, 1")
+    height: tuple[Number, ...] = Field(default=(), description="table: rising heights, m")
+    north: tuple[Number, ...] = Field(
+        default=(), description="table: the wind at these, where the air moves to, m/s"
+    )
+    east: tuple[Number, ...] = Field(default=(), description="table: m/s")
+
+    def _check(self) -> None:
+        every = {key for keys in NEEDS.values() for key in keys}
+        for key in sorted(every):
+            is_set = bool(getattr(self, key))
+            needed = key in NEEDS[self.law]
+            expected = f"{'a value' if needed else 'none'} beside law {self.law}"
+            require(is_set == needed, key, "a value" if is_set else "none", expected)
+        for key in ("north", "east"):
+            if self.law == "table":
+                require_length(key, getattr(self, key), [f"{h:g} m" for h in self.height])
+        rises = all(b > a for a, b in pairwise(self.height))
+        require(rises, "height", list(self.height), "rising heights")
+        if self.reference is not None and self.roughness is not None:
+            expected = f"more than roughness, {self.roughness:g} m"
+            above = self.reference > self.roughness
+            require(above, "reference", f"{self.reference:g} m", expected)
+
+    def profile(self) -> wind_field.Log | wind_field.Power | wind_field.Table:
+        """The profile of the equations."""
+        if self.law == "table":
+            return wind_field.Table(self.height, self.north, self.east)
+        reference = self.reference or math.inf
+        if self.law == "log":
+            return wind_field.Log(reference, self.roughness or math.inf)
+        return wind_field.Power(reference, self.exponent or 0.0)
+
+
+class MicroburstConfig(Config):
+    """A microburst: a downdraft that spreads over the ground."""
+
+    ground: Number = Field(description="the altitude of the ground, m, as `pose`")
+    north: Number = Field(description="of the centre, m")
+    east: Number = Field(description="of the centre, m")
+    radius: Positive = Field(description="the radius R of the downdraft, m")
+    speed: Positive = Field(description="the largest outflow, m/s")
+    height: Positive = Field(description="its height above the ground, m")
+
+    def model(self) -> wind_field.Microburst:
+        """The microburst of the equations."""
+        values = self.model_dump(exclude={"ground"})
+        return wind_field.Microburst(**values)
+
+
+def require_one_wind(
+    wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
+) -> None:
+    """Raise ParameterError for a wind beside a table of the wind, and for two altitudes of the
+    ground.
+    """
+    if shear is not None and shear.law == "table":
+        expected = "0 beside shear.law table, which has the whole wind"
+        require(not any(wind), "wind", list(wind), expected)
+    if shear is not None and burst is not None:
+        expected = f"{shear.ground:g} m, as in shear"
+        same = burst.ground == shear.ground
+        require(same, "microburst.ground", f"{burst.ground:g} m", expected)
+
+
+def wind_field_of(
+    wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
+) -> wind_field.WindField | None:
+    """The wind over the place; None of a wind that is the same everywhere."""
+    section = burst if shear is None else shear
+    if section is None:
+        return None
+    return wind_field.WindField(
+        (wind[0], wind[1]),
+        section.ground,
+        None if shear is None else shear.profile(),
+        None if burst is None else burst.model(),
+    )
 
 
 class BiasConfig(Config):

@@ -12,7 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from aircraft_sim import plant, pose, sensors, truth, turbulence, vanes
+from aircraft_sim import plant, pose, sensors, truth, turbulence, vanes, wind_field
+from aircraft_sim.disturbance import AXES
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
@@ -90,6 +91,13 @@ class StateSpaceModel:
         # north, east, altitude
         self._psi = 0.0
         self._position = [0.0, 0.0, 0.0]
+        self._over_place = parameters.relative_wind()
+        self._wind_here = self._wind_at(0)
+        self._wind_dot = np.zeros(3)
+        self._into = np.zeros((len(states), 3))  # of a change of the wind forward, right, down
+        for k, name in enumerate(("V", "beta", "alpha")):
+            if name in states:
+                self._into[states.index(name), k] = -1.0 if name == "V" else -1.0 / self._speed
         self._psi_dot, self._velocity = (
             self._heading_rate(self._states()),
             self._air_velocity(self._states()),
@@ -104,6 +112,8 @@ class StateSpaceModel:
             begin = 0
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
+        if self._over_place is not None:
+            forced = forced._replace(rate=forced.rate + self._rate_by_wind())
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
         half = seconds(duration_ns) / 2.0
         psi_dot = self._psi_dot
@@ -116,6 +126,30 @@ class StateSpaceModel:
             x + half * (v + w)
             for x, v, w in zip(self._position, velocity, self._velocity, strict=True)
         ]
+        if self._over_place is not None:
+            before = self._wind_here
+            self._position = [
+                x + 2.0 * half * w
+                for x, w in zip(self._position, (*before[:2], -before[2]), strict=True)
+            ]
+            self._wind_here = self._wind_at(t_ns + duration_ns)
+            self._wind_dot = (self._wind_here - before) / (2.0 * half)
+
+    def _wind_at(self, t_ns: int) -> FloatArray:
+        """The wind against that of the start, to the north, to the east and down, m/s."""
+        if self._over_place is None:
+            return np.zeros(3)
+        return self._over_place.at(seconds(t_ns), *self._position)
+
+    def _rate_by_wind(self) -> FloatArray:
+        """x_dot by the change of the wind along the flight, shape (n,): the states V, beta and
+        alpha are relative to the air.
+
+        V_dot -= W_dot forward, beta_dot -= W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is
+        that over the period before. Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
+        """
+        _, _, _, phi, theta, *_ = self._states()
+        return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
     def _drifts(self, t_ns: int) -> bool:
         """Whether the aircraft at t differs from that of the block."""
@@ -131,7 +165,10 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         _, _, beta, phi, theta, *_ = self._states()
         attitude = (pose.wrapped(phi), theta, pose.wrapped(self._psi))
-        return np.array([*attitude, *self._position, *self._velocity, beta])
+        velocity = np.array(self._velocity)
+        if self._over_place is not None:
+            velocity += self._wind_here * [1.0, 1.0, -1.0]
+        return np.array([*attitude, *self._position, *velocity, beta])
 
     def _states(self) -> list[float]:
         """The POSE_STATES, deviations from trim."""
@@ -172,7 +209,13 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
         flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x))
-        return truth.values(self._state, self._block.wind[index], self._block.rate[index], flown)
+        rate = self._block.rate[index]
+        wind = self._block.wind[index]
+        if self._over_place is not None:
+            rate = rate + self._rate_by_wind()
+            along = wind_field.body_axes(0.0, 0.0, self._psi) @ self._wind_here
+            wind = wind + along[[AXES.index(axis) for axis in self._axes]]
+        return truth.values(self._state, wind, rate, flown)
 
     def diverged(self) -> bool:
         """See FlightDynamicsModel."""
@@ -207,7 +250,8 @@ class Simulator:
             )
         else:
             self._model = StateSpaceModel(parameters)
-        self._wind = parameters.wind
+        over_place = parameters.relative_wind()
+        self._wind = parameters.wind if over_place is None else over_place.carried
         self._gusts = parameters.gusts
         self._speed = channels.speed
         self._drift_section = parameters.drift

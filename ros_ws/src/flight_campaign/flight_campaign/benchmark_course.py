@@ -93,6 +93,9 @@ def _require_flyable(scenario: Scenario) -> None:
         "models at other speeds",
         "none: the aircraft of a campaign fly at their trim speed",
     )
+    for key in ("shear", "microburst"):
+        expected = "none: in a campaign the wind is the same everywhere"
+        require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
     fixed = aircraft.over_airspeed is None
     require(
         fixed,

@@ -20,7 +20,8 @@ UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # 0 completed or landed
-STATUS_INCOMPLETE = 4  # completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside
+# completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside
+STATUS_INCOMPLETE = 4
 LOST_CONTACT = (
     "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 )

@@ -76,6 +76,7 @@ def _is_newest_last(scenario: Scenario) -> bool:
         and not scenario.controller.vanes
         and aircraft.drift is None
         and aircraft.over_airspeed is None
+        and aircraft.relative_wind() is None
         and not aircraft.is_jsbsim
     )
 

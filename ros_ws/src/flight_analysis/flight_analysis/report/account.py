@@ -57,7 +57,8 @@ AIRCRAFT = re.compile(
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(
-    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|{INCOMPLETE}).*",
+    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|"
+    rf"{INCOMPLETE}).*",
     re.DOTALL,
 )  # of an outcome
 

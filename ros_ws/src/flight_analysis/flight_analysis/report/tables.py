@@ -137,9 +137,11 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
         )
     end = figures.flight_end(tape)
     faults = flown.aircraft.actuators.read_faults() if isinstance(flown, Scenario) else ()
-    for fault in faults:
-        if fault.at < end:
-            listed.append(Interval(f"fault: {fault.subject}", fault.at, end, fault.extent))
+    listed += [
+        Interval(f"fault: {fault.subject}", fault.at, end, fault.extent)
+        for fault in faults
+        if fault.at < end
+    ]
     if "internals" in tape:
         limited = tape["internals"].group("limited")
         t = tape.time("internals")

@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Wind that depends on the place: a profile over the height (wind shear), and a microburst.
+
+An aircraft flies in an air mass that moves with the wind at its start; what differs from this wind
+elsewhere acts on the aircraft.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.pose import Start
+from flight_core.vectors import FloatArray
+
+LAYER = 12.5
+PEAK_HEIGHT = math.log(LAYER) / (LAYER - 1.0)
+"""z* over the height e of the boundary layer, and the height of the largest outflow over z*."""
+
+PEAK = 0.319086343 * (math.exp(-PEAK_HEIGHT) - math.exp(-LAYER * PEAK_HEIGHT))
+"""Largest outflow of a microburst over scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209, times
+the spread at the height of the largest outflow."""
+
+
+class Log(NamedTuple):
+    """Factor ln(h / z0) / ln(h_ref / z0) on the wind at the reference height; 0 below z0.
+
+    Source: neutral surface layer, MIL-F-8785C, 3.7.3.2.
+    """
+
+    reference: float  # h_ref, m
+    roughness: float  # z0, m
+
+    def factor(self, height: float) -> float:
+        """The factor at a height above the ground, m."""
+        above = max(height / self.roughness, 1.0)
+        return math.log(above) / math.log(self.reference / self.roughness)
+
+
+class Power(NamedTuple):
+    """Factor (h / h_ref)^a on the wind at the reference height; 0 on the ground."""
+
+    reference: float  # h_ref, m
+    exponent: float  # a
+
+    def factor(self, height: float) -> float:
+        """The factor at a height above the ground, m."""
+        return float((max(height, 0.0) / self.reference) ** self.exponent)
+
+
+class Table(NamedTuple):
+    """Wind over the height: linear between the heights, constant beyond."""
+
+    height: tuple[float, ...]  # m, rising
+    north: tuple[float, ...]  # m/s, where the air moves to
+    east: tuple[float, ...]
+
+
+class Microburst(NamedTuple):
+    """A downdraft that spreads over the ground.
+
+        u = l R^2 / 2 r (1 - exp(-r^2 / R^2)) (exp(-z / z*) - exp(-z / e))     outward
+        w = -l exp(-r^2 / R^2) (e (exp(-z / e) - 1) - z* (exp(-z / z*) - 1))   up
+
+    with l = speed / PEAK R, z* = height / PEAK_HEIGHT, e = z* / LAYER; the air keeps its volume.
+    Source: R. M. Oseguera, R. L. Bowles, A Simple, Analytic 3-Dimensional Downburst Model Based on
+    Boundary Layer Stagnation Flow, NASA TM-100632 (1988).
+    """
+
+    north: float  # m, of the centre
+    east: float
+    radius: float  # R, m
+    speed: float  # largest outflow, m/s
+    height: float  # of the largest outflow above the ground, m
+
+    def wind(self, north: float, east: float, height: float) -> tuple[float, float, float]:
+        """Wind at a place, to the north, to the east and down, m/s."""
+        x = north - self.north
+        y = east - self.east
+        r = max(math.hypot(x, y), 1e-6 * self.radius)
+        far = self.height / PEAK_HEIGHT
+        near = far / LAYER
+        z = max(height, 0.0)
+        scale = self.speed / (PEAK * self.radius)
+        core = math.exp(-((r / self.radius) ** 2))
+        spread = math.exp(-z / far) - math.exp(-z / near)
+        outward = scale * self.radius**2 / (2.0 * r) * (1.0 - core) * spread
+        down = scale * core * (near * math.expm1(-z / near) - far * math.expm1(-z / far))
+        return outward * x / r, outward * y / r, down
+
+
+class WindField(NamedTuple):
+    """Wind over the place. `wind` is the steady wind, of `Log` and `Power` that at their reference
+    height.
+    """
+
+    wind: tuple[float, float]  # m/s to the north, to the east
+    ground: float  # altitude of the ground, m, as `pose`
+    shear: Log | Power | Table | None = None
+    microburst: Microburst | None = None
+
+    def at(self, north: float, east: float, altitude: float) -> tuple[float, float, float]:
+        """Wind at a place over ground, to the north, to the east and down, m/s."""
+        height = altitude - self.ground
+        shear = self.shear
+        to_north, to_east = self.wind
+        if isinstance(shear, Table):
+            to_north = float(np.interp(height, shear.height, shear.north))
+            to_east = float(np.interp(height, shear.height, shear.east))
+        elif shear is not None:
+            factor = shear.factor(height)
+            to_north *= factor
+            to_east *= factor
+        if self.microburst is None:
+            return to_north, to_east, 0.0
+        outward = self.microburst.wind(north, east, height)
+        return to_north + outward[0], to_east + outward[1], outward[2]
+
+
+class RelativeWind:
+    """Wind against that of the start, in the axes of a flight that begins at the origin, to the
+    north.
+
+    `carried`: the wind at the start to the north and to the east, m/s, which moves the air mass.
+    """
+
+    def __init__(self, field: WindField, start: Start, altitude: float) -> None:
+        self._field = field
+        self._start = start
+        self.carried = field.at(start.north, start.east, altitude)[:2]
+        self._cos = math.cos(start.heading)
+        self._sin = math.sin(start.heading)
+
+    def at(self, t: float, north: float, east: float, altitude: float) -> FloatArray:
+        """Wind at t and at a place of the flight, to the north, to the east and down, m/s, shape
+        (3,).
+        """
+        cos = self._cos
+        sin = self._sin
+        x = self._start.north + self.carried[0] * t + cos * north - sin * east
+        y = self._start.east + self.carried[1] * t + sin * north + cos * east
+        to_north, to_east, down = self._field.at(x, y, altitude)
+        to_north -= self.carried[0]
+        to_east -= self.carried[1]
+        return np.array([cos * to_north + sin * to_east, cos * to_east - sin * to_north, down])
+
+
+def body_axes(phi: float, theta: float, psi: float) -> FloatArray:
+    """Matrix from north, east, down to forward, right, down of the body, shape (3, 3).
+
+    Source: Stevens, Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eq. (1.3-20).
+    """
+    sin_phi, sin_theta, sin_psi = map(math.sin, (phi, theta, psi))
+    cos_phi, cos_theta, cos_psi = map(math.cos, (phi, theta, psi))
+    tilted = sin_phi * sin_theta
+    upright = cos_phi * sin_theta
+    return np.array(
+        [
+            [cos_theta * cos_psi, cos_theta * sin_psi, -sin_theta],
+            [
+                tilted * cos_psi - cos_phi * sin_psi,
+                tilted * sin_psi + cos_phi * cos_psi,
+                sin_phi * cos_theta,
+            ],
+            [
+                upright * cos_psi + sin_phi * sin_psi,
+                upright * sin_psi - sin_phi * cos_psi,
+                cos_phi * cos_theta,
+            ],
+        ]
+    )
