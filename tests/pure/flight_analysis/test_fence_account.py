@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flight_analysis.report.account import Account, account_of_json, final_outcome
-from flight_analysis.report.guided import Outside, orbit_missed_by, time_outside
+from flight_analysis.report.guided import Outside, orbit_missed_by, time_outside, touched_beside
 from flight_core.outcome import (
     COMPLETED,
     INTERRUPTED,
@@ -19,7 +19,7 @@ from flight_core.tape import Signal, Tape
 from flight_guidance.guidance import digest
 from flight_guidance.guidance_state import LARGEST, Lateral
 from flight_guidance.notices import Notices
-from flight_guidance.params import GuidanceConfig, RouteConfig
+from flight_guidance.params import GuidanceConfig, RouteConfig, ZoneConfig
 
 SECTION = GuidanceConfig.validate_mapping(
     {
@@ -127,3 +127,19 @@ def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
     assert outcome == "completed, the last orbit not joined: 720 m"
     assert exit_status(outcome) == STATUS_INCOMPLETE
     assert final_outcome(outcome, Account(10.0, {}, ())) == COMPLETED
+
+
+def test_landing_beside_its_touch_down_zone_says_so() -> None:
+    """A zone of 400 by 20 m from the threshold on; the wheels touch 300 m on and 14 m beside."""
+    zone = {"north": [0.0, 400.0, 400.0, 0.0], "east": [-10.0, -10.0, 10.0, 10.0]}
+    touchdown = ZoneConfig.validate_mapping(zone, "touchdown")
+    section = SECTION.model_copy(update={"touchdown": touchdown})
+    place = Signal(np.zeros(1, dtype=np.int64), ("north", "east"), np.array([[300.0, 14.0]]))
+    beside = touched_beside(Tape({"pose": place}, 0), section)
+    assert beside == pytest.approx(4.0)
+    assert touched_beside(Tape({"pose": place}, 0), SECTION) == 0.0
+    landed = "osprey landed at t = 9 s"
+    outcome = final_outcome(landed, Account(10.0, {}, (), beside=beside))
+    assert outcome == f"{landed}, outside of the touch-down zone by 4 m"
+    assert exit_status(outcome) == STATUS_INCOMPLETE
+    assert final_outcome(outcome, Account(10.0, {}, ())) == landed

@@ -20,7 +20,7 @@ from aircraft_sim.sensors import DelayLine
 from flight_core import plausible
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import LANDED, FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -350,7 +350,23 @@ class Simulator:
         step = 1 if self._commands else max(number - self._number, 1)
         for k in range(self._number, number, step):
             self._commands.append(u)
-            self._model.advance(k * self.period_ns, self._commands.popleft(), step * self.period_ns)
+            late = self._commands.popleft()
+            try:
+                self._model.advance(k * self.period_ns, late, step * self.period_ns)
+            except FlightEnded as ended:
+                self._number = k + step
+                raise FlightEnded(f"{ended}{self._touch(str(ended))}") from None
+
+    def _touch(self, sentence: str) -> str:
+        """Speed across the heading and the place of a landing, for its sentence; "" of another
+        end.
+        """
+        if LANDED not in sentence:
+            return ""
+        at = dict(zip(POSE, self.pose().tolist(), strict=True))
+        across = at["v_east"] * math.cos(at["psi"]) - at["v_north"] * math.sin(at["psi"])
+        place = f"north {at['north']:.0f} m, east {at['east']:.1f} m"
+        return f", {abs(across):.1f} m/s sideways, at {place}"
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""

@@ -13,6 +13,7 @@ NOT_FLOWN = (
     "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
 )
 NOT_JOINED = "the last orbit not joined"  # after an outcome and a comma, before how far away
+BESIDE = "outside of the touch-down zone"  # after a landing and a comma, before how far
 LANDED = " landed "  # in an outcome, between the aircraft and the time
 IMPORT = "imported"  # of a log that an autopilot wrote
 NEVER_FLEW = "never flew"  # before the reason
@@ -20,7 +21,8 @@ UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # 0 completed or landed
-# completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside
+# completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside of
+# the fence, or landed outside of the touch-down zone
 STATUS_INCOMPLETE = 4
 LOST_CONTACT = (
     "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
@@ -38,7 +40,7 @@ def ended_early(held: float, duration: float) -> str:
 
 def exit_status(outcome: str) -> int:
     """Exit status of a flight by the outcome."""
-    if outcome.startswith(f"{COMPLETED}, ") or f", {OUTSIDE}" in outcome:
+    if outcome.startswith(f"{COMPLETED}, ") or f", {OUTSIDE}" in outcome or BESIDE in outcome:
         return STATUS_INCOMPLETE
     if LANDED in outcome:
         return 0

@@ -286,6 +286,9 @@ class GuidanceConfig(NodeConfig):
     fence: dict[str, ZoneConfig] = Field(
         default={}, description="zones to stay in or to keep out of"
     )
+    touchdown: ZoneConfig | None = Field(
+        default=None, description="where a landing is to touch down; none: anywhere"
+    )
     home: HomeConfig = Field(
         default=HomeConfig(),
         description="where the aircraft goes at a fence and by `guidance/home`",

@@ -21,10 +21,12 @@ from flight_analysis.report.guided import (
     flown_legs,
     orbit_missed_by,
     time_outside,
+    touched_beside,
     unflown_legs,
 )
 from flight_core.modes import Mode
 from flight_core.outcome import (
+    BESIDE,
     COMPLETED,
     INCOMPLETE,
     LANDED,
@@ -57,7 +59,7 @@ AIRCRAFT = re.compile(
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(
-    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|"
+    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|{BESIDE}|"
     rf"{INCOMPLETE}).*",
     re.DOTALL,
 )  # of an outcome
@@ -137,6 +139,7 @@ class Account(NamedTuple):
     )
     outside: Outside | None = None  # of the fence; None without one
     off_orbit: float = 0.0  # m from the last orbit at the end; 0 of an orbit that is joined
+    beside: float = 0.0  # m from the touch-down zone, of a landing; 0 inside
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -165,6 +168,7 @@ class Account(NamedTuple):
             "unguided": self.unguided,
             "unflown": list(self.unflown),
             "off_orbit": self.off_orbit,
+            "beside": self.beside,
             "processes": {name: process._asdict() for name, process in self.processes.items()},
             "commands": None if self.commands is None else self.commands._asdict(),
             "late": self.late,
@@ -220,7 +224,8 @@ def final_outcome(outcome: str, account: Account) -> str:
         else [f"{OUTSIDE} for {outing.outside_s:.1f} s, {outing.farthest_m:.0f} m at most"]
     )
     if LANDED in base:
-        return ", ".join([base, *outside])
+        missed = [f"{BESIDE} by {account.beside:.0f} m"] if account.beside else []
+        return ", ".join([base, *outside, *missed])
     if not base.startswith((COMPLETED, UNKNOWN)):
         return base
     parts = [
@@ -384,6 +389,7 @@ def account(
         tuple(legs), tuple(unflown),
         _processes(tape), late=first if first is not None and first > end / 2.0 else None,
         outside=time_outside(tape, section), off_orbit=off_orbit,
+        beside=touched_beside(tape, section) if LANDED in outcome and section is not None else 0.0,
     )  # fmt: skip
 
 
@@ -728,4 +734,5 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
         late,
         outside,
         content.get("off_orbit", 0.0),
+        content.get("beside", 0.0),
     )

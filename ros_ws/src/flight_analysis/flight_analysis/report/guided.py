@@ -200,6 +200,16 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
     return distance if distance > route.near(leg) else 0.0
 
 
+def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
+    """Distance from the touch-down zone at the end of the flight, m; 0 inside, and without a
+    zone.
+    """
+    if section.touchdown is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
+        return 0.0
+    place = (tape["pose"]["north"][-1:], tape["pose"]["east"][-1:])
+    return max(-float(clearance((section.touchdown.zone(),), *place)[0]), 0.0)
+
+
 class Outside(NamedTuple):
     """The time outside of the fence, while guidance flew."""
 
