@@ -413,7 +413,7 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
     """Channel, content and times of the messages of a chunk with this message index."""
     return [
         (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
-        for batch in decode_batches([Part(Opcode.CHUNK, chunk, [index])])
+        for batch in decode_batches([Part(Opcode.CHUNK, chunk, [index], 0)])
         if isinstance(batch, MessageBatch)
         for message, log_ns, publish_ns in zip(
             batch.data, batch.log_ns, batch.publish_ns, strict=True

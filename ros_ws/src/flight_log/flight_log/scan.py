@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the records of an intact, truncated or damaged MCAP file: up to the truncation, without the
-damaged parts.
+"""Reads the records of an intact, truncated, damaged or growing MCAP file: up to its end, without
+the damaged parts.
 """
 
 import os
@@ -10,11 +10,11 @@ import threading
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import IO, NamedTuple, TypeVar
 
@@ -122,6 +122,7 @@ class Part(NamedTuple):
     opcode: int
     content: bytes
     message_indexes: list[bytes]  # the contents of those behind a chunk
+    end: int  # place behind the record and its message indexes
 
 
 class MessageBatch(NamedTuple):
@@ -146,18 +147,24 @@ T = TypeVar("T")
 
 
 class Scan:
-    """A file, read once by `records` or `batches`. The attributes are valid afterwards."""
+    """A file. `records`, `batches` and `groups` read on where the call before ended, as a growing
+    file needs. The attributes are valid afterwards.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.complete = False  # it has its footer
+        self.position = 0  # bytes that have been read
+        self.ended = False  # the end of the data has been read
+        self.complete = False  # the file has its footer
         self.damaged = 0  # chunks and other parts that could not be read
+        self.endless = 0  # bytes of a record that no file holds, at `position`
         self.known_end_ns = (
             0  # the latest log time in the index and the chunk headers, including lost messages
         )
         self.message_counts: dict[
             int, int
         ] = {}  # by channel, as the index has them; known from the first record on
+        self._messages = 0  # that have been read
 
     @property
     def faults(self) -> str:
@@ -172,34 +179,38 @@ class Scan:
         Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError
         for a file that cannot be read, and nothing for damaged content.
         """
-        return self._read(decode_parts, 0, map)
+        return chain.from_iterable(self._read(decode_parts, 0, map))
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
         """As `records`, many times faster: the messages of a channel in some chunks come
         together.
         """
-        return self._read(decode_batches, JOINED_BYTES, map_ahead)
+        return chain.from_iterable(self._read(decode_batches, JOINED_BYTES, map_ahead))
+
+    def groups(self) -> Iterator[Sequence[McapRecord | MessageBatch]]:
+        """As `batches`, a chunk at a time: a caller may end between two."""
+        return self._read(decode_batches, 0, map)
 
     def _read(
         self,
         decode: Callable[[Sequence[Part]], Iterator[R]],
         joined: int,
-        apply: Callable[..., Iterator[tuple[list[R], int]]],
-    ) -> Iterator[R | Schema | Channel]:
+        apply: Callable[..., Iterator[tuple[Part, list[R], int]]],
+    ) -> Iterator[Sequence[R | Schema | Channel]]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             index = self._index(stream, size)
-            yield from (record for record in index if isinstance(record, Schema | Channel))
-            missing = sum(
-                record.message_count for record in index if isinstance(record, Statistics)
-            )
-            parts = _joined(_with_message_indexes(self._frames(stream, size, index)), joined)
-            for records, damaged in apply(partial(_decoded, decode), parts):
+            yield [record for record in index if isinstance(record, Schema | Channel)]
+            count = sum(record.message_count for record in index if isinstance(record, Statistics))
+            parts = _joined(self._parts(stream, size, index), joined)
+            for last, records, damaged in apply(partial(_decoded, decode), parts):
+                self.position = last.end
+                self.ended = last.opcode in ENDS
                 self.damaged += damaged
-                missing -= sum(_messages_in(record) for record in records)
-                yield from records
-            if missing > 0 and not self.damaged:  # a changed opcode makes a record unrecognisable
-                self.damaged += 1
+                self._messages += sum(map(_messages_in, records))
+                yield records
+            if count > self._messages and not self.damaged:
+                self.damaged += 1  # a changed opcode makes a record unrecognisable
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
         """The records of the index (the MCAP summary); empty when the file is truncated or the
@@ -238,34 +249,26 @@ class Scan:
                 self.message_counts |= {channel: min(count, most) for channel, count in counts}
         return index
 
-    def _frames(
-        self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
-    ) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of every record up to the index. After a damaged record the next
-        record of the index follows.
-        """
+    def _parts(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[Part]:
+        """The parts from the position to the end of the data, or of the file so far."""
         stream.seek(0)
-        position = len(MCAP0_MAGIC)
-        if stream.read(position) != MCAP0_MAGIC:
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.complete = False
             return
-        for opcode, end, content in frames(stream, position, _known_places(index, size)):
-            position = end
-            if opcode in ENDS:
+        position = self.position = max(self.position, len(MCAP0_MAGIC))
+        for part in _with_message_indexes(frames(stream, position, _known_places(index, size))):
+            position = part.end
+            yield part
+            if part.opcode in ENDS:
                 return
-            self.damaged += opcode == DAMAGED
-            if opcode != DAMAGED:
-                yield opcode, content
         stream.seek(position)  # of a record that is not whole
         head = stream.read(RECORD.size + TIMES.size)
-        if len(head) == RECORD.size + TIMES.size and head[0] == Opcode.CHUNK:
-            self.known_end_ns = max(self.known_end_ns, TIMES.unpack_from(head, RECORD.size)[1])
+        if len(head) == RECORD.size + TIMES.size:
+            opcode, length = RECORD.unpack_from(head)
+            self.endless = length if length > 2 * MAX_CHUNK_BYTES else 0
+            if opcode == Opcode.CHUNK:
+                self.known_end_ns = max(self.known_end_ns, TIMES.unpack_from(head, RECORD.size)[1])
         self.complete = False
-
-
-def known_places(stream: IO[bytes], size: int) -> list[int]:
-    """As `_known_places`, of a finished file; the size of a growing file."""
-    return _known_places(Scan(Path())._index(stream, size), size)
 
 
 def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
@@ -307,16 +310,17 @@ def frames(
             return
 
 
-def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]:
+def _with_message_indexes(frames: Iterator[tuple[int, int, bytes]]) -> Iterator[Part]:
     """Every record with the message indexes behind; only a chunk has message indexes."""
     before: Part | None = None
-    for opcode, content in frames:
+    for opcode, end, content in frames:
         if before is not None and opcode == Opcode.MESSAGE_INDEX:
             before.message_indexes.append(content)
+            before = before._replace(end=end)
             continue
         if before is not None:
             yield before
-        before = Part(opcode, content, [])
+        before = Part(opcode, content, [], end)
     if before is not None:
         yield before
 
@@ -347,20 +351,20 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
 
 def _decoded(
     decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Part]
-) -> tuple[list[R], int]:
-    """The records of parts without the damaged parts, and how many these are."""
+) -> tuple[Part, list[R], int]:
+    """The last of parts, their records without those of damaged parts, and how many these are."""
     try:
-        return list(decode(parts)), 0
+        return parts[-1], list(decode(parts)), 0
     except DECODE_ERRORS:
         if len(parts) == 1:
-            return [], 1
+            return parts[0], [], 1
     records = []
     damaged = 0
     for part in parts:
-        part_records, part_damaged = _decoded(decode, [part])
+        _, part_records, part_damaged = _decoded(decode, [part])
         records += part_records
         damaged += part_damaged
-    return records, damaged
+    return parts[-1], records, damaged
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -376,8 +380,8 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         yield from (future.result() for future in ahead)
 
 
-def split(data: bytes, only: Container[int] | None = None) -> Iterator[McapRecord]:
-    """The records in a sequence of bytes, `only` those of some opcodes. Raises DECODE_ERRORS."""
+def split(data: bytes) -> Iterator[McapRecord]:
+    """The records in a sequence of bytes. Raises DECODE_ERRORS."""
     position = 0
     while position < len(data):
         opcode, length = RECORD.unpack_from(data, position)
@@ -385,11 +389,7 @@ def split(data: bytes, only: Container[int] | None = None) -> Iterator[McapRecor
         end = position + length
         if end > len(data):
             raise McapError("a record longer than its container")
-        if only is not None and opcode not in only:
-            pass
-        elif (
-            opcode == Opcode.MESSAGE and length >= MESSAGE.size
-        ):  # here, for nearly all records are messages
+        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # nearly all records are messages
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
             yield Message(
                 channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence
@@ -535,6 +535,8 @@ def decode_parts(parts: Iterable[Part]) -> Iterator[McapRecord]:
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """The record, or the records of a chunk. Raises DECODE_ERRORS."""
+    if opcode == DAMAGED:
+        raise McapError("a record longer than the place for it")
     if opcode == Opcode.CHUNK:
         yield from split(decompress(content))
     elif opcode == Opcode.MESSAGE:
