@@ -228,6 +228,73 @@ def figures(summary: dict[str, Any]) -> dict[str, Any]:
     return {key: summary[key] for key in ("duration", "errors", "inputs", "transients", "ticks")}
 
 
+@few
+@given(
+    at=st.floats(0.05, 0.95),
+    topics=st.lists(st.sampled_from(STAMPED), min_size=2, max_size=2, unique=True),
+    kinds=st.lists(st.sampled_from(("cut", "begun late", "hole", "thinned")), min_size=2),
+    jumbled=st.booleans(),
+)
+def test_two_damages_of_a_log_are_not_told_as_a_busy_host(
+    numbered: Messages,
+    recorded: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    at: float,
+    topics: list[str],
+    kinds: list[str],
+    jumbled: bool,
+) -> None:
+    """Damages of two topics, also with each two messages swapped and a tenth of them twice."""
+    messages: list[Sent] = list(numbered)
+    for kind, topic in zip(kinds, topics, strict=False):
+        messages = damaged(messages, kind, at, 0.5, topic)
+    if jumbled:
+        order = np.arange(len(messages) - len(messages) % 2).reshape(-1, 2)[:, ::-1].ravel()
+        messages = [messages[k] for k in order] + messages[: len(messages) // 10]
+    folder = tmp_path_factory.mktemp("damaged")
+    check(write_messages(recorded / "run_0.mcap", folder / "run_0.mcap", messages))
+    shutil.rmtree(folder)
+
+
+def test_log_that_begins_late_is_no_flight_that_began_late(
+    numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
+    """The numbers of the ticks tell of those before the log."""
+    log = write_messages(
+        recorded / "run_0.mcap",
+        tmp_path / "run_0.mcap",
+        damaged(numbered, "begun late", 0.75, 0.0, ""),
+    )
+    outcome = read_flight(log).summary["outcome"]
+    assert outcome.startswith("completed, log incomplete: ")
+    assert "u 51 of 201 samples, begins at t = 1.500 of 2.000 s" in outcome
+
+
+def test_short_hole_that_is_the_lack_is_named(
+    numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
+    log = write_messages(
+        recorded / "run_0.mcap", tmp_path / "run_0.mcap", damaged(numbered, "hole", 0.5, 0.4, "/y")
+    )
+    outcome = read_flight(log).summary["outcome"]
+    assert "y 801 of 1001 samples, no sample from t = 0.998 to 1.400 s" in outcome
+
+
+@pytest.mark.parametrize("beside", ["summary.json", "outcome"])
+def test_outcome_of_another_flight_beside_a_log_is_not_believed(
+    beside: str, numbered: Messages, recorded: Path, tmp_path: Path
+) -> None:
+    """A log without its outcome in a folder of another name, with a summary that names no flight,
+    and with the outcome of a launch.
+    """
+    half = damaged(numbered, "cut", 0.5, 0.0, "")
+    log = write_messages(recorded / "run_0.mcap", tmp_path / "other" / "run_0.mcap", half)
+    content = {"summary.json": json.dumps({"outcome": "landed"}), "outcome": "landed"}[beside]
+    (log.parent / beside).write_text(content, encoding="utf-8")
+    assert "landed" not in read_flight(log).summary["outcome"]
+    assert "landed" not in read_flight(log.parent).summary["outcome"]
+
+
 @pytest.mark.parametrize("by", [0.5, 3.0, 3600.0])
 @pytest.mark.parametrize("kind", ["stamps forth", "clock forth"])
 @pytest.mark.parametrize("pose", [True, False], ids=["pose too", "without pose"])

@@ -368,11 +368,11 @@ def account(
     unguided = bool(guided) and all(
         topic.expected and not topic.found and not topic.unset for topic in guided
     )
-    first = _late_first_u(topics, scenario) if from_start else None
+    first = _late_first_u(tape, topics, scenario) if from_start else None
     lacks = [
         lack
         for name, topic in topics.items()
-        if (lack := _lack(name, topic, end, late.get(name, 0.0), first))
+        if (lack := _lack(name, topic, end, late.get(name, 0.0), late_u=first is not None))
     ]
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
@@ -652,29 +652,41 @@ def _latest(scenario: Scenario) -> dict[str, float]:
     }
 
 
-def _late_first_u(topics: Mapping[str, TopicAccount], scenario: Scenario | None) -> float | None:
+def _late_first_u(
+    tape: Tape, topics: Mapping[str, TopicAccount], scenario: Scenario | None
+) -> float | None:
     """Flight time of the first u where it came more than SILENCE after the first y could; None for
     one in time.
 
-    A controller that a user activates has none in time.
+    The numbers of the ticks tell of a first u before the log. A controller that a user activates
+    has none in time.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
     firsts = [
         first for name in TICKS if name in topics and (first := topics[name].first) is not None
     ]
-    late = min(firsts, default=0.0) - scenario.aircraft.sensors.delay > SILENCE
-    return min(firsts) if late else None
+    if not firsts:
+        return None
+    before = 0.0
+    if "internals" in tape and "number" in tape["internals"].names:
+        before = (tape["internals"]["number"][0] - 1.0) / scenario.controller.rate
+    first_u = min(firsts) - before
+    return first_u if first_u - scenario.aircraft.sensors.delay > SILENCE else None
 
 
-def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: float | None) -> str:
+def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str:
     """What a topic lacks, as a sentence without a verb; empty for a whole topic.
 
-    `late`: of the last sample, s; `first_u`: the flight time of a late first u, s.
+    `late`: of the first and the last sample, s; `late_u`: the first u of the flight was late.
     """
     facts = []
-    if name == "u" and first_u is not None:
-        facts.append(f"begins at t = {first_u:.3f} of {end:.3f} s")
+    missing = not topic.holds(topic.found + topic.unsent) or (
+        topic.share is not None and topic.share < LEAST
+    )
+    begins_late = missing and topic.first is not None and topic.first - late > SILENCE
+    if begins_late or (name == "u" and late_u):
+        facts.append(f"begins at t = {topic.first:.3f} of {end:.3f} s")
     if topic.step and topic.last is not None:
         facts.append(
             f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s"
@@ -683,14 +695,13 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: floa
         facts.append(f"{topic.unset} samples without a usable stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
-    missing = not topic.holds(topic.found + topic.unsent) or (
-        topic.share is not None and topic.share < LEAST
-    )
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
-        if topic.gap is not None and topic.gap_at is not None and topic.gap > SILENCE:
+        lost = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
+        least = min(SILENCE, lost / 2.0)  # a shorter gap is named where it is most of the lack
+        if topic.gap is not None and topic.gap_at is not None and topic.gap > least:
             facts.append(
                 f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"
             )

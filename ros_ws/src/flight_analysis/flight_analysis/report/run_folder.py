@@ -353,11 +353,10 @@ def _identity(recorded: RecordedRun) -> dict[str, Any]:
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> str:
-    """The outcome in the log, else in the summary of the run, else the outcome that a launch left
-    beside the log.
+    """The outcome in the log, else in the summary of this flight, else the outcome that a launch
+    left beside a log with the name of the folder.
 
-    The summary of another flight is not believed. The samples in the log tell the outcome of nodes
-    started by hand.
+    The samples in the log tell the outcome of nodes started by hand.
     """
     tape = recorded.tape
     if tape.outcome != UNKNOWN:
@@ -366,10 +365,9 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
         with suppress(OSError, ValueError, TypeError, KeyError):
             summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
             before = printable(str(summary["outcome"]))
-            of_this_flight = summary.get("flight") in (None, _identity(recorded))
-            if of_this_flight and not before.startswith(UNKNOWN):  # as of an earlier version
+            if summary["flight"] == _identity(recorded) and not before.startswith(UNKNOWN):
                 return before
-    if folder is not None:
+    if folder is not None and (folder / f"{folder.name}_0.mcap").is_file():
         with suppress(ParameterError):
             if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(
                 errors="replace"
