@@ -119,7 +119,8 @@ setup-all: .venv/.all .venv/.workspace
 	@$(if $(MOVED),rm -rf ros_ws/build ros_ws/install ros_ws/log)
 	@mkdir -p ros_ws/build ros_ws/install && find ros_ws/build ros_ws/install -xtype l -delete # colcon keeps links to files that moved, and fails
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
-	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
+	@printf '%s\n' 'import sys, _signal; sys.orig_argv[1:2] and sys.orig_argv[1].endswith("/rise-di") and _signal.signal(_signal.SIGINT, _signal.SIG_DFL)' \
+	  $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) `# first a quiet Ctrl-C while rise-di loads` \
 	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"
 	@ln -sf ../../ros_ws/install/flight_cli/lib/flight_cli/rise-di .venv/bin/rise-di
 	@$(BIN)/python -m compileall -q ros_ws/src # also where PYTHONDONTWRITEBYTECODE is set: each process starts 0.15 s earlier

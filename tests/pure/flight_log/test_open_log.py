@@ -201,6 +201,10 @@ def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
             str(tmp_path / "plain"), str(tmp_path / "bag")
         )
         assert results[1].exit_code == results[0].exit_code == 0
+    flight = Flight(tmp_path / "bag", remaps=REMAPS)
+    while flight.update():
+        pass
+    assert {*REMAPS} <= {*flight.samples}
 
 
 def test_two_aircraft_are_shown_one_at_time(

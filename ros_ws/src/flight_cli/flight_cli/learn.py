@@ -12,6 +12,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
+from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
 from flight_cli.output import (
@@ -73,10 +74,13 @@ def learn(
             markup=False,
             soft_wrap=True,
         )
+    account = log_account(recorded)
+    over = "" if account is None else account.over("internals")
+    part = f", {over}" if over else ""
     if result.entries:
-        console.print(entry_table("A and B of the last identification", result.entries))
+        console.print(entry_table(f"A and B of the last identification{part}", result.entries))
     if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
-        console.print(model_table(models, display_units(flown)))
+        console.print(model_table(models, display_units(flown), part))
     if result.model is not None and write is not None:
         write_text("--write", write, learned_yaml(result, str(run)))
         console.print(

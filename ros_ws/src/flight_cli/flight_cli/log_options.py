@@ -7,7 +7,7 @@ of several, what it lacks.
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -28,14 +28,11 @@ LogScenario = Annotated[
     ),
 ]
 
-LogRemaps = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--remap",
-        metavar="NAME:=TOPIC",
-        help="A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
-    ),
-]
+REMAP: dict[str, Any] = {
+    "metavar": "NAME:=TOPIC",
+    "help": "A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
+}
+LogRemaps = Annotated[list[str] | None, typer.Option("--remap", **REMAP)]
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:

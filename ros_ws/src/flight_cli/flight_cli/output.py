@@ -3,8 +3,9 @@
 """What the commands share: tables, JSON, paths, exit statuses."""
 
 import json
+import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any, Literal
 
@@ -285,7 +286,20 @@ def print_json(value: Any) -> None:
     print(json.dumps(finite_or_null(value)))
 
 
+STDOUT = Path("-")
+
+
+def stdout_for(file: Path | None) -> AbstractContextManager[object]:
+    """Standard output is free for a file that is "-": what the block prints goes to the errors."""
+    return redirect_stdout(sys.stderr) if file == STDOUT else nullcontext()
+
+
 def write_text(option: str, path: Path, text: str) -> None:
-    """Write a file that an option names. Raises ParameterError where it cannot be written."""
+    """Write a file that an option names, "-" for standard output. Raises ParameterError where it
+    cannot be written.
+    """
+    if path == STDOUT:
+        print(text, end="")
+        return
     with writing(option, path, "the path of a file"):
         write_file(path, text)

@@ -29,7 +29,7 @@ from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, new_table, print_json, write_text
+from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
 from flight_cli.settings import Settings, parse_settings
 from flight_cli.words import AsJson
 from flight_core.outcome import STATUS_INCOMPLETE
@@ -47,7 +47,10 @@ def replay(
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     csv_file: Annotated[
-        Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")
+        Path | None,
+        typer.Option(
+            "--csv", help="CSV file for u as recorded and as computed; - for standard output."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -91,14 +94,15 @@ def replay(
         *_parameter_notes(result, open_loop=others is not None),
     )
     notes += () if guided is None else guided.notes
-    if as_json:
-        guidance_json = None if guided is None else _guidance_as_json(guided)
-        replay_json = _as_json(result, notes, parameters.inputs, settings or [])
-        print_json({**replay_json, "expected": ticks, "guidance": guidance_json})
-    else:
-        _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
-        if guided is not None:
-            _show_guidance(guided)
+    with stdout_for(csv_file):
+        if as_json:
+            guidance_json = None if guided is None else _guidance_as_json(guided)
+            replay_json = _as_json(result, notes, parameters.inputs, settings or [])
+            print_json({**replay_json, "expected": ticks, "guidance": guidance_json})
+        else:
+            _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
+            if guided is not None:
+                _show_guidance(guided)
     equal = result.equal() and (guided is None or guided.equal())
     part = STATUS_INCOMPLETE if result.compared.sum() < WHOLE * ticks else 0
     raise typer.Exit(part if equal else DIFFERS)

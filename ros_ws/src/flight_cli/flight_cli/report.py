@@ -10,11 +10,12 @@ import typer
 from rich.console import Console
 
 from flight_analysis.report import comparison
+from flight_analysis.report.export import signal_table
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_over
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, new_table, print_json, show_flight
+from flight_cli.output import LATEST, STDOUT, new_table, print_json, show_flight, stdout_for
 from flight_cli.repair import repair_log
 from flight_cli.words import AsJson
 from flight_core.files import display_path
@@ -46,7 +47,10 @@ def report(
     ] = None,
     csv: Annotated[
         Path | None,
-        typer.Option(help="Write all signals as CSV, one row an instant, one column a channel."),
+        typer.Option(
+            help="Write all signals as CSV, one row an instant, one column a channel; - for "
+            "standard output."
+        ),
     ] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
     repair: Annotated[
@@ -105,7 +109,7 @@ def report(
         html=html,
         output=output,
         png=png,
-        csv=csv,
+        csv=None if csv == STDOUT else csv,
         parquet=parquet,
         figure=figure,
         width=width,
@@ -117,16 +121,19 @@ def report(
         scenario=scenario_source,
         remaps=remaps_of(remap),
     )
-    if as_json:
-        summaries = [flight.summary for flight in flights]
-        print_json(summaries[0] if len(flights) == 1 else summaries)
-    else:
-        if len(flights) == 1:
-            show_flight(Console(), flights[0])
-            print(f"outcome: {flights[0].summary['outcome']}")
+    if csv == STDOUT:
+        print(signal_table(flights).write_csv(), end="")
+    with stdout_for(csv):
+        if as_json:
+            summaries = [flight.summary for flight in flights]
+            print_json(summaries[0] if len(flights) == 1 else summaries)
         else:
-            show_comparison(Console(), flights)
-        print(f"report:  {display_path(page)}")
+            if len(flights) == 1:
+                show_flight(Console(), flights[0])
+                print(f"outcome: {flights[0].summary['outcome']}")
+            else:
+                show_comparison(Console(), flights)
+            print(f"report:  {display_path(page)}")
     if any(flight.summary["account"] and flight.summary["account"]["lacks"] for flight in flights):
         raise typer.Exit(STATUS_INCOMPLETE)
 

@@ -13,7 +13,7 @@ import typer
 
 from flight_bringup.processes import end_with_parent
 from flight_cli.flightgear import show_in_flightgear
-from flight_cli.log_options import LogScenario, scenario_file
+from flight_cli.log_options import REMAP, LogScenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
@@ -101,6 +101,7 @@ def watch(
             "the root."
         ),
     ] = None,
+    remap: Annotated[list[str] | None, typer.Option("--set remap", **REMAP)] = None,
     background: Annotated[
         Path | None,
         typer.Option(
@@ -162,11 +163,12 @@ def watch(
     require(
         not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two"
     )
+    remaps = remaps_of(remap)
     shown_scenario = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
     chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
     for folder in chosen:
         if not wait:
-            require_log(folder, namespace)
+            require_log(folder, namespace, remaps)
     require(
         background is None or not (text or foxglove),
         "background",
@@ -191,7 +193,7 @@ def watch(
     for folder in chosen:
         aircraft += [(folder, name) for name in (namespaces(folder) if fleet else (namespace,))]
     flights = [
-        Flight(folder, namespace=name, scenario=shown_scenario, background=lines)
+        Flight(folder, namespace=name, scenario=shown_scenario, background=lines, remaps=remaps)
         for folder, name in aircraft
     ]
     if text:

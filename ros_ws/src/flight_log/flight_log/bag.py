@@ -144,6 +144,11 @@ class _ChunkIndexes:
         stream.write(self._file.kept_data())
 
 
+def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
+    """Full names in the stack by topics of a log; `remaps` are topics of the log by names."""
+    return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
+
+
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
     """The full name that a topic of a log has in the stack: `remaps`, by topics of the log, come
     before those of the log.

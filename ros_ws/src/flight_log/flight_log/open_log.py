@@ -24,6 +24,7 @@ from mcap.records import Channel, McapRecord, Message, Schema
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
+from flight_log.bag import stack_topic
 from flight_log.file_kinds import (
     BEGUN,
     EMPTY,
@@ -186,7 +187,7 @@ def _unpack(file: Path, plain: Path, kind: str) -> bool:
     return True
 
 
-def log_topics(run: Path) -> dict[str, str]:
+def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
     """The types of the topics of a log by full name; with "in ENCODING" of messages that are no
     CDR.
 
@@ -204,7 +205,8 @@ def log_topics(run: Path) -> dict[str, str]:
                     name = schemas.get(record.schema_id, "")
                     encoding = record.message_encoding
                     topics.setdefault(
-                        record.topic, name if encoding == "cdr" else f"{name} in {encoding}"
+                        stack_topic(record, remaps),
+                        name if encoding == "cdr" else f"{name} in {encoding}",
                     )
                 elif topics and scan.message_counts:  # the index names all channels
                     break

@@ -33,6 +33,7 @@ from flight_log.bag import (
     SCENARIO_MEDIA_TYPE,
     SILENCES,
     SIMULATED_TIME,
+    full_names,
     stack_topic,
 )
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, leap_note, recording_note, without_leaps
@@ -184,7 +185,7 @@ def read_run(
     replacement = (
         None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     )
-    log = _read(run, {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()})
+    log = _read(run, full_names(remaps))
     filled = {
         topic: signal
         for topic, samples in log.topics.items()
@@ -249,9 +250,8 @@ def read_run(
         refused=refused,
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
-    delays = latency(
-        {topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS}
-    )
+    steps = any(recording[name].step_ns for name in TIMED_TOPICS if name in recording)
+    sent = {topic: times for topic, times in log.sent.items() if names.get(topic) in TIMED_TOPICS}
     stored = (
         replacement
         or log.scenario
@@ -263,7 +263,7 @@ def read_run(
         stored,
         log.metadata,
         tuple(log.attachments),
-        delays,
+        None if steps else latency(sent),
         engaged,
         aircraft,
         run,

@@ -40,7 +40,7 @@ from flight_guidance import guidance_state
 from flight_guidance.odometry import ROUTE_FRAMES
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
-from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE
+from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE, full_names
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
@@ -146,7 +146,8 @@ class Flight:
     """A flight in a log. `update` reads new messages.
 
     `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the
-    scenario in the log. `background`: lines of the map, of `background.read_background`.
+    scenario in the log. `background`: lines of the map, of `background.read_background`. `remaps`
+    as in `read_run`.
     """
 
     def __init__(
@@ -156,8 +157,10 @@ class Flight:
         namespace: str | None = None,
         scenario: StoredFile | None = None,
         background: Sequence[Line] = (),
+        remaps: Mapping[str, str] = {},
     ) -> None:
         self.run = run
+        self._remaps = remaps
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[PageEvent] = []
@@ -179,7 +182,7 @@ class Flight:
         self.scenario: Scenario | None = None  # once read
         self.digest = 0  # of the controller's parameters in the newest tick; exact, unlike float32
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
-        self._follower = Follower(run, self._rate_of)
+        self._follower = Follower(run, self._rate_of, full_names(remaps))
         self._topics: dict[str, _Topic] = {}  # by full name
         self._asked = namespace is not None
         self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
@@ -343,7 +346,7 @@ class Flight:
         log.
         """
         with suppress(ParameterError, OSError):
-            recorded = read_run(self.run, self._namespace)
+            recorded = read_run(self.run, self._namespace, None, self._remaps)
             if self._given is not None:
                 recorded = recorded._replace(scenario=self._given)
             account = log_account(recorded)

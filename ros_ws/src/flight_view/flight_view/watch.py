@@ -7,12 +7,13 @@ import os
 import secrets
 import signal
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from flight_core.files import is_folder
 from flight_core.parameters import ParameterError, require
+from flight_log.bag import full_names
 from flight_log.disk import is_locked
 from flight_log.named_vectors import JOINT_STATE, full_name
 from flight_log.open_log import log_files, log_topics
@@ -66,14 +67,14 @@ def namespaces(run: Path) -> list[str | None]:
     return [None]
 
 
-def require_log(run: Path, namespace: str | None = None) -> None:
+def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, str] = {}) -> None:
     """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an
     aircraft in the namespace.
     """
     with suppress(OSError):
         if any(is_locked(file) for file in log_files(run)):
             return
-    topics = log_topics(run)
+    topics = log_topics(run, full_names(remaps))
     aircraft = [
         topic
         for topic, name in topics.items()

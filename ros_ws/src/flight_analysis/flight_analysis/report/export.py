@@ -28,7 +28,7 @@ ROW_HEIGHT = 2.2
 DPI = 120
 
 
-def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
+def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
     """The table of a flight, or of several flights with the name of the flight in a first column
     "run".
     """
@@ -46,13 +46,13 @@ def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
 def write_csv(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the wide table as CSV. Numbers read back to the last bit; a null is an empty cell."""
     with replacing(path) as stream:
-        _joined_table(flights).write_csv(stream)
+        signal_table(flights).write_csv(stream)
 
 
 def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the wide table as Parquet (zstd)."""
     with replacing(path) as stream:
-        _joined_table(flights).write_parquet(stream)
+        signal_table(flights).write_parquet(stream)
 
 
 class _PlotColumn(NamedTuple):
