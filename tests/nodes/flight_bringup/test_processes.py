@@ -19,7 +19,12 @@ from flight_bringup.processes import FlightProcesses, NotReadyError
 from flight_core.parameters import ParameterError
 
 SILENT_MONITOR: Any = SimpleNamespace(
-    is_ready=lambda *_: False, is_matched=lambda *_: False
+    is_ready=lambda *_: False,
+    is_matched=lambda *_: False,
+    has_time=lambda: True,
+    speed=lambda: 1.0,
+    clock=time,
+    clock_ended=lambda: "",
 )  # in place of a FlightMonitor
 
 
@@ -113,11 +118,10 @@ def test_flight_without_matched_nodes_never_begins(
     monkeypatch.setattr(processes, "READY_TIMEOUT", 0.05)
     given: list[float] = []
     state = {"controller": {"ready"}, "aircraft": {"ready", "matched"}, "recorder": set[str]()}
-    monitor = SimpleNamespace(
-        is_ready=lambda name, _: "ready" in state[name],
-        is_matched=lambda name, _: "matched" in state[name],
-        start=given.append,
-    )
+    monitor = SimpleNamespace(**vars(SILENT_MONITOR))
+    monitor.is_ready = lambda name, _: "ready" in state[name]
+    monitor.is_matched = lambda name, _: "matched" in state[name]
+    monitor.start = given.append
     flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)  # type: ignore[arg-type]
     popen = SimpleNamespace(pid=1, poll=lambda: None)
     flight.processes = [SimpleNamespace(node=NodeSpec("fake", name), popen=popen) for name in state]  # type: ignore[misc]
@@ -127,6 +131,24 @@ def test_flight_without_matched_nodes_never_begins(
     state |= {name: {"ready", "matched"} for name in state}
     assert flight.begin() == ""
     assert given == [flight.start_time] == [pytest.approx(time.time() + 0.5, abs=0.4)]
+
+
+def test_flight_by_a_clock_that_never_comes_is_told_so(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only_stage.write_text("import time\ntime.sleep(60)\n", encoding="utf-8")
+    monkeypatch.setattr(processes, "READY_TIMEOUT", 0.5)
+    monitor = SimpleNamespace(**vars(SILENT_MONITOR))
+    monitor.is_ready = lambda *_: True
+    monitor.has_time = lambda: False
+    expected = "/clock: no message of a simulator after 0.5 s"
+    with (
+        pytest.raises(NotReadyError, match=expected),
+        FlightProcesses(
+            osprey_gust, tmp_path, monitor, lockstep=False, one_process=False, use_sim_time=True
+        ),
+    ):
+        pass
 
 
 LOSES_CONTACT = (

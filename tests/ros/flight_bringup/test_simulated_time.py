@@ -107,3 +107,24 @@ def test_nodes_begin_again_with_a_new_simulation(
     assert not [line for line in controller.lines if "already registered" in line]
     for node in nodes:
         node.interrupt().succeed()
+
+
+@pytest.mark.parametrize("ends", [False, True], ids=["whole", "simulator ends"])
+def test_fly_is_by_the_clock_of_a_simulator(ends: bool, start: Start, tmp_path: Path) -> None:
+    """Two seconds of flight in one of the host; without the simulator the flight is over."""
+    shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
+    apart = ("--ros-args", "-r", "y:=/apart/y", "-r", "u:=/apart/u")
+    simulator = start("simulator", "2", *apart)
+    settings = ("use_sim_time", "composed", "aircraft.rate=100", "reference_model.rate=100")
+    words = [word for setting in settings for word in ("--set", setting)]
+    duration = "60" if ends else "2"
+    flight = start("flight_cli.cli", "fly", "osprey_servo", "--duration", duration, *words)
+    if ends:
+        until(lambda: [*tmp_path.glob("runs/*/*.mcap")], "the log")
+        log = next(tmp_path.glob("runs/*/log/one_process.log"))
+        until(lambda: "ENGAGED" in log.read_text(encoding="utf-8"), "engaged")
+        simulator.interrupt().succeed()
+        flight.wait_for("outcome: ended early: /clock has no publisher: its simulator ended")
+    else:
+        flight.wait_for("note: flown by the simulated time of /clock, at ")
+        flight.wait_for("outcome: completed")

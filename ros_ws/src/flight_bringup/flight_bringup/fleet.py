@@ -78,6 +78,7 @@ class FleetConfig(Config):
         default=False, description="fly as fast as the machine allows, in lockstep, each by itself"
     )
     composed: bool = Field(default=False, description="all nodes of an aircraft in one process")
+    use_sim_time: bool = Field(default=False, description="by the /clock of a simulator")
     set: Overrides = Field(
         default={},
         description="parameters of all aircraft, by section: a shared wind, for instance",
@@ -111,6 +112,7 @@ class Fleet:
     members: tuple[Member, ...]
     lockstep: bool = False
     composed: bool = False
+    use_sim_time: bool = False
 
     def participants(self) -> int:
         """The DDS participants of a flight: the command, and the processes."""
@@ -122,9 +124,11 @@ class Fleet:
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
 
-def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
-    """Read the file of a fleet; `duration` in s replaces the duration of the file. Raises
-    ParameterError.
+def read_fleet(
+    file: FilePath, duration: float | None = None, *, use_sim_time: bool = False
+) -> Fleet:
+    """Read the file of a fleet; `duration` in s replaces the duration of the file, `use_sim_time`
+    is by /clock. Raises ParameterError.
     """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
@@ -148,7 +152,14 @@ def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
             f"{aircraft.delay:g} s",
             "0 in lockstep, which has no common time",
         )
-    fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed)
+    by_clock = use_sim_time or config.use_sim_time
+    require(
+        not (by_clock and config.lockstep),
+        f"{path.stem}.use_sim_time",
+        "true in lockstep, which has no clock",
+        "one of the two",
+    )
+    fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed, by_clock)
     cheaper = "" if config.composed else "; composed: true takes one an aircraft"
     participants = f"{fleet.participants()} participants of the middleware"
     require(
@@ -226,6 +237,7 @@ class _Flight:
                 self.monitor,
                 lockstep=fleet.lockstep,
                 one_process=fleet.composed,
+                use_sim_time=fleet.use_sim_time,
                 namespace=absolute_namespace(self.member.name),
             ).__enter__()
         except ParameterError as error:
@@ -319,7 +331,12 @@ def fly_fleet(
                 outputs = member.scenario.controller.outputs
                 namespace = absolute_namespace(member.name)
                 monitor = stack.enter_context(
-                    FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace)
+                    FlightMonitor(
+                        outputs,
+                        lockstep=fleet.lockstep,
+                        use_sim_time=fleet.use_sim_time,
+                        namespace=namespace,
+                    )
                 )
                 flights.append(_Flight(member, run, monitor, partial(progress, member.name)))
             for flight in flights:
@@ -346,6 +363,6 @@ def fly_fleet(
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
     """Begin the flights in real time with a common t = 0."""
     if not fleet.lockstep:
-        start = start_instants(LEAD + BEGIN_TIME * len(flights))
+        start = start_instants(LEAD + BEGIN_TIME * len(flights), flights[0].monitor)
         for flight in flights:
             flight.begin(fleet, start)

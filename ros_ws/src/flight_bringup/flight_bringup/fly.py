@@ -34,7 +34,7 @@ from flight_core.environment import require_ros_environment
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, seconds
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
@@ -78,6 +78,7 @@ def fly_over_topics(
     *,
     lockstep: bool = False,
     one_process: bool = False,
+    use_sim_time: bool = False,
     autopilot: Autopilot | None = None,
     namespace: str = "",
     announce: Callable[[str], None] = lambda line: None,
@@ -86,7 +87,8 @@ def fly_over_topics(
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one
-    process. `autopilot` flies in the aircraft's place, in real time only. All nodes are in the
+    process. With `use_sim_time` the nodes and the flight are by /clock.
+    `autopilot` flies in the aircraft's place, in real time only. All nodes are in the
     `namespace`, as "/uav1". `announce` gets a line for each change of engagement and of reason, but
     not for a changed number, and for what becomes of a proposal of a learner. With `engaged_for`,
     s, the flight ends so long after its first engagement, or with it, or without one when too
@@ -102,6 +104,7 @@ def fly_over_topics(
             FlightMonitor(
                 scenario.controller.outputs,
                 lockstep=lockstep,
+                use_sim_time=use_sim_time,
                 learns=scenario.learns(),
                 namespace=namespace,
             ) as monitor,
@@ -111,6 +114,7 @@ def fly_over_topics(
                 monitor,
                 lockstep=lockstep,
                 one_process=one_process,
+                use_sim_time=use_sim_time,
                 autopilot=autopilot,
                 namespace=namespace,
             ) as processes,
@@ -236,7 +240,7 @@ def _follow_real_time(
     engaged_at = math.inf
     while True:
         _announce_learned(processes, monitor, processes.start_time, announce)
-        t = time.monotonic() - processes.started
+        t = seconds(monitor.clock.monotonic_ns()) - processes.started
         if outcome := span.outcome(t):
             return outcome
         if (reason := processes.ended_early()) is not None:
@@ -266,7 +270,8 @@ def _follow_real_time(
                 for name, e in zip(outputs, values, strict=True)
             )
             text = f"{mode}  e: {', '.join(errors)}"
-        progress(min(max(t, 0.0), scenario.flight.duration), text)
+        shown = "waiting for /clock" if monitor.waits_for_clock() else text
+        progress(min(max(t, 0.0), scenario.flight.duration), shown)
         yield
 
 

@@ -5,7 +5,6 @@ share the graph.
 """
 
 import re
-import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -168,11 +167,11 @@ def start_lead(startup: float) -> float:
     return 0.5 + 1.5 * startup
 
 
-def start_instant(lead: float) -> float:
-    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so nodes with and without
-    `start_time` tick together.
+def start_instant(lead: float, now: float) -> float:
+    """Time of t = 0, s, `lead` from `now`: a whole 0.01 s, so nodes with and without `start_time`
+    tick together.
     """
-    return round(time.time() + lead, 2)
+    return round(now + lead, 2)
 
 
 def parameter_overrides(
@@ -182,6 +181,7 @@ def parameter_overrides(
     start_time: float,
     *,
     lockstep: bool,
+    use_sim_time: bool = False,
     autopilot: Autopilot | None = None,
 ) -> ParameterOverrides:
     """The parameters of a process beside the section of the scenario file; "node:name" for several
@@ -192,10 +192,11 @@ def parameter_overrides(
     of u_m. Guidance gets the numbers by rule, the learner the scenario. The recorder gets the files
     to attach to the log; this function writes the files into the folder of the run. With an
     autopilot the bridge gets the channel map, the recorder the topics of the autopilot, and the
-    controller starts inactive.
+    controller starts inactive. With `use_sim_time` every node ticks by /clock.
     """
+    clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
-        return (
+        return clock | (
             {}
             if autopilot is None
             else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
@@ -254,10 +255,12 @@ def parameter_overrides(
         return {
             f"{node.executable}:{name}": value
             for node, values in overrides.items()
-            for name, value in values.items()
+            for name, value in (values | clock).items()
         }
-    return overrides[spec] | (
-        {"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {}
+    return (
+        overrides[spec]
+        | clock
+        | ({"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {})
     )
 
 

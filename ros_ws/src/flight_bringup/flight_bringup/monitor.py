@@ -3,6 +3,7 @@
 """Monitor of a flight: what `rise-di fly` sees of the nodes."""
 
 import os
+import time
 
 from flight_core.modes import Mode
 from flight_core.parameters import require
@@ -12,7 +13,9 @@ from flight_core.vectors import ChannelError, FloatArray
 from flight_ros import reports
 from flight_ros.client import Client
 from flight_ros.messages import Decoder, instant, stamp_of
+from flight_ros.simulated_time import ClockRestarted, SimulatedTime
 from flight_ros.subscriptions import PolledSubscription
+from flight_ros.ticker import HostTime
 from flight_ros.topics import (
     ENGAGEMENT,
     INTERNALS,
@@ -39,9 +42,17 @@ class FlightMonitor(Client):
     """
 
     def __init__(
-        self, outputs: tuple[str, ...], *, lockstep: bool, learns: bool = False, namespace: str = ""
+        self,
+        outputs: tuple[str, ...],
+        *,
+        lockstep: bool,
+        use_sim_time: bool = False,
+        learns: bool = False,
+        namespace: str = "",
     ) -> None:
         super().__init__("monitor", namespace)
+        self._simulated = SimulatedTime(self._node) if use_sim_time else None
+        self.clock: HostTime = self._simulated or time  # of the flight
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
         self._internals = (
@@ -60,6 +71,30 @@ class FlightMonitor(Client):
             PolledSubscription(self._node, LEARNING, PUBLISH, raw=True) if learns else None
         )
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
+
+    def has_time(self) -> bool:
+        """Whether the time of the flight is known: in simulated time from the first /clock on."""
+        return self._simulated is None or self._simulated.known()
+
+    def speed(self) -> float:
+        """Simulated time over that of the host, at least 1: an instant that far ahead is ahead."""
+        return 1.0 if self._simulated is None else max(self._simulated.speed(), 1.0)
+
+    def waits_for_clock(self) -> bool:
+        """Whether the simulator has paused /clock."""
+        return self._simulated is not None and self._simulated.silent()
+
+    def clock_ended(self) -> str:
+        """Why the simulation of the flight is over; else empty."""
+        if self._simulated is None or not self._simulated.known():
+            return ""
+        try:
+            self._simulated.require_one_simulation()
+        except ClockRestarted as restart:
+            return f"ended early: {restart}"
+        count = self._simulated.subscription.entity.get_publisher_count
+        gone = self._simulated.silent() and not count()
+        return "ended early: /clock has no publisher: its simulator ended" if gone else ""
 
     def is_ready(self, node: str, pid: int) -> bool:
         """Whether the loop of a node runs. The process id tells it from a node of that name in

@@ -37,6 +37,7 @@ from flight_bringup.graph import (
 from flight_core.files import dump_yaml, write_file
 from flight_core.outcome import COMPLETED, INTERRUPTED, LOST_CONTACT, NEVER_FLEW, STATUS_BAD_INPUT
 from flight_core.parameters import ParameterError, nest
+from flight_core.rates import seconds
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_log.bag import OUTCOME_FILE
@@ -50,6 +51,7 @@ CLOSE_TIMEOUT = (
 )
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
+NO_CLOCK = "/clock: no message of a simulator"
 # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 DISCOVERY_TIME = 0.5
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
@@ -66,9 +68,11 @@ def end_with_parent() -> list[str]:
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
 
-def start_instants(lead: float) -> tuple[float, float]:
-    """System time and monotonic time of t = 0, s, `lead` from now."""
-    return start_instant(lead), time.monotonic() + lead
+def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
+    """Time of the stamps and of the ticks of t = 0, s, `lead` of the host from now."""
+    clock = monitor.clock
+    lead *= monitor.speed()
+    return start_instant(lead, seconds(clock.time_ns())), seconds(clock.monotonic_ns()) + lead
 
 
 @contextmanager
@@ -189,9 +193,11 @@ class FlightProcesses:
         *,
         lockstep: bool,
         one_process: bool,
+        use_sim_time: bool = False,
         autopilot: Autopilot | None = None,
         namespace: str = "",
     ) -> None:
+        self._use_sim_time = use_sim_time
         self._scenario = scenario
         self._run = run
         self._monitor = monitor
@@ -211,9 +217,8 @@ class FlightProcesses:
             self._second = (ONE_PROCESS, *apart)
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
-        self.start_time = math.inf  # system time of t = 0, s
-        # the same on the monotonic clock, as the nodes count: a step of the system clock is none of
-        # t
+        self.start_time = math.inf  # time of t = 0 by the stamps, s
+        # the same by the time of the ticks: a step of the system clock is none of t
         self.started = math.inf
         self._on_start = not lockstep and autopilot is None
 
@@ -227,7 +232,8 @@ class FlightProcesses:
                 time.sleep(DISCOVERY_TIME)
             self._monitor.require_free_domain()
             if not self._on_start:
-                self._set_start(start_instants(start_lead(time.monotonic() - begin)))
+                lead = start_lead(time.monotonic() - begin)
+                self._set_start(start_instants(lead, self._monitor))
             for node in self._second:
                 self._start(node)
         except BaseException as error:
@@ -261,7 +267,7 @@ class FlightProcesses:
         """
         leave_real_time_priority()  # the nodes have it
         if not (reason := self.match()) and self._on_start:
-            self._set_start(start or start_instants(LEAD))
+            self._set_start(start or start_instants(LEAD, self._monitor))
             self._monitor.start(self.start_time)
         return reason
 
@@ -299,6 +305,7 @@ class FlightProcesses:
             self._run,
             start,
             lockstep=self._lockstep,
+            use_sim_time=self._use_sim_time,
             autopilot=self.autopilot,
         )
         if node is BRIDGE:
@@ -308,21 +315,24 @@ class FlightProcesses:
         )
 
     def _wait_until_ready(self, deadline: float) -> None:
-        while waiting := self.waiting():
+        while (waiting := self.waiting()) or not self._monitor.has_time():
             if (reason := self.ended_early()) is not None:
                 statuses = {process.popen.poll() for process in self.processes}
                 raise (ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError)(reason)
             if time.monotonic() > deadline:
                 late = (
-                    f"timed out waiting for {', '.join(waiting)}: not ready after "
-                    f"{READY_TIMEOUT:g} s"
+                    f"timed out waiting for {', '.join(waiting)}: not ready"
+                    if waiting
+                    else NO_CLOCK
                 )
-                raise NotReadyError(f"{late}; see the logs in {self._run / 'log'}")
+                raise NotReadyError(
+                    f"{late} after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}"
+                )
             time.sleep(POLL_PERIOD)
 
     def ended_early(self) -> str | None:
-        """The reason of the first process that has ended, None while all run. In real time the law
-        flies on without a learner.
+        """The reason of the first process that has ended, or why simulated time has; None while all
+        run. In real time the law flies on without a learner.
 
         On a busy host several may have ended since the last call. One that lost contact with
         another is then not the cause.
@@ -331,7 +341,8 @@ class FlightProcesses:
             process for process in self.processes if self._lockstep or process.node is not LEARNER
         ]
         reasons = [reason for process in processes if (reason := _end(process)) is not None]
-        return min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
+        first = min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
+        return first or self._monitor.clock_ended() or None
 
     def learner_ended(self) -> str:
         """How the learner has ended, told once; else empty."""

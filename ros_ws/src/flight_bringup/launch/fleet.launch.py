@@ -15,7 +15,14 @@ from launch.events.process import ProcessExited
 from launch_ros.substitutions import ExecutableInPackage
 
 from flight_bringup.fleet import read_fleet
-from flight_bringup.launch.stages import argument, end_with_launch, runs_argument, watch_argument
+from flight_bringup.launch.stages import (
+    USE_SIM_TIME,
+    argument,
+    end_with_launch,
+    runs_argument,
+    sim_time_argument,
+    watch_argument,
+)
 from launch import LaunchContext, LaunchDescription
 
 
@@ -31,6 +38,7 @@ def generate_launch_description() -> LaunchDescription:
             ),
             watch_argument(),
             runs_argument(),
+            sim_time_argument(),
             OpaqueFunction(function=_fly),
         ]
     )
@@ -54,6 +62,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         *(["--duration", duration] if duration else []),
     ]
     options += ["--watch"] if argument(context, "watch") == "true" else []
+    options += ["--set", USE_SIM_TIME] if argument(context, USE_SIM_TIME) == "true" else []
     return [
         ExecuteProcess(
             cmd=[rise_di, "fly", file, *options], name="fleet", output="screen", on_exit=end

@@ -30,6 +30,7 @@ from flight_bringup.graph import (
 )
 from flight_bringup.launch.stages import (
     BOOLEAN,
+    FlightClock,
     argument,
     begin_when_matched,
     complete,
@@ -42,6 +43,7 @@ from flight_bringup.launch.stages import (
     rosbag2,
     runs_argument,
     scenario_argument,
+    sim_time_argument,
     start_in_stages,
     watch_argument,
     watch_page,
@@ -72,6 +74,7 @@ def generate_launch_description() -> LaunchDescription:
             runs_argument(),
             watch_argument(),
             namespace_argument(),
+            sim_time_argument(),
             OpaqueFunction(function=_fly),
         ]
     )
@@ -93,6 +96,13 @@ def _fly(context: LaunchContext) -> list[Action]:
         "rosbag2 in lockstep",
         "true: the aircraft waits for the stack's recorder",
     )
+    clock = FlightClock(context)
+    require(
+        not (clock.simulated and (lockstep or by_rosbag2)),
+        "use_sim_time",
+        "true in lockstep, or with rosbag2",
+        "a flight in real time, with the stack's recorder",
+    )
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
@@ -100,7 +110,14 @@ def _fly(context: LaunchContext) -> list[Action]:
         return flight_node(
             spec,
             scenario,
-            parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep),
+            parameter_overrides(
+                spec,
+                scenario,
+                run,
+                start_time,
+                lockstep=lockstep,
+                use_sim_time=clock.simulated,
+            ),
             run,
         )
 
@@ -114,17 +131,17 @@ def _fly(context: LaunchContext) -> list[Action]:
             ]
         elif begins:
             end = begin_when_matched(
-                context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2
+                context, run, clock, (*first, *nodes), duration, by_rosbag2=by_rosbag2
             )
         else:  # a user activates the controller, or no user does
             end = end_with_log(
-                context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
+                context, run, clock, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
             )
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     actions = watch_page(context, run) + start_in_stages(
-        context, run, {spec: node(spec) for spec in first}, follow
+        context, run, clock, {spec: node(spec) for spec in first}, follow
     )
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)

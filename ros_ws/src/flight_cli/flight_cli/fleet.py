@@ -41,6 +41,7 @@ def fly_fleet_file(
     runs: Path,
     *,
     watch: bool,
+    use_sim_time: bool,
     as_json: bool,
 ) -> None:
     """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Exits with the
@@ -48,7 +49,7 @@ def fly_fleet_file(
     """
     require_package("rclpy", "")
     require_ros_environment()
-    chosen = read_fleet(file, duration)
+    chosen = read_fleet(file, duration, use_sim_time=use_sim_time)
     chosen_runs = new_runs(chosen, runs)
     context.call_on_close(partial(remove_empty, *chosen_runs))
     if watch:

@@ -83,6 +83,13 @@ def fly(
             help="Fly with all nodes in one process: a third of the processor time.",
         ),
     ] = False,
+    use_sim_time: Annotated[
+        bool,
+        typer.Option(
+            "--set use_sim_time",
+            help="Fly by the /clock of a simulator, at any speed of it, in place of real time.",
+        ),
+    ] = False,
     bridge: Annotated[
         str | None,
         typer.Option(
@@ -150,7 +157,15 @@ def fly(
                 "it beside a fleet",
                 "a scenario, or the key in the file of the fleet",
             )
-        fly_fleet_file(context, scenario, duration, runs, watch=watch, as_json=as_json)
+        fly_fleet_file(
+            context,
+            scenario,
+            duration,
+            runs,
+            watch=watch,
+            use_sim_time=use_sim_time,
+            as_json=as_json,
+        )
     chosen = with_settings(find_scenario(scenario, duration, with_route=route is None), settings)
     require(
         not (in_process and (lockstep or composed)),
@@ -166,6 +181,12 @@ def fly(
     )
     namespace = absolute_namespace(namespace)
     stepping = lockstep or chosen.flight.lockstep
+    require(
+        not (use_sim_time and (in_process or stepping)),
+        "use_sim_time",
+        "a flight in lockstep or in one process",
+        "a flight in real time over topics",
+    )
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     require(
         not (send and bridge is None),
@@ -223,6 +244,7 @@ def fly(
                 progress,
                 lockstep=stepping,
                 one_process=composed,
+                use_sim_time=use_sim_time,
                 autopilot=autopilot,
                 namespace=namespace,
                 announce=announce,
