@@ -2,25 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Export of flights: a wide table of the signals (CSV, Parquet), and a figure (PNG)."""
 
-from collections.abc import Callable, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
-from flight_analysis.metrics import best_error
 from flight_analysis.report import comparison
 from flight_analysis.report.data_frame import data_frame
-from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
-from flight_analysis.report.summary import NO_UNIT, RecordedFlight, channel_label
+from flight_analysis.report.paper import channels_by_title, draw_channel, last_instant
+from flight_analysis.report.summary import RecordedFlight
 from flight_core.files import replacing
 from flight_core.parameters import require
-from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal, Tape
 
-# Each loads in some tenths of a second, and most reports need neither.
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # it loads in some tenths of a second, and most reports do not need it
     import polars as pl
-    from matplotlib.axes import Axes
 
 # inches
 FIGURE_WIDTH = 15.0
@@ -55,25 +49,6 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
         signal_table(flights).write_parquet(stream)
 
 
-class _PlotColumn(NamedTuple):
-    """A column of the PNG: a signal of the tapes with some topics, with the channels of the
-    first.
-    """
-
-    title: str
-    topics: tuple[str, ...]
-    signal: Callable[[Tape], Signal]
-    style: dict[str, Any]
-    reference: bool = False
-
-
-PLOT_COLUMNS = (
-    _PlotColumn("y, over y_m", ("y",), lambda tape: tape["y"], {}, reference=True),
-    _PlotColumn("e = y - y_m", ("y", "y_m"), lambda tape: best_error(tape)[1], {}),
-    _PlotColumn("u", ("u",), lambda tape: tape["u"], {"drawstyle": "steps-post"}),
-)
-
-
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity,
     a row a channel.
@@ -86,54 +61,21 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
         path.name,
         "a name that ends in .png; figure writes .pdf and .svg",
     )
-    columns = [
-        (column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topics))
-    ]
-    rows = max(len(names) for _, names in columns)
+    columns = {title: names for title, names in channels_by_title(flights).items() if names}
+    rows = max(map(len, columns.values()))
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
-    for axes, (column, names) in zip(grid.T, columns, strict=True):
-        axes[0].set_title(column.title)
+    for axes, (title, names) in zip(grid.T, columns.items(), strict=True):
+        axes[0].set_title(title)
         for axis, name in zip(axes, names, strict=False):
-            _plot_channel(axis, flights, column, name)
+            draw_channel(axis, flights, name, line_width=1.0)
         axes[len(names) - 1].set_xlabel("t (s)")
         axes[len(names) - 1].tick_params(labelbottom=True)
         for axis in axes[len(names) :]:
             axis.set_axis_off()
-    grid[0, 0].set_xlim(0.0, max(flight_end(flight.tape) for flight in flights) or 1.0)
+    grid[0, 0].set_xlim(0.0, last_instant(flights))
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, frameon=False
     )
     with replacing(path) as stream:
         figure.savefig(stream, dpi=DPI, format="png")
-
-
-def _channels(flights: Sequence[RecordedFlight], topics: Sequence[str]) -> list[str]:
-    tapes = [flight.tape for flight in flights if {*topics} <= {*flight.tape.signals}]
-    return list(dict.fromkeys(chain.from_iterable(tape[topics[0]].names for tape in tapes)))
-
-
-def _plot_channel(
-    axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str
-) -> None:
-    """Plot a channel of the flights, with the reference and the gusts of the first flight."""
-    units = comparison.units(flights)
-    factor = units.get(name, NO_UNIT).factor
-
-    def plot(tape: Tape, signal: Signal, **style: Any) -> None:
-        axes.plot((signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[name] * factor, **style)
-
-    first = flights[0]
-    for gust in gust_intervals(first.tape, first.gusts):
-        axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
-    if column.reference and "y_m" in first.tape and name in first.tape["y_m"].names:
-        plot(first.tape, first.tape["y_m"], color=REFERENCE, linewidth=4.0, label="y_m")
-    for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
-        tape = flight.tape
-        if {*column.topics} <= {*tape.signals} and name in tape[column.topics[0]].names:
-            plot(
-                tape, column.signal(tape), color=colour, linewidth=1.0, label=label, **column.style
-            )
-    axes.set_ylabel(channel_label(name, units))
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)

@@ -7,7 +7,6 @@ a topic, LaTeX.
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,29 +58,9 @@ STYLE: Any = {
     "svg.hashsalt": "rise-di",  # the same file for the same flight
 }
 MATLAB_NAME = 63  # characters of a name at most
-MATLAB_KEYWORDS = frozenset(
-    {
-        "break",
-        "case",
-        "catch",
-        "classdef",
-        "continue",
-        "else",
-        "elseif",
-        "end",
-        "for",
-        "function",
-        "global",
-        "if",
-        "otherwise",
-        "parfor",
-        "persistent",
-        "return",
-        "spmd",
-        "switch",
-        "try",
-        "while",
-    }
+MATLAB_KEYWORDS = (
+    "break case catch classdef continue else elseif end for function global if otherwise parfor "
+    "persistent return spmd switch try while"
 )
 
 
@@ -118,9 +97,8 @@ def write_figure(
     require(
         NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm"
     )
-    outputs = _names(flights, "y")
-    inputs = _names(flights, "u")
-    known = [*outputs, *inputs, *(f"e.{name}" for name in outputs if _names(flights, "y_m"))]
+    outputs, errors, inputs = channels_by_title(flights).values()
+    known = [*outputs, *inputs, *errors]
     wanted = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
     for name in wanted:
         require(name in known, "channels", f"{name!r}", one_of(known, name))
@@ -131,9 +109,9 @@ def write_figure(
         )
         grid = figure.subplots(len(wanted), 1, sharex=True, squeeze=False)[:, 0]
         for axes, name in zip(grid, wanted, strict=True):
-            _draw(axes, flights, name)
+            draw_channel(axes, flights, name)
         grid[-1].set_xlabel("t (s)")
-        grid[-1].set_xlim(0.0, max(flight_end(flight.tape) for flight in flights) or 1.0)
+        grid[-1].set_xlim(0.0, last_instant(flights))
         handles: dict[str, Any] = {}
         for axes in grid:
             lines, labels = axes.get_legend_handles_labels()
@@ -146,18 +124,24 @@ def write_figure(
             figure.savefig(stream, format=suffix, dpi=DPI, metadata=stamps or None)
 
 
-def _names(flights: Sequence[RecordedFlight], topic: str) -> list[str]:
-    """Channels of a topic on any of the tapes."""
-    return list(
-        dict.fromkeys(
-            chain.from_iterable(
-                flight.tape[topic].names for flight in flights if topic in flight.tape
-            )
-        )
-    )
+def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]:
+    """Names of outputs, errors ("e.NAME") and inputs of all flights, by title."""
+    names: dict[str, dict[str, None]] = {"y": {}, "y_m": {}, "u": {}}
+    for flight in flights:
+        for topic in names.keys() & flight.tape.signals.keys():
+            names[topic] |= dict.fromkeys(flight.tape[topic].names)
+    errors = [f"e.{name}" for name in names["y"] if names["y_m"]]
+    return {"y, over y_m": [*names["y"]], "e = y - y_m": errors, "u": [*names["u"]]}
 
 
-def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
+def last_instant(flights: Sequence[RecordedFlight]) -> float:
+    """The end of the longest flight, s; 1 without samples."""
+    return max(flight_end(flight.tape) for flight in flights) or 1.0
+
+
+def draw_channel(
+    axes: "Axes", flights: Sequence[RecordedFlight], name: str, line_width: float = LINE_WIDTH
+) -> None:
     """Draw a channel of each flight, with the reference and the gusts of the first."""
     units = comparison.units(flights)
     plain = name.removeprefix("e.")
@@ -173,7 +157,7 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
         axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
     if is_output and not is_error and "y_m" in first.tape and plain in first.tape["y_m"].names:
         plot(
-            first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * LINE_WIDTH, label="y_m"
+            first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
         )
     for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
         tape = flight.tape
@@ -181,7 +165,7 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
         if signal is not None and plain in signal.names:
             drawn = {} if is_output else {"drawstyle": "steps-post"}
             shown = label if len(flights) > 1 else ("y" if is_output and not is_error else "")
-            plot(tape, signal, color=colour, linewidth=LINE_WIDTH, label=shown, **drawn)
+            plot(tape, signal, color=colour, linewidth=line_width, label=shown, **drawn)
     axes.set_ylabel(("e of " if is_error else "") + channel_label(plain, units))
     axes.grid(alpha=0.3, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)
@@ -238,7 +222,9 @@ def matlab_names(names: Iterable[str], used_names: Iterable[str] = ()) -> dict[s
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
         plain = (
-            plain if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS else f"x_{plain}"
+            plain
+            if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS.split()
+            else f"x_{plain}"
         )
         plain = plain[:MATLAB_NAME]
         count = 1
