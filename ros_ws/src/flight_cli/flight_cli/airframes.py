@@ -7,12 +7,11 @@ a new airframe.
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
 from flight_cli.output import new_table, parse_numbers, print_json
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains.airframe_properties import (
@@ -28,78 +27,64 @@ from rise_di.own_airframe import NewAirframe, new_airframe
 def airframes(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[AIRFRAME]...",
-            help="Names, or airframe files (.yaml); by default the library. With --write one: "
+        argument(
+            "Names, or airframe files (.yaml); by default the library. With --write one: "
             "an airframe file, a MATLAB file"
             " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
+            metavar="[AIRFRAME]...",
         ),
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Write NAME.yaml and NAME_flight.yaml, an airframe that flies."
-        ),
+        option("Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"),
     ] = None,
     name: Annotated[
-        str, typer.Option("--set name", help="Name of the airframe; by default that of the file.")
+        str, setting("name", "Name of the airframe; by default that of the file.")
     ] = "",
     speed: Annotated[
-        str | None,
-        typer.Option("--set speed", help='Trim speed, in m/s or with a unit: "176 ft/s".'),
+        str | None, setting("speed", 'Trim speed, in m/s or with a unit: "176 ft/s".')
     ] = None,
     states: Annotated[
         str,
-        typer.Option(
-            help='States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".'
-        ),
+        option('States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".'),
     ] = "",
     inputs: Annotated[
         str,
-        typer.Option(
-            help='Inputs in the order of B, with units and effects: "elevator: rad nose down, '
+        option(
+            'Inputs in the order of B, with units and effects: "elevator: rad nose down, '
             'thrust: 1".'
         ),
     ] = "",
     outputs: Annotated[
         str,
-        typer.Option(
-            help='As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
+        option(
+            'As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
             '0.987 u + 0.163 w".'
         ),
     ] = "",
     thrust: Annotated[
-        bool,
-        typer.Option(
-            "--set thrust", help="Add an input thrust in units of the weight along the flight path."
-        ),
+        bool, setting("thrust", "Add an input thrust in units of the weight along the flight path.")
     ] = False,
     lag: Annotated[
-        str | None,
-        typer.Option(help="Lags of the actuators in s, in the order of the inputs: 0.05,0.3"),
+        str | None, option("Lags of the actuators in s, in the order of the inputs: 0.05,0.3")
     ] = None,
     mass: Annotated[
-        str | None,
-        typer.Option("--set mass", help='Beside AVL\'s derivatives: "3.2 kg" or "85 slug".'),
+        str | None, setting("mass", 'Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
     ] = None,
     Ixx: Annotated[
-        str | None, typer.Option("--set Ixx", help='Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
+        str | None, setting("Ixx", 'Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
     ] = None,
-    Iyy: Annotated[str | None, typer.Option("--set Iyy", help="As --Ixx.")] = None,
-    Izz: Annotated[str | None, typer.Option("--set Izz", help="As --Ixx.")] = None,
-    Ixz: Annotated[str | None, typer.Option("--set Ixz", help="As --Ixx; by default 0.")] = None,
+    Iyy: Annotated[str | None, setting("Iyy", "As --Ixx.")] = None,
+    Izz: Annotated[str | None, setting("Izz", "As --Ixx.")] = None,
+    Ixz: Annotated[str | None, setting("Ixz", "As --Ixx; by default 0.")] = None,
     density: Annotated[
-        str | None, typer.Option("--set density", help='"1.225 kg/m^3" or "0.002377 slug/ft^3".')
+        str | None, setting("density", '"1.225 kg/m^3" or "0.002377 slug/ft^3".')
     ] = None,
     length: Annotated[
-        str | None, typer.Option("--set length", help="Unit of length of AVL's file, by default m.")
+        str | None, setting("length", "Unit of length of AVL's file, by default m.")
     ] = None,
-    text: Annotated[
-        str, typer.Option("--set source", help="Where the figures come from: a book and a page.")
-    ] = "",
-    replace: Annotated[
-        bool, typer.Option("--set replace", help="Replace files of these names.")
-    ] = False,
+    text: Annotated[str, setting("source", "Where the figures come from: a book and a page.")] = "",
+    replace: Annotated[bool, setting("replace", "Replace files of these names.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.

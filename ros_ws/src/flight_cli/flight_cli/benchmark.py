@@ -17,7 +17,7 @@ from flight_campaign.benchmark_entry import find_entry
 from flight_campaign.benchmark_scores import SCORES, Benchmark, Flights, define
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option
 from flight_core.files import display_path
 from flight_core.parameters import require
 
@@ -32,37 +32,27 @@ LEGEND = (
 def benchmark(
     entry: Annotated[
         list[str],
-        typer.Argument(
-            help="Scenarios whose controllers fly, one for each airframe; or a law of compare, "
+        argument(
+            "Scenarios whose controllers fly, one for each airframe; or a law of compare, "
             "as pi; or MODULE:FUNCTION."
         ),
     ],
     aircraft: Annotated[
-        int, typer.Option(min=1, help="Uncertain aircraft of a set; fewer to try an entry.")
+        int, option("Uncertain aircraft of a set; fewer to try an entry.", min=1)
     ] = 200,
-    name: Annotated[str | None, typer.Option(help="Name of the entry.")] = None,
-    sees: Annotated[
-        str | None, typer.Option(help="What the law measures beside y_m, as in: y.")
-    ] = None,
+    name: Annotated[str | None, option("Name of the entry.")] = None,
+    sees: Annotated[str | None, option("What the law measures beside y_m, as in: y.")] = None,
     knows: Annotated[
-        str | None,
-        typer.Option(help="What the law knows of the aircraft beside D, as in: Omega_ii."),
+        str | None, option("What the law knows of the aircraft beside D, as in: Omega_ii.")
     ] = None,
     release: Annotated[
-        str,
-        typer.Option(
-            help="Hash of the commit of a release: fresh seeds; by default the fixed seeds."
-        ),
+        str, option("Hash of the commit of a release: fresh seeds; by default the fixed seeds.")
     ] = "",
     output: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder of the run, which an interrupted run continues; by default in runs."
-        ),
+        option("Folder of the run, which an interrupted run continues; by default in runs."),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Threads; by default one a core.")
-    ] = None,
+    workers: Annotated[int | None, option("Threads; by default one a core.", min=1)] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fly the public benchmark with a law, and write a file of scores. The same command continues

@@ -40,7 +40,7 @@ from flight_cli.output import (
     print_json,
     progress_bar,
 )
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import learner
@@ -73,88 +73,81 @@ def campaign(
     context: typer.Context,
     scenario: Annotated[
         str,
-        typer.Argument(
-            help="Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
+        argument(
+            "Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
             "interrupted campaign to continue."
         ),
     ] = "osprey_servo",
-    aircraft: Annotated[int, typer.Option(min=1, help="How many uncertain aircraft.")] = 1000,
+    aircraft: Annotated[int, option("How many uncertain aircraft.", min=1)] = 1000,
     uncertainty: Annotated[
-        float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")
+        float, option("Largest relative deviation of each entry of A and B, 0 to 1.")
     ] = 0.3,
     wind: Annotated[
         WindEffect | None,
-        typer.Option(
-            "--set wind",
-            help="Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+        setting(
+            "wind",
+            "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
             "the scenario's.",
         ),
     ] = None,
     entry: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set entry",
-            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
+        setting(
+            "entry",
+            "An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
             "lag=0.5, noise=0.5, delay=0.02 (s).",
         ),
     ] = None,
     distribution: Annotated[
         Distribution | None,
-        typer.Option(
-            "--set distribution",
-            help="Of the deviations: uniform, normal with three standard deviations at the "
+        setting(
+            "distribution",
+            "Of the deviations: uniform, normal with three standard deviations at the "
             "limit, or its two limits.",
         ),
     ] = None,
     score: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set score",
-            help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each "
-            "output.",
+        setting(
+            "score",
+            "Unit of the rms error of an output in the score, SI, as q=0.02; once for each output.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
+    seed: Annotated[int, option("Seed of the aircraft.", min=0)] = 1,
     sweep: Annotated[
         str | None,
-        typer.Option(
-            help="A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
+        option(
+            "A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
             "or 'beta[V]=0.5,1,2'."
         ),
     ] = None,
-    duration: Annotated[
-        float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")
-    ] = None,
+    duration: Annotated[float | None, option("Seconds to fly, in place of the scenario's.")] = None,
     chunk: Annotated[
         int | None,
-        typer.Option(
-            "--set chunk",
+        setting(
+            "chunk",
+            f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU.",
             min=1,
-            help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on "
-            "a GPU.",
         ),
     ] = None,
     engine: Annotated[
         EngineName | None,
-        typer.Option(
-            help="Threads of this process, or processes and hosts of dask; by default dask with "
+        option(
+            "Threads of this process, or processes and hosts of dask; by default dask with "
             "a learner."
         ),
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option("--set workers", min=1, help="Threads or processes; by default one a core."),
+        int | None, setting("workers", "Threads or processes; by default one a core.", min=1)
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option("--set scheduler", help="Address of a dask scheduler, as in tcp://host:8786."),
+        str | None, setting("scheduler", "Address of a dask scheduler, as in tcp://host:8786.")
     ] = None,
-    runs: Annotated[
-        Path, typer.Option("--set runs", help="Folder that the campaign's folder is made in.")
-    ] = Path("runs"),
+    runs: Annotated[Path, setting("runs", "Folder that the campaign's folder is made in.")] = Path(
+        "runs"
+    ),
     rows: Annotated[
-        Path | None,
-        typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries."),
+        Path | None, option("Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -26,7 +26,7 @@ from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
     SignCheck,
@@ -40,24 +40,21 @@ INSTALLED = "installed"  # in place of a folder: the message packages of this ho
 
 def check(
     map_name: Annotated[
-        str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")
+        str, argument("Name of a channel map, or path of one (.yaml).", metavar="MAP")
     ],
-    airframe: Annotated[
-        str | None, typer.Option(help="Airframe; by default that of the scenario.")
-    ] = None,
-    scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_servo",
+    airframe: Annotated[str | None, option("Airframe; by default that of the scenario.")] = None,
+    scenario: Annotated[str, option("Scenario with the controller.")] = "osprey_servo",
     run: Annotated[
         Path | None,
-        typer.Option(
-            help="A recorded flight with y and u, each input excited; with a bridge, its "
-            "engaged time."
+        option(
+            "A recorded flight with y and u, each input excited; with a bridge, its engaged time."
         ),
     ] = None,
     namespace: LogNamespace = None,
     definitions: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Check the rows instead: the sources of a message package, of one release; "
+        option(
+            "Check the rows instead: the sources of a message package, of one release; "
             f"several, each a column; or {INSTALLED}."
         ),
     ] = None,

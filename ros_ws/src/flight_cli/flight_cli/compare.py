@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -36,6 +35,7 @@ from flight_cli.output import (
     progress_bar,
     write_text,
 )
+from flight_cli.words import argument, option, setting
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -66,61 +66,51 @@ WIDTH = 200  # characters, the least width of the table
 
 def compare(
     scenario: Annotated[
-        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")
+        str, argument("Name of a scenario, or path of a scenario file (.yaml).")
     ] = "osprey_servo",
-    aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 200,
+    aircraft: Annotated[int, option("Uncertain aircraft at each level.", min=1)] = 200,
     uncertainty: Annotated[
-        str, typer.Option(help="Largest relative deviations of A and B, as in 0.3,0.5")
+        str, option("Largest relative deviations of A and B, as in 0.3,0.5")
     ] = "0.3,0.5",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
+    seed: Annotated[int, option("Seed of the uncertain aircraft.", min=0)] = 1,
     wind: Annotated[
         WindEffect | None,
-        typer.Option(
-            "--set wind",
-            help="Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+        setting(
+            "wind",
+            "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
             "the scenario's.",
         ),
     ] = None,
     laws: Annotated[
         str | None,
-        typer.Option(
-            help="Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
+        option(
+            "Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
             "place of a name: its controller."
         ),
     ] = None,
     tuning: Annotated[
-        str,
-        typer.Option(help=f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}."),
+        str, option(f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}.")
     ] = "gust_turbulence",
     tune: Annotated[
         bool,
-        typer.Option(
-            "--tune",
-            help="First tune the laws that have no gains for this scenario: minutes a law.",
+        option(
+            "First tune the laws that have no gains for this scenario: minutes a law.", "--tune"
         ),
     ] = False,
     turbulence_seed: Annotated[
-        int,
-        typer.Option(
-            "--set turbulence_seed",
-            min=0,
-            help="Seed of the turbulence, unlike that of the tuning.",
-        ),
+        int, setting("turbulence_seed", "Seed of the turbulence, unlike that of the tuning.", min=0)
     ] = law_comparison.TURBULENCE_SEED,
     gains: Annotated[
-        Path | None,
-        typer.Option("--set gains", help="File of tuned gains; by default the one of the stack."),
+        Path | None, setting("gains", "File of tuned gains; by default the one of the stack.")
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(
-            help="File for the gains of one law as a section of a scenario, which flies with "
+        option(
+            "File for the gains of one law as a section of a scenario, which flies with "
             "the score shown."
         ),
     ] = None,
-    to_json: Annotated[
-        Path | None, typer.Option("--json", help="File to write the figures to, SI.")
-    ] = None,
+    to_json: Annotated[Path | None, option("File to write the figures to, SI.", "--json")] = None,
 ) -> None:
     """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits,
     uncertainty, tuning.

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.words import Namespace
+from flight_cli.words import Namespace, option
 from flight_core.environment import require_ros_environment
 
 REFUSED = 1
@@ -17,14 +17,13 @@ REFUSED = 1
 
 def engage(
     off: Annotated[
-        bool, typer.Option("--off", help="Disengage: give the channels back to the autopilot.")
+        bool, option("Disengage: give the channels back to the autopilot.", "--off")
     ] = False,
     blind: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Engage without regard to the pilot's transmitter, and without end by max_engaged.",
             "--blind",
-            help="Engage without regard to the pilot's transmitter, and without end by "
-            "max_engaged.",
         ),
     ] = False,
     namespace: Namespace = "",

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import print_json
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_log.tape_reader import read_run
 from rise_di.c_code import export as write_export
 
@@ -20,62 +20,42 @@ DIFFERS = 1
 
 
 def export(
-    scenario: Annotated[
-        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")
-    ],
+    scenario: Annotated[str, argument("Name of a scenario, or path of a scenario file (.yaml).")],
     folder: Annotated[
-        Path | None,
-        typer.Option("--c", help="Folder to write the C code and the report of the proof to."),
+        Path | None, option("Folder to write the C code and the report of the proof to.", "--c")
     ] = None,
     px4: Annotated[
-        Path | None,
-        typer.Option(help="Folder to write an external module of PX4 to, in place of --c."),
+        Path | None, option("Folder to write an external module of PX4 to, in place of --c.")
     ] = None,
     run: Annotated[
-        Path | None,
-        typer.Option(help="Prove with the ticks of a recorded run, in place of flights."),
+        Path | None, option("Prove with the ticks of a recorded run, in place of flights.")
     ] = None,
     float32: Annotated[
-        bool,
-        typer.Option(
-            "--float32", help="Compute in float. The proof then bounds the difference of u."
-        ),
+        bool, option("Compute in float. The proof then bounds the difference of u.", "--float32")
     ] = False,
     duration: Annotated[
         float | None,
-        typer.Option(
-            min=1.0, help="Duration of a flight of the proof, s; else the scenario's, at most 20 s."
-        ),
+        option("Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0),
     ] = None,
     drawn: Annotated[
-        int,
-        typer.Option(
-            "--set drawn", min=1, max=10_000_000, help="Number of drawn steps of the proof."
-        ),
+        int, setting("drawn", "Number of drawn steps of the proof.", min=1, max=10_000_000)
     ] = 50_000,
-    seed: Annotated[int, typer.Option("--set seed", min=0, help="Seed of the drawn inputs.")] = 1,
+    seed: Annotated[int, setting("seed", "Seed of the drawn inputs.", min=0)] = 1,
     compiler: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
+        option(
+            "Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
             "and clang, if there."
         ),
     ] = None,
     runner: Annotated[
-        str,
-        typer.Option(
-            "--set runner", help="Command that starts what the compiler makes, as qemu-aarch64."
-        ),
+        str, setting("runner", "Command that starts what the compiler makes, as qemu-aarch64.")
     ] = "",
     fmu: Annotated[
         bool,
-        typer.Option(
-            "--fmu", help="Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code."
-        ),
+        option("Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", "--fmu"),
     ] = False,
-    without_proof: Annotated[
-        bool, typer.Option("--no-proof", help="Write the code without a proof.")
-    ] = False,
+    without_proof: Annotated[bool, option("Write the code without a proof.", "--no-proof")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the

@@ -29,11 +29,7 @@ from flight_bringup.graph import (
     second_stage,
 )
 from flight_cli.fleet import fly_fleet_file
-from flight_cli.output import (
-    flight_progress,
-    print_json,
-    show_flight,
-)
+from flight_cli.output import flight_progress, print_json, show_flight
 from flight_cli.route_options import (
     Altitude,
     Line,
@@ -43,7 +39,7 @@ from flight_cli.route_options import (
     read_waypoints,
 )
 from flight_cli.settings import Settings, with_settings
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -57,31 +53,27 @@ def fly(
     context: typer.Context,
     scenario: Annotated[
         str,
-        typer.Argument(
-            help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
+        argument(
+            "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
         ),
     ] = "osprey_servo",
     duration: Annotated[
-        float | None, typer.Option(help="Duration in s; by default that of the scenario.")
+        float | None, option("Duration in s; by default that of the scenario.")
     ] = None,
     settings: Settings = None,
     in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes."),
+        bool, option("Fly in one process without ROS, as fast as it goes.", "--in-process")
     ] = False,
     lockstep: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Fly in lockstep over topics, as fast as possible, repeatable to the byte.",
             "--lockstep",
-            help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.",
         ),
     ] = False,
     composed: Annotated[
         bool,
-        typer.Option(
-            "--set composed",
-            help="Fly with all nodes in one process: a third of the processor time.",
-        ),
+        setting("composed", "Fly with all nodes in one process: a third of the processor time."),
     ] = False,
     use_sim_time: Annotated[
         bool,
@@ -92,46 +84,41 @@ def fly(
     ] = False,
     bridge: Annotated[
         str | None,
-        typer.Option(
-            metavar="MAP",
-            help="Fly an autopilot in place of the aircraft, by a channel map; a dry run "
+        option(
+            "Fly an autopilot in place of the aircraft, by a channel map; a dry run "
             "without --send.",
+            metavar="MAP",
         ),
     ] = None,
     route: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help=f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it."
-        ),
+        option(f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"),
     ] = None,
     origin: OriginOfRoute = None,
     fence: Annotated[
         Path | None,
-        typer.Option(
-            "--set route.fence",
+        setting(
+            "route.fence",
+            f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
             metavar="FILE",
-            help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
         ),
     ] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
     line: Line = None,
     send: Annotated[
-        bool,
-        typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged."),
+        bool, option("Send commands to the autopilot once the bridge is engaged.", "--send")
     ] = False,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")
+        bool, option("Serve the live page of the flight while it lasts.", "--watch")
     ] = False,
     namespace: Annotated[
         str,
-        typer.Option(
-            help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain."
-        ),
+        option("Namespace of all nodes, as uav1: one for each aircraft that flies in this domain."),
     ] = "",
-    runs: Annotated[
-        Path, typer.Option("--set runs", help="Folder that the run's folder is made in.")
-    ] = Path("runs"),
+    runs: Annotated[Path, setting("runs", "Folder that the run's folder is made in.")] = Path(
+        "runs"
+    ),
     as_json: AsJson = False,
 ) -> None:
     """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real
@@ -209,14 +196,14 @@ def fly(
     )
     files = route or fence
     for_route = (("route.simplify", simplify or None, route), ("route.line", line, route))
-    for option, value, file in (
+    for key, value, file in (
         ("route.origin", origin, files),
         ("route.altitude", altitude, files),
         *for_route,
     ):
         require(
             value is None or file is not None,
-            option,
+            key,
             "no --route",
             "the file of a route: --route FILE",
         )

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, read_waypoints
-from flight_cli.words import Namespace
+from flight_cli.words import Namespace, argument
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import ParameterError, require
 from flight_guidance.guidance_state import TARGETS
@@ -32,9 +32,8 @@ LINK = "link"
 def guide(
     commands: Annotated[
         list[str],
-        typer.Argument(
-            metavar="COMMAND...",
-            help="NAME=VALUE: one of phi, heading, course, leg, or north, east and radius of an "
+        argument(
+            "NAME=VALUE: one of phi, heading, course, leg, or north, east and radius of an "
             "orbit; one of theta, climb,"
             " altitude; V. phi, theta, heading and course in degrees, r (beside phi) in degrees "
             "a second; else m and m/s."
@@ -42,6 +41,7 @@ def guide(
             "resume: the last leg. home: fly"
             " home and orbit. link: keep the operator's link until Ctrl-C. Or a route file, "
             "without airspeeds.",
+            metavar="COMMAND...",
         ),
     ],
     origin: OriginOfRoute = None,

@@ -54,7 +54,7 @@ from flight_cli.output import (
     progress_bar,
     write_text,
 )
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -84,116 +84,102 @@ LINEAR = (
 def identify(
     source: Annotated[
         str | None,
-        typer.Argument(
-            help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
+        argument(
+            "jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
             "run, or an MCAP file. None with --bridge alone."
         ),
     ] = None,
-    speed: Annotated[
-        float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")
-    ] = None,
+    speed: Annotated[float | None, option("True airspeed to trim and fly at, m/s.")] = None,
     altitude: Annotated[
-        float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")
+        float | None, option("Altitude above sea level to trim and fly at, m.")
     ] = None,
     airframe: Annotated[
-        str | None, typer.Option(help="With a log: the nominal airframe, a name or a file (.yaml).")
+        str | None, option("With a log: the nominal airframe, a name or a file (.yaml).")
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(
-            help="Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
+        option(
+            "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
             "airframe file for the model, with a page. With --bridge: folder for what flies it."
         ),
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(
-            "--set scenario",
-            help="With a log: scenario with lags and delay of the controller; by default that "
+        setting(
+            "scenario",
+            "With a log: scenario with lags and delay of the controller; by default that "
             "in the log.",
         ),
     ] = None,
     delay: Annotated[
         float | None,
-        typer.Option(
-            "--set delay",
-            help="With a log: delay of u, s; by default that of the scenario. One process has "
-            "none.",
+        setting(
+            "delay",
+            "With a log: delay of u, s; by default that of the scenario. One process has none.",
         ),
     ] = None,
     namespace: Annotated[
         str | None,
-        typer.Option(
-            "--set namespace", help="With a log: namespace of the aircraft, if it holds several."
-        ),
+        setting("namespace", "With a log: namespace of the aircraft, if it holds several."),
     ] = None,
     refly: Annotated[
         bool,
-        typer.Option(
-            "--set refly",
-            help="With a log: fly its scenario with feedforward and observer of the model, in "
-            "process.",
+        setting(
+            "refly",
+            "With a log: fly its scenario with feedforward and observer of the model, in process.",
         ),
     ] = False,
     observer: Annotated[
-        bool,
-        typer.Option(
-            "--observer", help="Of JSBSim: add an extended-state observer from Omega and lags."
-        ),
+        bool, option("Of JSBSim: add an extended-state observer from Omega and lags.", "--observer")
     ] = False,
     guidance: Annotated[
         bool,
-        typer.Option(
-            "--guidance", help="Of JSBSim: fly and write guidance by rule in place of the pulses."
-        ),
+        option("Of JSBSim: fly and write guidance by rule in place of the pulses.", "--guidance"),
     ] = False,
     learn: Annotated[
-        bool,
-        typer.Option("--learn", help="Of JSBSim: write a scenario that learns A and B in flight."),
+        bool, option("Of JSBSim: write a scenario that learns A and B in flight.", "--learn")
     ] = False,
     margin: Annotated[
         float | None,
-        typer.Option(
-            "--set margin",
-            help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step "
-            "tests.",
+        setting(
+            "margin",
+            "Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.",
         ),
     ] = None,
     bridge: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "Excite the aircraft behind a channel map, or read the log of such a flight.",
             metavar="MAP",
-            help="Excite the aircraft behind a channel map, or read the log of such a flight.",
         ),
     ] = None,
     amplitude: Annotated[
         float | None,
-        typer.Option(
-            "--set amplitude",
-            help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.",
+        setting(
+            "amplitude",
+            "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.",
         ),
     ] = None,
     phase_margin: Annotated[
         float | None,
-        typer.Option(
-            "--set phase_margin",
-            help="Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45.",
+        setting(
+            "phase_margin", "Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."
         ),
     ] = None,
     accept: Annotated[
         bool,
-        typer.Option(
-            "--set accept",
-            help="Accept a phase margin below 40 deg, and write gains whose margins fall short.",
+        setting(
+            "accept",
+            "Accept a phase margin below 40 deg, and write gains whose margins fall short.",
         ),
     ] = False,
     commands: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set command",
-            metavar="INPUT:PROPERTY=VALUE",
-            help="Of JSBSim: a model's own property for an input, and its value at full "
+        setting(
+            "command",
+            "Of JSBSim: a model's own property for an input, and its value at full "
             "command; repeat for more.",
+            metavar="INPUT:PROPERTY=VALUE",
         ),
     ] = None,
     link_delay: Annotated[

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from rich.console import Console
 
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import find_map, load_map
 from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table
+from flight_cli.words import argument, option
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
@@ -27,44 +27,32 @@ from flight_log.vehicle_log import Choice, read_foreign_log
 
 def import_(
     log: Annotated[
-        Path,
-        typer.Argument(
-            help="DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4."
-        ),
+        Path, argument("DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.")
     ],
     map_name: Annotated[
-        str,
-        typer.Option(
-            "--map", metavar="MAP", help="Channel map: its channels of y and u, trims, scales."
-        ),
+        str, option("Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP")
     ],
     output: Annotated[
-        Path | None,
-        typer.Option(help="Folder to create; by default runs/ with the name of the log."),
+        Path | None, option("Folder to create; by default runs/ with the name of the log.")
     ] = None,
-    start: Annotated[
-        float | None, typer.Option("--from", help="Begin, s since the begin of the log.")
-    ] = None,
-    stop: Annotated[
-        float | None, typer.Option("--until", help="End, s since the begin of the log.")
-    ] = None,
+    start: Annotated[float | None, option("Begin, s since the begin of the log.", "--from")] = None,
+    stop: Annotated[float | None, option("End, s since the begin of the log.", "--until")] = None,
     servos: Annotated[
         bool,
-        typer.Option(
+        option(
+            "u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
             "--servos",
-            help="u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
         ),
     ] = False,
     system: Annotated[
-        int | None,
-        typer.Option(help="MAVLink system of a tlog of several; without, the one that flew."),
+        int | None, option("MAVLink system of a tlog of several; without, the one that flew.")
     ] = None,
     instances: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "Sensor or instance of several, as IMU=1; repeat for more.",
             "--instance",
             metavar="MESSAGE=NUMBER",
-            help="Sensor or instance of several, as IMU=1; repeat for more.",
         ),
     ] = None,
 ) -> None:

@@ -7,22 +7,21 @@ fleet.
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler, rviz, urdf
 from flight_bringup.fleet import is_fleet, read_fleet
+from flight_cli.words import argument, option
 from flight_core.files import write_file, writing
 
 
 def layouts(
     scenario: Annotated[
         str,
-        typer.Argument(
-            help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
+        argument(
+            "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
         ),
     ] = "osprey_servo",
-    folder: Annotated[Path, typer.Option(help="Folder to write the files to.")] = Path(),
+    folder: Annotated[Path, option("Folder to write the files to.")] = Path(),
 ) -> None:
     """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz
     with guidance.

@@ -24,7 +24,7 @@ from flight_cli.output import (
     write_text,
 )
 from flight_cli.settings import Settings, with_settings
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -35,11 +35,9 @@ NOTHING_LEARNED = 1
 
 
 def learn(
-    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
+    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")] = LATEST,
     settings: Settings = None,
-    write: Annotated[
-        Path | None, typer.Option(help="File for the learned model, an airframe file.")
-    ] = None,
+    write: Annotated[Path | None, option("File for the learned model, an airframe file.")] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     as_json: AsJson = False,

@@ -9,30 +9,29 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
+from flight_cli.words import option
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
 
 LogNamespace = Annotated[
-    str | None,
-    typer.Option("--namespace", help="Namespace of the aircraft, if the log holds several."),
+    str | None, option("Namespace of the aircraft, if the log holds several.", "--namespace")
 ]
 LogScenario = Annotated[
     str | None,
-    typer.Option(
-        "--scenario", help="Scenario of the flight, a name or a file; by default that in the log."
-    ),
+    option("Scenario of the flight, a name or a file; by default that in the log.", "--scenario"),
 ]
 
-REMAP: dict[str, Any] = {
-    "metavar": "NAME:=TOPIC",
-    "help": "A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
-}
-LogRemaps = Annotated[list[str] | None, typer.Option("--remap", **REMAP)]
+LogRemaps = Annotated[
+    list[str] | None,
+    option(
+        "A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
+        "--remap",
+        metavar="NAME:=TOPIC",
+    ),
+]
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:

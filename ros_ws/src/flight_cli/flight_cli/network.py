@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from flight_cli.words import option
 from flight_core.environment import require_ros_environment
 from flight_core.installation import require_package
 
@@ -19,24 +20,23 @@ FAILED = 1
 def network(
     peers: Annotated[
         str,
-        typer.Option(
+        option(
+            "IPv4 addresses of all hosts, this one's among them; the same on each host.",
             metavar="A,B",
-            help="IPv4 addresses of all hosts, this one's among them; the same on each host.",
         ),
     ],
-    write: Annotated[
-        Path, typer.Option(metavar="FILE", help="File to write the profile to.")
-    ] = Path("network.xml"),
+    write: Annotated[Path, option("File to write the profile to.", metavar="FILE")] = Path(
+        "network.xml"
+    ),
     check: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Then wait for the same command on the other hosts: who receives whom, delays, clocks.",
             "--check",
-            help="Then wait for the same command on the other hosts: who receives whom, delays, "
-            "clocks.",
         ),
     ] = False,
     timeout: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="How long to wait for the other hosts, s.")
+        float, option("How long to wait for the other hosts, s.", min=1.0, max=3600.0)
     ] = 20.0,
 ) -> None:
     """Write the profile of the middleware for nodes on several hosts: unicast between their

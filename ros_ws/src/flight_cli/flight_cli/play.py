@@ -10,10 +10,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
+from flight_cli.words import argument, option
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -29,17 +28,17 @@ class Stamps(StrEnum):
 
 
 def play(
-    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")],
+    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")],
     topics: Annotated[
-        str, typer.Option(help="Topics, as in y,y_m; by default all but those of every node.")
+        str, option("Topics, as in y,y_m; by default all but those of every node.")
     ] = "",
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Factor to real time.")] = 1.0,
-    start: Annotated[float, typer.Option(min=0.0, help="Flight time to start at, s.")] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
+    rate: Annotated[float, option("Factor to real time.", min=0.01, max=100.0)] = 1.0,
+    start: Annotated[float, option("Flight time to start at, s.", min=0.0)] = 0.0,
+    loop: Annotated[bool, option("Repeat until Ctrl-C.", "--loop")] = False,
     stamps: Annotated[
         Stamps,
-        typer.Option(
-            help="now: moved to the present, as a controller in real time needs them; recorded: "
+        option(
+            "now: moved to the present, as a controller in real time needs them; recorded: "
             "unchanged."
         ),
     ] = Stamps.NOW,
@@ -52,8 +51,8 @@ def play(
     is refused. A warning names the skipped topics: without CDR, or of a message type that is not
     installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
-    for option, value in (("--rate", rate), ("--start", start)):
-        require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
+    for name, value in (("--rate", rate), ("--start", start)):
+        require(math.isfinite(value), name, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start, namespace)
     warn_of_lacks_in(run, namespace)

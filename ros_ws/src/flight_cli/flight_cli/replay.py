@@ -31,7 +31,7 @@ from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
 from flight_cli.settings import Settings, parse_settings
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -41,16 +41,13 @@ DIFFERS = 1
 
 
 def replay(
-    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
+    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")] = LATEST,
     settings: Settings = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     csv_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--csv", help="CSV file for u as recorded and as computed; - for standard output."
-        ),
+        Path | None, option("CSV file for u as recorded and as computed.", "--csv")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -17,7 +17,7 @@ from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, STDOUT, new_table, print_json, show_flight, stdout_for
 from flight_cli.repair import repair_log
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path
 from flight_core.outcome import STATUS_INCOMPLETE
 
@@ -25,70 +25,51 @@ from flight_core.outcome import STATUS_INCOMPLETE
 def report(
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="Folder of a run, by default runs/latest; several are compared with the first."
-        ),
+        argument("Folder of a run, by default runs/latest; several are compared with the first."),
     ] = None,
     html: Annotated[
         Path | None,
-        typer.Option(
-            "--set html", help="Page of a comparison; by default comparison.html beside run 1."
-        ),
+        setting("html", "Page of a comparison; by default comparison.html beside run 1."),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--set output",
-            help="Folder for the report of one run, by default that of its log: for archives.",
+        setting(
+            "output", "Folder for the report of one run, by default that of its log: for archives."
         ),
     ] = None,
-    png: Annotated[
-        Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")
-    ] = None,
+    png: Annotated[Path | None, option("Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write all signals as CSV, one row an instant, one column a channel; - for "
-            "standard output."
-        ),
+        Path | None, option("Write all signals as CSV, one row an instant, one column a channel.")
     ] = None,
-    parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
+    parquet: Annotated[Path | None, option("Write the same table as Parquet.")] = None,
     repair: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Rebuild each log whose recorder was killed, or that is damaged, and write no report.",
             "--repair",
-            help="Rebuild each log whose recorder was killed, or that is damaged, and write no "
-            "report.",
         ),
     ] = False,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     figure: Annotated[
-        Path | None,
-        typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png."),
+        Path | None, option("Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
     ] = None,
-    width: Annotated[
-        str, typer.Option("--set width", help="Width of the figure: 88mm, 3.5in.")
-    ] = WIDTH,
+    width: Annotated[str, setting("width", "Width of the figure: 88mm, 3.5in.")] = WIDTH,
     channels: Annotated[
         str,
-        typer.Option(
-            "--set channels",
-            help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
+        setting(
+            "channels",
+            "Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
             "default each output.",
         ),
     ] = "",
     mat: Annotated[
-        Path | None,
-        typer.Option("--set mat", help="Write all signals as a MAT-file, a structure a topic."),
+        Path | None, setting("mat", "Write all signals as a MAT-file, a structure a topic.")
     ] = None,
-    tables: Annotated[
-        Path | None, typer.Option("--set tables", help="Folder for a CSV a topic.")
-    ] = None,
+    tables: Annotated[Path | None, setting("tables", "Folder for a CSV a topic.")] = None,
     latex: Annotated[
-        Path | None,
-        typer.Option("--set latex", help="Write the tables of errors and inputs as LaTeX."),
+        Path | None, setting("latex", "Write the tables of errors and inputs as LaTeX.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

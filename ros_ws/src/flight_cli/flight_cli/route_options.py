@@ -7,41 +7,40 @@ import sys
 from pathlib import Path
 from typing import Annotated, overload
 
-import typer
-
 from flight_cli.output import parse_numbers
+from flight_cli.words import setting
 from flight_core.parameters import require
 from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
 Altitude = Annotated[
     float | None,
-    typer.Option(
-        "--set route.altitude",
-        help="Altitude of a route without, or of the ground or home that it counts from, m.",
+    setting(
+        "route.altitude",
+        "Altitude of a route without, or of the ground or home that it counts from, m.",
     ),
 ]
 OriginOfRoute = Annotated[
     str | None,
-    typer.Option(
-        "--set route.origin",
+    setting(
+        "route.origin",
+        "Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
         metavar="LAT,LON",
-        help="Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
     ),
 ]
 Simplify = Annotated[
     float,
-    typer.Option(
-        "--set route.simplify",
+    setting(
+        "route.simplify",
+        "Leave out positions of a route within this distance of the line without them, m.",
         min=0.0,
-        help="Leave out positions of a route within this distance of the line without them, m.",
     ),
 ]
 Line = Annotated[
     str | None,
-    typer.Option(
-        "--set route.line",
+    setting(
+        "route.line",
+        "Which line of a file with several: a number from 1 on, or a name.",
         metavar="LINE",
-        help="Which line of a file with several: a number from 1 on, or a name.",
     ),
 ]
 

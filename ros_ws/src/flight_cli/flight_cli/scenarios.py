@@ -4,20 +4,18 @@
 
 from typing import Annotated
 
-import typer
 from rich.console import Console
 
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.output import new_table, print_json
-from flight_cli.words import AsJson
+from flight_cli.words import AsJson, argument
 
 
 def scenarios(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[SCENARIO]...",
-            help="Names, or scenario files (.yaml); by default all that ship.",
+        argument(
+            "Names, or scenario files (.yaml); by default all that ship.", metavar="[SCENARIO]..."
         ),
     ] = None,
     as_json: AsJson = False,

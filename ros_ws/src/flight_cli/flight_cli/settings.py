@@ -6,18 +6,17 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
-import typer
-
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_cli.words import option
 from flight_core.files import parse_yaml
 from flight_core.parameters import Config, nest, require
 
 Settings = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "A parameter to change, as in controller.k_g=2.0; may be repeated.",
         "--set",
         metavar="KEY=VALUE",
-        help="A parameter to change, as in controller.k_g=2.0; may be repeated.",
     ),
 ]
 

@@ -9,12 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from flight_bringup.processes import end_with_parent
 from flight_cli.flightgear import show_in_flightgear
 from flight_cli.log_options import REMAP, LogScenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
+from flight_cli.words import argument, option, setting
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import missing
@@ -36,100 +35,94 @@ from flight_view.watch import (
 def watch(
     run: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[RUN]...",
-            help="Folder of a run, or an MCAP file; by default the run in progress, else the "
+        argument(
+            "Folder of a run, or an MCAP file; by default the run in progress, else the "
             "last one. The second is a ghost.",
+            metavar="[RUN]...",
         ),
     ] = None,
     fleet: Annotated[
         bool,
-        typer.Option(
-            "--fleet",
-            help="Show the aircraft of each RUN on one map, and a choice of them; by default "
+        option(
+            "Show the aircraft of each RUN on one map, and a choice of them; by default "
             "the runs in progress.",
+            "--fleet",
         ),
     ] = False,
     port: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "Port on this host; 0 takes any free one.",
             min=0,
             max=65535,
-            help="Port on this host; 0 takes any free one.",
             show_default=f"{DEFAULT_PORT}",
         ),
     ] = None,
     wait: Annotated[
-        bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")
+        bool, option("Wait for the log of RUN where there is none yet.", "--wait")
     ] = False,
     text: Annotated[
-        bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")
+        bool, option("Show the flight in the terminal, without a browser.", "--text")
     ] = False,
     foxglove: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.",
             "--foxglove",
-            help="Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.",
         ),
     ] = False,
     flightgear: Annotated[
         str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            help="Send the pose of a flight in progress to FlightGear instead, as to "
+        option(
+            "Send the pose of a flight in progress to FlightGear instead, as to "
             "127.0.0.1:5500, with --set origin.",
+            metavar="HOST:PORT",
         ),
     ] = None,
     control: Annotated[
         bool,
-        typer.Option(
-            "--control",
-            help="Let the page command the flight, with a key that this command prints.",
+        option(
+            "Let the page command the flight, with a key that this command prints.", "--control"
         ),
     ] = False,
     control_real: Annotated[
-        bool,
-        typer.Option(
-            "--set real", help="As --control, and gains also while a bridge sends to an autopilot."
-        ),
+        bool, setting("real", "As --control, and gains also while a bridge sends to an autopilot.")
     ] = False,
     scenario: LogScenario = None,
     namespace: Annotated[
         str | None,
-        typer.Option(
-            help="Namespace of the aircraft: by default the first in the log, with --control "
-            "the root."
+        option(
+            "Namespace of the aircraft: by default the first in the log, with --control the root."
         ),
     ] = None,
     remap: Annotated[list[str] | None, typer.Option("--set remap", **REMAP)] = None,
     background: Annotated[
         Path | None,
-        typer.Option(
-            "--set background",
+        setting(
+            "background",
+            "GeoJSON of lines, polygons and points for the map, with --set origin.",
             metavar="FILE",
-            help="GeoJSON of lines, polygons and points for the map, with --set origin.",
         ),
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(
-            "--set origin",
+        setting(
+            "origin",
+            "Where north and east are 0, for the background and FlightGear.",
             metavar="LAT,LON",
-            help="Where north and east are 0, for the background and FlightGear.",
         ),
     ] = None,
     altitude: Annotated[
         float,
-        typer.Option(
-            "--set altitude",
-            help="Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
+        setting(
+            "altitude",
+            "Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
         ),
     ] = 0.0,
     rate: Annotated[
-        float,
-        typer.Option("--set rate", min=1.0, max=100.0, help="Packets a second to FlightGear."),
+        float, setting("rate", "Packets a second to FlightGear.", min=1.0, max=100.0)
     ] = 30.0,
-    runs: Annotated[Path, typer.Option("--set runs", help="Folder of the runs.")] = Path("runs"),
+    runs: Annotated[Path, setting("runs", "Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or
     again later.

@@ -14,8 +14,25 @@ from typer.core import TyperCommand, TyperGroup
 from flight_core.parameters import ParameterError, require
 
 SET = "--set"
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")]
-Namespace = Annotated[str, typer.Option(help="Namespace of the aircraft.")]
+
+
+def option(text: str, *names: str, **rules: Any) -> Any:
+    """An option with its help; without `names` the name of the parameter."""
+    return typer.Option(*names, help=text, **rules)
+
+
+def setting(name: str, text: str, **rules: Any) -> Any:
+    """An option that a user gives as --set NAME=VALUE."""
+    return option(text, f"{SET} {name}", **rules)
+
+
+def argument(text: str, **rules: Any) -> Any:
+    """An argument with its help."""
+    return typer.Argument(help=text, **rules)
+
+
+AsJson = Annotated[bool, option("Print the result as JSON, nothing else.", "--json")]
+Namespace = Annotated[str, option("Namespace of the aircraft.")]
 """Options of several commands."""
 GONE = MappingProxyType(
     {
