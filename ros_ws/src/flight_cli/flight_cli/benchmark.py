@@ -102,9 +102,7 @@ def _show(console: Console, scores: Mapping[str, Any]) -> None:
         f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows "
         f"{entry['knows']}"
     )
-    table = new_table(
-        title, ("set", "flights", "score", "worst", "lost"), left_aligned=("set",), wrapped=("set",)
-    )
+    table = new_table(title, ("set", "flights", "score", "worst", "lost"), wrapped=("set",))
     for scored in scores["sets"].values():
         if "not_flown" not in scored:
             figures = (

@@ -21,7 +21,7 @@ from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.log_options import warn_of_lacks
-from flight_cli.output import flight_progress, new_table, print_json
+from flight_cli.output import flight_progress, new_table, print_json, say
 from flight_core.files import display_path, link_latest, write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -105,7 +105,7 @@ def identify_behind_bridge(
         )
     channel_map, narrower = within_range(channel_map, trims)
     for sentence in narrower:
-        console.print(sentence, highlight=False, soft_wrap=True)
+        say(console, sentence)
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, channels, speed, str(airframe.resolve()), needed)
     require(
@@ -123,11 +123,7 @@ def identify_behind_bridge(
         return
     _show_gains(console, channels, response, flyable)
     scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
-    console.print(
-        f"to fly it: rise-di fly {scenario} --bridge {copied} --send",
-        highlight=False,
-        soft_wrap=True,
-    )
+    say(console, f"to fly it: rise-di fly {scenario} --bridge {copied} --send")
 
 
 def _identified(
@@ -207,7 +203,6 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
         "another",
         ("input", "amplitude", "doublets, s", "multisine, s", "Hz"),
-        left_aligned=("input",),
     )
     for i, name in enumerate(controller.inputs):
         width = controller.width[i]
@@ -220,13 +215,12 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
             band,
         )
     console.print(table)
-    console.print(
+    say(
+        console,
         f"{'Hover' if hovers else 'Fly straight and level'}, in the mode in which the map "
         "engages, then in another terminal: rise-di engage (within"
         f" {duration - controller.duration:.0f} s). The pilot's override, rise-di engage --off "
         "and Ctrl-C end it at any time.",
-        highlight=False,
-        soft_wrap=True,
     )
 
 
@@ -304,11 +298,7 @@ def _show_response(
 
 def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
     parameters = ("input", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
-    table = new_table(
-        "Models of the channels, SI, fitted to the output error",
-        parameters,
-        left_aligned=("input",),
-    )
+    table = new_table("Models of the channels, SI, fitted to the output error", parameters)
     estimates = ("channel", "abs(y / u)", "+-", "y behind u, rad", "+-", "used")
     loop = new_table(
         "The models at the frequency of the loop, standard errors",
@@ -342,13 +332,12 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
         if model is None or not model.usable
     ]
     if uncertain:
-        console.print(
+        say(
+            console,
             f"{', '.join(uncertain)}: no certain model without a zero above {FASTEST_ZERO:g} "
             "1/s, so that the law has"
             f" {uncertain[0]}_dot = Omega u from the step response: no damping in its "
             "feedforward, and the integral by bandwidth alone.",
-            highlight=False,
-            soft_wrap=True,
         )
 
 
@@ -370,11 +359,7 @@ def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | No
 def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:
     controller = flyable.controller
     params = flyable.controller.law_params()
-    table = new_table(
-        "Gains by lag and delay",
-        ("channel", "bandwidth, rad/s", "Lambda, 1/s"),
-        left_aligned=("channel",),
-    )
+    table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         place = response.outputs.index(output)
         bandwidth = params.K[i] * params.input_scale[i] * abs(channels.Omega[place, place])

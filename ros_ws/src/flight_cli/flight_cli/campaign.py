@@ -39,6 +39,7 @@ from flight_cli.output import (
     parse_numbers,
     print_json,
     progress_bar,
+    say,
 )
 from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path, writing
@@ -295,7 +296,6 @@ def _print(console: Console, results: Table, first: str) -> None:
     table = new_table(
         escape(f"\n{results.caption}"),
         (first, *(escape(column.head) for column in results.columns)),
-        left_aligned=(first,),
     )
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
@@ -314,7 +314,7 @@ def _show(
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
-    table = new_table(escape(title), ("figure", *FIGURE_HEADINGS), left_aligned=("figure",))
+    table = new_table(escape(title), ("figure", *FIGURE_HEADINGS))
     for row in figure_rows(tally, units):
         table.add_row(*row)
     console.print(table)
@@ -333,9 +333,8 @@ def _show(
         )
     for flight in figures["fly_again"]:
         score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"
-        console.print(
+        say(
+            console,
             f"worst: aircraft {flight['number']}, {score}; again: {flight['command']} (or "
             "--lockstep, over topics)",
-            soft_wrap=True,
-            highlight=False,
         )

@@ -52,6 +52,7 @@ from flight_cli.output import (
     new_table,
     print_json,
     progress_bar,
+    say,
     write_text,
 )
 from flight_cli.words import AsJson, argument, option, setting
@@ -484,11 +485,11 @@ def _show_flights_of_model(
     console: Console, again: _Reflight, units: dict[str, DisplayUnit]
 ) -> None:
     headings = ["flight", *(f"{name}\n{unit.unit}" for name, unit in units.items())]
-    table = new_table("\nRms of the error", headings, left_aligned=("flight",))
+    table = new_table("\nRms of the error", headings)
     for title, rms in (("recorded", again.recorded), ("with the model", again.again)):
         table.add_row(title, *(f"{rms[name] * unit.factor:.3g}" for name, unit in units.items()))
     console.print(table)
-    console.print(f"{again.origin}; outcome: {again.outcome}", highlight=False, soft_wrap=True)
+    say(console, f"{again.origin}; outcome: {again.outcome}")
 
 
 def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) -> Actuation:
@@ -506,11 +507,7 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
 def _show_model(console: Console, identification: Identification) -> None:
     console.print(entry_table(f"A and B of {identification.airframe.name}", identification.entries))
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
-    table = new_table(
-        "\nInnovations of the held-out samples, one of three seconds",
-        headings,
-        left_aligned=("output",),
-    )
+    table = new_table("\nInnovations of the held-out samples, one of three seconds", headings)
     for i, (name, unit) in enumerate(_units(identification).items()):
         figures = [
             (model.rms[i] * unit.factor, model.whiteness[i])
@@ -593,25 +590,20 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
     steps = identified.responses
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
-    console.print(
+    say(
+        console,
         f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude "
         f"{states['altitude']:.5g} m, "
         + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
-        highlight=False,
-        soft_wrap=True,
     )
     stops = new_table(
-        "\nCommands: trim, and range down and up from trim",
-        ("input", "trim", "down", "up"),
-        left_aligned=("input",),
+        "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
     )
     columns = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
     responses = new_table(
-        "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2",
-        columns,
-        left_aligned=("input",),
+        "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns
     )
     for j, name in enumerate(INPUTS):
         stops.add_row(
@@ -629,17 +621,13 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
             differ = f"the slopes of its steps differ by a factor of {1.0 / spread:.2g}"
             console.print(f"{name} is not linear: {differ}; the largest is used")
     for sentence in steps.rejected:
-        console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
+        say(console, f"rejected: {sentence}")
 
     answer = identified.selection.engineering
     controller = answer.controller
     params = answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
-    table = new_table(
-        "\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2",
-        headings,
-        left_aligned=("channel",),
-    )
+    table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings)
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         response = (
             abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)])
@@ -654,19 +642,14 @@ def _show(console: Console, identified: IdentifiedAircraft) -> None:
     if answer.delay_margin:
         margin += f", {speed_of_margin(identified.selection.study, answer)}"
     if identified.sideslip_zero > 0.0:
-        console.print(
+        say(
+            console,
             f"with p and r constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s:"
             " a zero in the right half plane, outside the theorem; the sideslip feedback of "
             "--guidance flies it",
-            highlight=False,
-            soft_wrap=True,
         )
     sign = controller.sampled_sign()[0].name.lower()
-    console.print(
-        f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    say(console, f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}")
     _show_flights(console, identified)
 
 
@@ -679,9 +662,7 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
         ("flight", "outcome"),
         ("outcome",),
     )
-    largest = new_table(
-        "\nLargest deviation of a command from trim", ["flight", *INPUTS], left_aligned=("flight",)
-    )
+    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS])
     for title, flight in identified.flights.items():
         errors = [
             f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()

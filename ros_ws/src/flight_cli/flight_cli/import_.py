@@ -12,7 +12,7 @@ from rich.console import Console
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import find_map, load_map
 from flight_analysis.report.run_folder import PROVENANCE
-from flight_cli.output import new_table
+from flight_cli.output import new_table, say
 from flight_cli.words import argument, option
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
@@ -109,11 +109,7 @@ def import_(
     )
     for sentence in notes:
         print(f"warning: {sentence}", file=sys.stderr)
-    table = new_table(
-        f"{log.name}, {read.kind}",
-        ("topic", "samples", "Hz", "longest gap, s"),
-        left_aligned=("topic",),
-    )
+    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS
         rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
@@ -124,10 +120,9 @@ def import_(
         tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     ) / NANOSECONDS
     length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
-    console.print(
+    say(
+        console,
         f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",
-        highlight=False,
-        soft_wrap=True,
     )
 
 

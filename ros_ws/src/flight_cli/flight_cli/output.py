@@ -79,13 +79,11 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
             _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance"))
         )
         if legs := leg_results(summary["guidance"]["legs"]):
-            console.print(
-                f"{legs}{taken_over(summary, 'guidance')}", highlight=False, soft_wrap=True
-            )
+            say(console, f"{legs}{taken_over(summary, 'guidance')}")
     if summary["models"]:
         console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
     if commands := command_results(summary):
-        console.print(commands, highlight=False, soft_wrap=True)
+        say(console, commands)
     console.print(
         f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error",
         style="dim",
@@ -116,9 +114,7 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
 def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
     """What guidance held in each segment: rms and largest error."""
     headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
-    table = new_table(
-        f"Guidance by segment, in m, m/s and deg{part}", headings, left_aligned=("segment",)
-    )
+    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings)
     for segment in segments:
         held = segment["lateral"], segment["vertical"]
         names = ", ".join(each["quantity"] for each in held)
@@ -143,7 +139,6 @@ def model_table(
     table = new_table(
         f"Rms of the error by model{part}",
         ["", *(heading.replace(" ", "\n") for heading in headings)],
-        left_aligned=("",),
     )
     for row in rows:
         table.add_row(*row)
@@ -153,9 +148,7 @@ def model_table(
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
     """Entries of A and B, nominal and identified, with the standard deviation of the change."""
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
-    table = new_table(
-        f"{title}, SI; deviation: of the change, standard", headings, left_aligned=("entry",)
-    )
+    table = new_table(f"{title}, SI; deviation: of the change, standard", headings)
     for entry in entries:
         values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
         if entry.nominal:
@@ -184,16 +177,17 @@ def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
 
 def new_table(
     title: str,
-    headings: Iterable[str],
-    left_aligned: Container[str] = (),
+    headings: Sequence[str],
+    left_aligned: Container[str] | None = None,
     wrapped: Container[str] = (),
 ) -> Table:
-    """An empty table: columns outside `left_aligned` are aligned right, columns outside `wrapped`
-    keep to one line.
+    """An empty table: columns outside `left_aligned`, by default the first, are aligned right,
+    columns outside `wrapped` keep to one line.
     """
+    left = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in headings:
-        justify: Literal["left", "right"] = "left" if heading in left_aligned else "right"
+        justify: Literal["left", "right"] = "left" if heading in left else "right"
         table.add_column(heading, justify=justify, no_wrap=heading not in wrapped, overflow="fold")
     return table
 
@@ -279,6 +273,11 @@ def parse_numbers(text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         return []
+
+
+def say(console: Console, text: str) -> None:
+    """Print a text as it is, also where it is longer than a line."""
+    console.print(text, highlight=False, soft_wrap=True)
 
 
 def print_json(value: Any) -> None:

@@ -184,7 +184,7 @@ def _show(
         )
     if open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
-        table = new_table("u computed minus u recorded", headings, left_aligned=("input",))
+        table = new_table("u computed minus u recorded", headings)
         for name, figures in _u_figures(result, inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
         console.print(table)

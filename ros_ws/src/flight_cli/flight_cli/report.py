@@ -15,7 +15,7 @@ from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_over
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, STDOUT, new_table, print_json, show_flight, stdout_for
+from flight_cli.output import LATEST, new_table, print_json, say, show_flight
 from flight_cli.repair import repair_log
 from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path
@@ -125,7 +125,7 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
         zip(comparison.labels(flights), flights, strict=True), start=1
     ):
         result = f"{flight.summary['outcome']}{taken_over(flight.summary, 'errors')}"
-        console.print(f"{k}: {label}, {result}", highlight=False, soft_wrap=True)
+        say(console, f"{k}: {label}, {result}")
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table(
         "Tracking error, and its ratio to the first", headings, left_aligned=("channel", "")
