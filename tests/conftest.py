@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
+from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_log.tape_writer import write_run
 
@@ -32,6 +34,11 @@ few = settings(
 """Deterministic examples of fuzzing. benchmarks/fuzz.py does long searches."""
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[ParameterError]]:
+    """Expect a ParameterError whose sentence has a match of the pattern."""
+    return pytest.raises(ParameterError, match=sentence)
 
 
 def pytest_configure(config: pytest.Config) -> None:

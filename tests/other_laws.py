@@ -27,17 +27,15 @@ def _section(text: str) -> dict[str, Any]:
     return parameters
 
 
-_RISE_DI = _section(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
+_RISE_DI = _section(find_scenario("osprey_servo").path.read_text())
 
 COMMON = {key: value for key, value in _RISE_DI.items() if key in ControllerConfig.model_fields}
 """The parameters that every law has."""
 
-_BLOCKS = re.findall(
-    r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8"), re.DOTALL
-)
+_BLOCKS = re.findall(r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").read_text(), re.DOTALL)
 
 SECTIONS = {law["law"]: COMMON | law for law in map(yaml.safe_load, _BLOCKS)}
-SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text(encoding="utf-8"))
+SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text())
 
 
 @contextmanager
@@ -47,12 +45,8 @@ def example_installed(folder: Path) -> Iterator[None]:
     """
     metadata = folder / "pid_law-0.1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8"
-    )
-    (metadata / "entry_points.txt").write_text(
-        f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8"
-    )
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLE))
         patch.syspath_prepend(str(folder))

@@ -33,10 +33,10 @@ def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
 
 def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path:
     """Write a scenario file with changes to the sections of another."""
-    tree = yaml.safe_load(base.read_text(encoding="utf-8"))
+    tree = yaml.safe_load(base.read_text())
     for name, changes in sections.items():
         tree[f"/**/{name}"]["ros__parameters"] |= changes
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(yaml.safe_dump(tree))
     return path
 
 

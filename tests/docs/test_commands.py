@@ -56,9 +56,7 @@ def make(words: list[str]) -> None:
     folder = REPOSITORY
     if words[:1] == ["-C"]:
         folder, words = folder / words[1], words[2:]
-    rules = re.findall(
-        r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    rules = re.findall(r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(), re.MULTILINE)
     targets = " ".join(rules).split()
     asked = [word for word in words if "=" not in word]
     assert asked == [] or asked[0] in targets
@@ -67,7 +65,7 @@ def make(words: list[str]) -> None:
 def ros2(words: list[str]) -> None:
     """The executable is in a package of this workspace, the launch file there has the arguments."""
     if words[0] == "run":
-        assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text(encoding="utf-8")
+        assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text()
     elif words[0] == "launch":
         with patch.dict(sys.modules, launch_stand_in.modules()):
             launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))[
@@ -101,7 +99,7 @@ CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "pyt
 
 def lines(page: Path) -> list[str]:
     """The lines of the blocks of a page; one that ends with a backslash goes on with the next."""
-    text = re.sub(r"\\\n *", "", page.read_text(encoding="utf-8"))
+    text = re.sub(r"\\\n *", "", page.read_text())
     return [
         *(line for block in SHELL.findall(text) for line in block.splitlines()),
         *INDENTED.findall(text),
@@ -147,7 +145,7 @@ def mistake_in(line: str, page: Path) -> str:
 def test_options_in_the_text_of_pages_exist() -> None:
     unknown = []
     for page in PAGES:
-        for name, rest in SPAN.findall(page.read_text(encoding="utf-8")):
+        for name, rest in SPAN.findall(page.read_text()):
             command = RISE_DI.commands[name]  # type: ignore[attr-defined]
             known = {option.split()[0] for parameter in command.params for option in parameter.opts}
             if options := set(re.findall(r"(?<!\S)--[a-z-]+", rest)) - known:
@@ -161,9 +159,7 @@ def test_quick_commands_of_pages_run_as_they_stand(
     for run in ("latest", "A", "B"):
         shutil.copytree(recorded, tmp_path / "runs" / run)
     monkeypatch.chdir(tmp_path)
-    indented = [
-        line for page in PAGES for line in INDENTED.findall(page.read_text(encoding="utf-8"))
-    ]
+    indented = [line for page in PAGES for line in INDENTED.findall(page.read_text())]
     found = {
         tuple(words[1:])
         for line in indented

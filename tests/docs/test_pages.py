@@ -37,7 +37,7 @@ def blocks(page: Path) -> list[tuple[str, str, str]]:
     """Kind, text and the reason for not running it, of each block of a page."""
     return [
         (block["kind"], block["text"], block["reason"] or "")
-        for block in BLOCK.finditer(page.read_text(encoding="utf-8"))
+        for block in BLOCK.finditer(page.read_text())
     ]
 
 
@@ -92,7 +92,7 @@ def test_each_block_of_page_is_run_or_says_why_not(page: Path) -> None:
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs_and_stored_without_output(notebook: Path, tmp_path: Path) -> None:
-    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    cells = json.loads(notebook.read_text())["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert code
     assert not any(cell.get("outputs") for cell in cells)
@@ -118,16 +118,14 @@ def test_the_site_has_every_page(site: Path) -> None:
 
 def test_a_formula_is_mathml_on_the_site(site: Path) -> None:
     code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)
-    pages = {
-        path.name: code.sub("", path.read_text(encoding="utf-8")) for path in site.rglob("*.html")
-    }
-    theory = (REPOSITORY / "docs" / "theory.md").read_text(encoding="utf-8")
+    pages = {path.name: code.sub("", path.read_text()) for path in site.rglob("*.html")}
+    theory = (REPOSITORY / "docs" / "theory.md").read_text()
     assert pages["theory.html"].count("<math") == theory.replace("$$", "$").count("$") / 2
     assert [name for name, page in pages.items() if re.search(r"\\[(\[]|\$", page)] == []
 
 
 def test_the_site_loads_nothing_from_another_host(site: Path) -> None:
-    pages = {path.name: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    pages = {path.name: path.read_text() for path in site.rglob("*.html")}
     loads = re.compile(r"""<link [^>]*\bhref="?(?:https?:)?//|\bsrc(?:set)?="?(?:https?:)?//""")
     assert [name for name, page in pages.items() if loads.search(page)] == []
     # The theme would load the library of such a diagram from a host; without the library the
@@ -135,11 +133,11 @@ def test_the_site_loads_nothing_from_another_host(site: Path) -> None:
     assert [
         page.name
         for page in (REPOSITORY / "docs").rglob("*.md")
-        if "```mermaid" in page.read_text(encoding="utf-8")
+        if "```mermaid" in page.read_text()
     ] == []
 
 
 def test_reference_of_parameters_is_that_of_classes() -> None:
-    assert parameters.PAGE.read_text(encoding="utf-8") == parameters.page(), (
+    assert parameters.PAGE.read_text() == parameters.page(), (
         "python -m tools.parameters writes it again"
     )

@@ -163,11 +163,9 @@ def export(data: bytes, folder: Path) -> None:
     flown = find_scenario("osprey_gust")
     frame = folder / "frame.yaml"
     frame.write_text(
-        dump_yaml(
-            _renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")), names)
-        )
+        dump_yaml(_renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text()), names))
     )
-    sections = _renamed(yaml.safe_load(flown.path.read_text(encoding="utf-8")), names)
+    sections = _renamed(yaml.safe_load(flown.path.read_text()), names)
     sections["/**/aircraft"]["ros__parameters"]["airframe"] = str(frame)
     path = folder / "scenario.yaml"
     path.write_text(dump_yaml(sections))

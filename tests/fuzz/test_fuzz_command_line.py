@@ -70,9 +70,7 @@ def garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"{name}.yaml").write_bytes(content)
     for folder in ("folder.yaml", "nothing", "other"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "other" / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information: 5\n", encoding="utf-8"
-    )
+    (tmp_path / "other" / "metadata.yaml").write_text("rosbag2_bagfile_information: 5\n")
     (tmp_path / "other" / "other.db3").write_bytes(b"SQLite format 3\x00" + bytes(200))
     return tmp_path
 

@@ -12,7 +12,7 @@ import yaml
 from mcap.opcode import Opcode
 from mcap.records import Message
 from mcap.writer import MCAP0_MAGIC, CompressionType
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.fuzz.targets import log, write_run
 from tests.joint_states import JOINT_STATE, vector
 
@@ -89,9 +89,7 @@ def test_lz4_chunk_with_changed_bytes_skipped(tmp_path: Path) -> None:
 def test_channel_with_invalid_quality_of_service_repaired(tmp_path: Path) -> None:
     run = write_run(tmp_path, log(Y).replace(b"- depth: 1\n", b"[: \x01 depth:"))
     assert repair(run).wrote_metadata
-    information = yaml.safe_load((run / METADATA).read_text(encoding="utf-8"))[
-        "rosbag2_bagfile_information"
-    ]
+    information = yaml.safe_load((run / METADATA).read_text())["rosbag2_bagfile_information"]
     assert (
         information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"] == []
     )
@@ -124,9 +122,7 @@ def test_with_invalid_flight_time_first_sample_is_at_0(t: float, tmp_path: Path)
 
 def test_invalid_topic_names_are_rejected(tmp_path: Path) -> None:
     run = write_run(tmp_path, log([("y", kind, data) for _, kind, data in Y]))
-    with pytest.raises(
-        ParameterError, match="found topics that begin with no slash: y, expected a recorded flight"
-    ):
+    with refusing("found topics that begin with no slash: y, expected a recorded flight"):
         read_run(run)
 
 
@@ -136,8 +132,8 @@ def test_metadata_with_an_invalid_end_is_rejected(last: str, tmp_path: Path) -> 
         f"rosbag2_bagfile_information: {{starting_time: {{nanoseconds_since_epoch: 0}}, "
         f"duration: {{nanoseconds: {last}}}}}"
     )
-    (tmp_path / METADATA).write_text(text, encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"metadata\.yaml: found .*, expected that of rosbag2"):
+    (tmp_path / METADATA).write_text(text)
+    with refusing(r"metadata\.yaml: found .*, expected that of rosbag2"):
         read_bag_metadata(tmp_path)
 
 
@@ -154,7 +150,7 @@ def test_a_log_with_any_parameters_is_repaired(content: bytes, tmp_path: Path) -
 
 def test_exponential_and_recursive_aliases_are_rejected() -> None:
     for name in ("aliases_of_a_billion", "itself_inside"):
-        with pytest.raises(ParameterError, match=r"not valid YAML \(found more than 100000 values"):
+        with refusing(r"not valid YAML \(found more than 100000 values"):
             parse_yaml((CORPUS / "scenario" / name).read_bytes(), "x", "y")
     assert parse_yaml("{a: &b [1, 2], c: *b}", "x", "y") == {"a": [1, 2], "c": [1, 2]}
 
@@ -185,8 +181,7 @@ def test_text_of_log_cannot_end_script_of_page() -> None:
 def test_log_without_finite_value_is_refused(
     value: float, tmp_path: Path, osprey_gust: Scenario
 ) -> None:
-    with pytest.raises(
-        ParameterError,
-        match=r"found no sample of a flight among .*/y: \d+ samples refused: damaged, not finite",
+    with refusing(
+        r"found no sample of a flight among .*/y: \d+ samples refused: damaged, not finite"
     ):
         read_flight(write_run(tmp_path, constant_flight(osprey_gust, value)))

@@ -39,15 +39,13 @@ def write_package(folder: Path, name: str, files: dict[str, str], dependencies: 
     """An interface package as its authors write it."""
     for path, text in files.items():
         (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name / path).write_text(text, encoding="utf-8")
+        (folder / name / path).write_text(text)
     depends = "".join(f"<depend>{dependency}</depend>" for dependency in dependencies)
     found = "\n".join(f"find_package({dependency} REQUIRED)" for dependency in dependencies)
     listed = " ".join(f'"{path}"' for path in files)
-    (folder / name / "package.xml").write_text(
-        PACKAGE_XML.format(name=name, depends=depends), encoding="utf-8"
-    )
+    (folder / name / "package.xml").write_text(PACKAGE_XML.format(name=name, depends=depends))
     text = CMAKE.format(name=name, found=found, files=listed, dependencies=" ".join(dependencies))
-    (folder / name / "CMakeLists.txt").write_text(text, encoding="utf-8")
+    (folder / name / "CMakeLists.txt").write_text(text)
 
 
 @pytest.fixture

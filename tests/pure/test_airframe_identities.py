@@ -10,6 +10,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from tests.conftest import refusing
 
 from aircraft_sim.airframe import Airframe, airframes, check_identities, load_airframe
 from flight_core.parameters import ParameterError
@@ -220,17 +221,9 @@ def test_factors_are_the_published_ones(unit: str, factor: float) -> None:
     assert si_per_unit(unit) == pytest.approx(factor, rel=2e-6)
 
 
-@pytest.mark.parametrize(
-    "unit",
-    [
-        "knots",
-        "",
-        "ft//s",
-        "m^x",
-    ],
-)
+@pytest.mark.parametrize("unit", ["knots", "", "ft//s", "m^x"])
 def test_unknown_unit_is_refused(unit: str) -> None:
-    with pytest.raises(ParameterError, match="or a product such as ft/s"):
+    with refusing("or a product such as ft/s"):
         quantity(unit, "states.V")
 
 
@@ -238,7 +231,7 @@ def test_text_with_a_unit_becomes_si() -> None:
     assert in_si("176 ft/s", "speed", "m/s") == pytest.approx(53.6448, rel=1e-12)
     assert in_si(53.6, "speed", "m/s") == 53.6
     for wrong, like in (("176 ft", "m/s"), ("fast", "m/s"), ("", "kg"), ("3 stone", "kg")):
-        with pytest.raises(ParameterError, match=r"^mass: found"):
+        with refusing(r"^mass: found"):
             in_si(wrong, "mass", like)
 
 
@@ -291,5 +284,5 @@ def test_coordinates_rebuild_the_state() -> None:
     P, N, H = output_coordinates(C)
     x = np.array([1.0, -2.0, 0.3, 0.7])
     np.testing.assert_allclose(P @ (C @ x) + N @ (H.T @ x), x, rtol=1e-12)
-    with pytest.raises(ParameterError, match="independent outputs"):
+    with refusing("independent outputs"):
         output_coordinates(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))

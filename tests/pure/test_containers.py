@@ -15,20 +15,18 @@ from flight_cli.cli import application
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCKER = ROOT / "docker"
-AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load(
-    (DOCKER / "autopilot.yaml").read_text(encoding="utf-8")
-)["services"]
+AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load((DOCKER / "autopilot.yaml").read_text())[
+    "services"
+]
 DOCKERFILES = sorted(DOCKER.glob("Dockerfile*"))
-COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
+COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 
 
 def instructions(dockerfile: Path) -> list[tuple[str, str]]:
     """Each instruction of a Dockerfile with its arguments, in order."""
     lines = [
-        line
-        for line in dockerfile.read_text(encoding="utf-8").splitlines()
-        if line and not line.startswith("#")
+        line for line in dockerfile.read_text().splitlines() if line and not line.startswith("#")
     ]
     joined = re.sub(r"\s*\\\n\s*", " ", "\n".join(lines)).splitlines()
     return [(word, rest) for word, _, rest in (line.partition(" ") for line in joined)]

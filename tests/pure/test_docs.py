@@ -57,12 +57,7 @@ WORDS = re.compile(f"(?<![a-z])({'|'.join(REPLACED).replace(' ', '[ _]')})(?![a-
 
 def prose(page: Path) -> str:
     """The text of a page without code blocks, code spans and formulas."""
-    text = re.sub(
-        r"^(```.*?^```|    .*?$)",
-        "",
-        page.read_text(encoding="utf-8"),
-        flags=re.MULTILINE | re.DOTALL,
-    )
+    text = re.sub(r"^(```.*?^```|    .*?$)", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"`[^`\n]*`|\$\$.*?\$\$|\$[^$]*\$", "", text, flags=re.DOTALL)
 
 
@@ -72,7 +67,7 @@ def links(page: Path) -> list[str]:
 
 def anchors(page: Path) -> set[str]:
     """The anchors that GitHub gives to the headings of a page."""
-    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
     }
@@ -86,7 +81,7 @@ def test_page_lines_have_at_most_200_characters() -> None:
     long = [
         f"{name(page)}:{number}"
         for page in PAGES
-        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        for number, line in enumerate(page.read_text().splitlines(), 1)
         # a program writes evidence.md, and a row of a table cannot go on in the next line
         if len(line) > MAX_LINE and not (page.name == "evidence.md" and line.startswith("|"))
     ]
@@ -97,9 +92,7 @@ def test_rows_have_a_cell_for_each_column() -> None:
     """Below a heading; a | in a formula would begin a cell, on GitHub and on the site."""
     bad = []
     for page in PAGES:
-        text = re.sub(
-            r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
-        )
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
         for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
             cells = {len(re.split(r"(?<!\\)\|", row)) for row in table.splitlines()}
             if len(cells) != 1 or not re.match(r".*\n\|( ?:?-+:? ?\|)+\n", table):
@@ -121,13 +114,11 @@ def test_relative_links_and_anchors_exist() -> None:
 
 
 def test_tests_that_pages_name_exist() -> None:
-    tests = "".join(
-        path.read_text(encoding="utf-8") for path in (REPOSITORY / "tests").rglob("*.py")
-    )
+    tests = "".join(path.read_text() for path in (REPOSITORY / "tests").rglob("*.py"))
     named = {
         (name(page), test)
         for page in PAGES
-        for test in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))
+        for test in re.findall(r"`(test_\w+)`", page.read_text())
     }
     unknown = [
         f"{page}: {test}"
@@ -157,7 +148,7 @@ def test_sources_tests_and_pages_use_words_of_field() -> None:
         f"{REPLACED[match.group().lower().replace('_', ' ')]}"
         for path in files
         if path != Path(__file__).resolve() and not {"corpus", "vendor"} & set(path.parts)
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for number, line in enumerate(path.read_text().splitlines(), 1)
         for match in WORDS.finditer(line)
     ]
     assert not occurrences, "\n".join(occurrences)

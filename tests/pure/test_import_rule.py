@@ -100,7 +100,7 @@ def imported_modules(path: Path) -> set[str]:
     both a and a.b.
     """
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -183,7 +183,7 @@ def test_no_unit_imports_itself_over_others() -> None:
 
 
 def test_architecture_page_shows_table_in_layers() -> None:
-    page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "architecture.md").read_text()
     lines = re.findall(r"^```text\n(.*?)```$", page, re.MULTILINE | re.DOTALL)[0].splitlines()
     sorter = TopologicalSorter(IMPORTS)
     sorter.prepare()
@@ -263,7 +263,7 @@ def test_private_names_of_rclpy_are_in_one_file() -> None:
 
 def has_private_names(path: Path) -> bool:
     """Whether a file imports rclpy.impl, or reads a `handle` beside an import of rclpy."""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     nodes = list(ast.walk(ast.parse(text))) if "rclpy" in text else []
     modules = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     reads_handle = any(isinstance(node, ast.Attribute) and node.attr == "handle" for node in nodes)

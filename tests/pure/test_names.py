@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.maps import MAP_FILES
 
 from aircraft_sim.airframe import LIBRARY as AIRFRAMES
@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.scenario import SCHEMAS
 from flight_analysis.closed_loop.scenario_library import LIBRARY as SCENARIOS
 from flight_analysis.report.paper import _tabular
 from flight_core.files import comment, dump_yaml, parse_yaml
-from flight_core.parameters import Config, ParameterError
+from flight_core.parameters import Config
 from flight_design.gains.gain_yaml import yaml_flow, yaml_template
 from rise_di import new_airframe
 
@@ -74,14 +74,8 @@ def sections(path: Path) -> list[tuple[type[Config], dict[str, Any]]]:
 
 
 FILES = [
-    *(
-        (Airframe, yaml.safe_load(path.read_text(encoding="utf-8")))
-        for path in sorted(AIRFRAMES.glob("*.yaml"))
-    ),
-    *(
-        (ChannelMap, yaml.safe_load(path.read_text(encoding="utf-8")))
-        for path in MAP_FILES.values()
-    ),
+    *((Airframe, yaml.safe_load(path.read_text())) for path in sorted(AIRFRAMES.glob("*.yaml"))),
+    *((ChannelMap, yaml.safe_load(path.read_text())) for path in MAP_FILES.values()),
     *(section for path in sorted(SCENARIOS.glob("*.yaml")) for section in sections(path)),
 ]
 DOORS = {
@@ -118,9 +112,7 @@ def test_name_outside_of_the_grammar_is_refused_at_each_place(
     door: tuple[type[Config], dict[str, Any], tuple[Any, ...]], name: str
 ) -> None:
     schema, values, path = door
-    with pytest.raises(
-        ParameterError, match=r"expected (a string that matches \[A-Za-z\]|printable characters)"
-    ):
+    with refusing(r"expected (a string that matches \[A-Za-z\]|printable characters)"):
         schema.validate_mapping(renamed(values, path, name), "set")
 
 
@@ -131,11 +123,7 @@ def test_every_file_of_the_repository_has_names_of_the_grammar() -> None:
         for path in sorted((REPOSITORY / "examples").rglob("*.yaml"))
         if path not in MAP_FILES.values()
     ]
-    names = {
-        path[-1]
-        for file in files
-        for path in places(yaml.safe_load(file.read_text(encoding="utf-8")))
-    }
+    names = {path[-1] for file in files for path in places(yaml.safe_load(file.read_text()))}
     assert all(
         name.replace("_", "").replace(".", "").isalnum() and name[0].isalpha() for name in names
     )
@@ -146,14 +134,9 @@ def test_airframe_whose_name_leaves_the_folder_is_refused(name: str, tmp_path: P
     """NAME.yaml is written into the folder that the user gives."""
     source = tmp_path / "source.yaml"
     source.write_text(
-        dump_yaml(
-            yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")) | {"name": name}
-        )
+        dump_yaml(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text()) | {"name": name})
     )
-    with pytest.raises(
-        ParameterError,
-        match=r"^name: found .*, expected the name of a file in the folder, without a /$",
-    ):
+    with refusing(r"^name: found .*, expected the name of a file in the folder, without a /$"):
         new_airframe(source, folder=tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["source.yaml"]
 

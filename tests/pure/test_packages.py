@@ -68,7 +68,7 @@ def disagreements(package: Path) -> list[str]:
     """The statements about a package's files that do not hold."""
     name = package.name
     root = ElementTree.parse(package / "package.xml").getroot()
-    setup = (package / "setup.py").read_text(encoding="utf-8")
+    setup = (package / "setup.py").read_text()
     email = root.find("maintainer[@email]")
     config = configparser.ConfigParser()
     config.read(package / "setup.cfg")
@@ -112,11 +112,11 @@ def undeclared(package: Path) -> set[str]:
 
 
 def test_the_wheel_holds_every_package_and_law() -> None:
-    project = tomllib.loads((SOURCES.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    project = tomllib.loads((SOURCES.parents[1] / "pyproject.toml").read_text())
     held = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
     assert held == [f"ros_ws/src/{package.name}/{package.name}" for package in PACKAGES]
     (laws,) = project["project"]["entry-points"].values()
-    setup = (SOURCES / "control_laws" / "setup.py").read_text(encoding="utf-8")
+    setup = (SOURCES / "control_laws" / "setup.py").read_text()
     assert laws == dict(re.findall(r'"(\w+) = ([\w.]+:\w+)"', setup))
 
 
@@ -124,13 +124,9 @@ def test_packages_citation_and_changelog_have_one_version() -> None:
     root = SOURCES.parents[1]
     files = [*PACKAGES, root / "examples" / "pid_law"]
     versions = {ElementTree.parse(package / "package.xml").findtext("version") for package in files}
-    cited = re.search(
-        r"^version: (.+)$", (root / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    cited = re.search(r"^version: (.+)$", (root / "CITATION.cff").read_text(), re.MULTILINE)
     newest = re.search(
-        r"^## (\d\S*) - \d{4}-\d\d-\d\d$",
-        (root / "CHANGELOG.md").read_text(encoding="utf-8"),
-        re.MULTILINE,
+        r"^## (\d\S*) - \d{4}-\d\d-\d\d$", (root / "CHANGELOG.md").read_text(), re.MULTILINE
     )
     assert cited is not None
     assert newest is not None
@@ -158,7 +154,7 @@ def test_pytest_runs_the_tests_of_a_package() -> None:
 
 
 def test_page_on_ros_names_what_rosdep_cannot_install() -> None:
-    page = (SOURCES.parents[1] / "docs" / "ros.md").read_text(encoding="utf-8")
+    page = (SOURCES.parents[1] / "docs" / "ros.md").read_text()
     assert not {name for name in WITHOUT_KEY if f"`{name.replace('_', '-')}`" not in page}
 
 
@@ -170,7 +166,7 @@ def uninstalled_data(package: Path) -> set[Path]:
     """Data files that setup.py does not name; a symlinked build has all files of the package
     folder.
     """
-    setup = (package / "setup.py").read_text(encoding="utf-8")
+    setup = (package / "setup.py").read_text()
     named = {
         pattern
         for data in re.findall(r"package_data=\{[^}]*\}", setup)
@@ -214,6 +210,6 @@ def test_every_source_file_states_its_licence() -> None:
     unmarked = [
         path
         for path in files
-        if "SPDX-License-Identifier: Apache-2.0" not in path.read_text(encoding="utf-8")[:200]
+        if "SPDX-License-Identifier: Apache-2.0" not in path.read_text()[:200]
     ]
     assert not unmarked

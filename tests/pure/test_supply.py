@@ -14,14 +14,10 @@ from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
-ADVISORIES: list[dict[str, str]] = yaml.safe_load(
-    (ROOT / ".ci/advisories.yaml").read_text(encoding="utf-8")
-)
+ADVISORIES: list[dict[str, str]] = yaml.safe_load((ROOT / ".ci/advisories.yaml").read_text())
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 LOCKED = re.findall(
-    r"^([a-z0-9][a-z0-9._-]*)==(\S+)",
-    (ROOT / "requirements.lock").read_text(encoding="utf-8"),
-    re.MULTILINE,
+    r"^([a-z0-9][a-z0-9._-]*)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE
 )
 
 
@@ -45,7 +41,7 @@ def test_locked_package_has_no_advisory_without_reason(row: dict[str, str]) -> N
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=[path.stem for path in WORKFLOWS])
 def test_workflow_is_of_fixed_commits_and_least_permissions(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     workflow: dict[str, Any] = yaml.safe_load(text)
     assert workflow["permissions"] == {"contents": "read"}
     for action in re.findall(r"uses: (?!\./)(.*)", text):
@@ -58,15 +54,15 @@ JOBS = [
     (
         f"{path.stem}.{name}",
         job,
-        job.get("permissions", yaml.safe_load(path.read_text(encoding="utf-8"))["permissions"]),
+        job.get("permissions", yaml.safe_load(path.read_text())["permissions"]),
     )
     for path in WORKFLOWS
-    for name, job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].items()
+    for name, job in yaml.safe_load(path.read_text())["jobs"].items()
 ]
 WITH_RIGHTS = [(name, job) for name, job, rights in JOBS if "write" in rights.values()]
-RELEASE: dict[str, Any] = yaml.safe_load(
-    (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
-)["jobs"]
+RELEASE: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())[
+    "jobs"
+]
 PROGRAM = re.compile(
     r"\.ci/|\b(pip|pipx|uv|uvx|npm|npx|yarn|conda|apt|apt-get|curl|wget|make|python[\d.]*|node|docker|git)\b"
 )
@@ -115,7 +111,7 @@ def test_build_of_a_release_runs_one_script() -> None:
         if "upload-artifact" in step.get("uses", "")
     ]
     assert uploads == [len(RELEASE["build"]["steps"]) - 1]
-    assert ".ci/wheel" not in re.sub(r"#.*", "", (ROOT / ".ci/release").read_text(encoding="utf-8"))
+    assert ".ci/wheel" not in re.sub(r"#.*", "", (ROOT / ".ci/release").read_text())
 
 
 @pytest.mark.parametrize(
@@ -123,7 +119,7 @@ def test_build_of_a_release_runs_one_script() -> None:
     ["Makefile", *(f".ci/{p.name}" for p in sorted((ROOT / ".ci").iterdir()) if not p.suffix)],
 )
 def test_installation_is_of_locked_hashes(path: str) -> None:
-    text = (ROOT / path).read_text(encoding="utf-8")
+    text = (ROOT / path).read_text()
     unlocked = [
         line
         for line in INSTALL.findall(re.sub(r"^\s*#.*", "", text, flags=re.MULTILINE))
@@ -134,7 +130,7 @@ def test_installation_is_of_locked_hashes(path: str) -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / ".ci").glob("*.txt")), ids=lambda path: path.stem)
 def test_list_of_a_script_has_a_hash_for_each_version(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     rows = re.findall(
         r"^[\w.-]+==\S+(?: ;[^\n\\]*)?(?: \\\n    --hash=sha256:[0-9a-f]{64})+", text, re.MULTILINE
     )
@@ -142,8 +138,6 @@ def test_list_of_a_script_has_a_hash_for_each_version(path: Path) -> None:
 
 
 def test_uv_is_that_of_the_makefile() -> None:
-    version = re.search(
-        r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    version = re.search(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert version is not None
-    assert f"uv=={version[1]} " in (ROOT / ".ci/uv.txt").read_text(encoding="utf-8")
+    assert f"uv=={version[1]} " in (ROOT / ".ci/uv.txt").read_text()

@@ -21,8 +21,8 @@ from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from rise_di_controller import internals
 
-PAGE = (REPOSITORY / "docs" / "symbols.md").read_text(encoding="utf-8")
-INTERFACES = (REPOSITORY / "docs" / "interfaces.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "symbols.md").read_text()
+INTERFACES = (REPOSITORY / "docs" / "interfaces.md").read_text()
 LAST_EQUATION = 52  # of the paper
 
 
@@ -61,7 +61,7 @@ def resolve(name: str) -> Any:
 
 def marked() -> set[int | str]:
     """The arguments of all marks `equation` of the tests."""
-    texts = (path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
+    texts = (path.read_text() for path in TESTS.rglob("test_*.py"))
     trees = (ast.parse(text) for text in texts if "mark.equation" in text)
     calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
     marks = [call for call in calls if ast.unparse(call.func) == "pytest.mark.equation"]

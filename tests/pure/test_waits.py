@@ -119,8 +119,6 @@ def test_patterns_are_found(source: str, found: int) -> None:
 def test_tests_over_topics_wait_for_conditions() -> None:
     files = [path for path in sorted(ROS.rglob("*.py")) if path.name not in HELPERS]
     lines = [
-        f"{path.relative_to(ROS)}:{fault}"
-        for path in files
-        for fault in faults(path.read_text(encoding="utf-8"))
+        f"{path.relative_to(ROS)}:{fault}" for path in files for fault in faults(path.read_text())
     ]
     assert not lines, "\n".join(lines)

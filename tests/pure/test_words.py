@@ -38,9 +38,7 @@ def nodes(folder: str) -> dict[str, list[ast.AST]]:
     """The syntax nodes of each Python file of a folder, by the path of the file."""
     paths = sorted((REPOSITORY / folder).rglob("*.py"))
     return {
-        str(path.relative_to(REPOSITORY)): list(
-            ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        )
+        str(path.relative_to(REPOSITORY)): list(ast.walk(ast.parse(path.read_text())))
         for path in paths
     }
 
@@ -77,7 +75,7 @@ def loop_variables(tree: list[ast.AST]) -> list[str]:
 
 def test_code_reads_aloud() -> None:
     trees = nodes("ros_ws/src")
-    texts = [(REPOSITORY / name).read_text(encoding="utf-8") for name in trees]
+    texts = [(REPOSITORY / name).read_text() for name in trees]
     lines = sum(
         bool(line.strip()) and not line.strip().startswith("#")
         for text in texts

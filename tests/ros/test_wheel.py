@@ -27,7 +27,7 @@ def write_package(folder: Path, name: str) -> None:
         f"{name}-9.9.dist-info/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: 9.9\n",
     }.items():
         (folder / path).parent.mkdir(parents=True)
-        (folder / path).write_text(text, encoding="utf-8")
+        (folder / path).write_text(text)
 
 
 @pytest.fixture

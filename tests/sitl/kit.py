@@ -136,19 +136,19 @@ class Autopilot:
         command = [str(self.script), action, str(self.folder), *words]
         # Files, not pipes: what `up` starts would hold a pipe open.
         output = self.folder / f"{action}.txt"
-        with output.open("w", encoding="utf-8") as file:
+        with output.open("w") as file:
             done = subprocess.run(
                 command, env={**os.environ, "PILOT_PYTHON": PILOT_PYTHON, **environment},
                 stdin=subprocess.DEVNULL,
                 stdout=file, stderr=subprocess.STDOUT, timeout=timeout, check=False,
             )  # fmt: skip
-        text = output.read_text(encoding="utf-8")
+        text = output.read_text()
         assert done.returncode == 0, f"{' '.join(command)}: {text}"
         return text.strip()
 
     def kill(self, *programs: str) -> Callable[[], None]:
         """Kill processes of the kit; what is returned starts them again as the kit started them."""
-        pids = [int(line) for line in (self.folder / "pids").read_text(encoding="utf-8").split()]
+        pids = [int(line) for line in (self.folder / "pids").read_text().split()]
         parents = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
 
         def is_one(process: psutil.Process, program: str) -> bool:
@@ -172,7 +172,7 @@ class Autopilot:
         def start() -> None:
             psutil.wait_procs(chosen)
             for program, (command, environment) in zip(programs, again, strict=True):
-                with (self.folder / f"{program}_again.log").open("w", encoding="utf-8") as log:
+                with (self.folder / f"{program}_again.log").open("w") as log:
                     started = subprocess.Popen(
                         command,
                         env=environment,
@@ -182,7 +182,7 @@ class Autopilot:
                         stderr=log,
                     )
                 self._restarted.append(started)
-                with (self.folder / "pids").open("a", encoding="utf-8") as file:
+                with (self.folder / "pids").open("a") as file:
                     file.write(f"{started.pid}\n")
 
         return start
@@ -222,7 +222,7 @@ class Autopilot:
 
     def patient_map(self, name: str, *changes: tuple[str, str]) -> str:
         """A copy of a map with longer ages, and further changes of its text."""
-        text = find_map(name).read_text(encoding="utf-8")
+        text = find_map(name).read_text()
         for old, new in (
             ("max_age: 0.2 ", f"max_age: {MAX_AGE} "),
             ("max_age: 0.35 ", f"max_age: {MAX_AGE} "),
@@ -230,7 +230,7 @@ class Autopilot:
         ):
             text = text.replace(old, new)
         path = self.folder / f"{Path(name).stem}.yaml"
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text)
         return str(path)
 
     def engage(self, *options: str) -> Process:
@@ -316,7 +316,7 @@ class Autopilot:
         """The summary of the last flight: its outcome, and its engagements with start, stop,
         reason.
         """
-        found: dict[str, Any] = json.loads((self.run / "summary.json").read_text(encoding="utf-8"))
+        found: dict[str, Any] = json.loads((self.run / "summary.json").read_text())
         return found
 
 
@@ -326,7 +326,7 @@ def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
 
     The poses of a busy host may be MAX_AGE old.
     """
-    content = yaml.safe_load(scenario.read_text(encoding="utf-8"))
+    content = yaml.safe_load(scenario.read_text())
     reference = content["/**/reference_model"]["ros__parameters"]
     kept = {
         key: value for key, value in reference.items() if key not in {"pulses", "coordinated_turn"}
@@ -422,9 +422,7 @@ class ArduPlane(Autopilot):
     def up(self, **parameters: float) -> None:
         """Start agent, autopilot and transmitter, with parameters of the autopilot."""
         extra = self.folder / "extra.parm"
-        extra.write_text(
-            "".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="utf-8"
-        )
+        extra.write_text("".join(f"{name} {value:g}\n" for name, value in parameters.items()))
         self._call("up", str(PROFILE), timeout=90.0, EXTRA_PARM=str(extra))
 
     def state(self) -> dict[str, Any]:
@@ -773,14 +771,14 @@ class Quadrotor(Px4):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.script = folder / "sitl"
-        text = Px4.script.read_text(encoding="utf-8")
+        text = Px4.script.read_text()
         for pattern, value in (
             (r"^KIT=.*$", f"KIT={Px4.script.parent}"),
             (r"PX4_SIM_MODEL=\S+", "PX4_SIM_MODEL=sihsim_quadx"),
         ):
             text, count = re.subn(pattern, value, text, flags=re.MULTILINE)
             assert count == 1, f"{Px4.script}: {pattern}"
-        self.script.write_text(text, encoding="utf-8")
+        self.script.write_text(text)
         self.script.chmod(0o755)
 
     def take_off(self) -> None:

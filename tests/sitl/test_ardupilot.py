@@ -93,7 +93,7 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     assert row.captured or airspeed == pytest.approx(
         1.0, abs=0.05
     )  # a captured V is 0 in a dry run
-    assert "sample refused" not in (plane.run / "log" / "bridge.log").read_text(encoding="utf-8")
+    assert "sample refused" not in (plane.run / "log" / "bridge.log").read_text()
     assert "/ap/joy" not in {message.topic for message in messages}, "a dry run sends nothing"
 
 
@@ -172,7 +172,7 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
     starts = (first + each * np.arange(turns)).tolist()
     program = plane.turns(starts, max(plane.state()["alt"] - plane.home, ALTITUDE), 24.0)
     scenario = plane.folder / "guided.yaml"
-    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0), encoding="utf-8")
+    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0))
     duration = first + each * turns
     with plane.engaged(scenario, map_of(plane), duration) as flight:
         flight.succeed(duration + 60.0)

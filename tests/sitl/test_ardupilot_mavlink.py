@@ -144,7 +144,7 @@ def test_stuck_aileron_is_found_by_a_turn_that_guidance_commands(plane: ArduPlan
     plane.level()
     scenario = plane.folder / "turn.yaml"
     program = plane.turns([10.0], plane.state()["alt"] - plane.home, 24.0)
-    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0), encoding="utf-8")
+    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0))
     with ExitStack() as afterwards, plane.engaged(scenario, plane.mavlink_map(), 100.0) as flight:
         for parameter, value in stuck("aileron", 1500):
             plane.say("param", parameter, f"{value:g}")

@@ -99,12 +99,12 @@ class Setup:
         """Start the bridge with the map after some changes of it: of a key, or of the keys of a
         row.
         """
-        content = yaml.safe_load(self.map.read_text(encoding="utf-8"))
+        content = yaml.safe_load(self.map.read_text())
         for key, value in changes.items():
             content[key] = (
                 content[key] | value if isinstance(value, Mapping) and key in content else value
             )
-        self.map.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        self.map.write_text(yaml.safe_dump(content, sort_keys=False))
         self.bridge = self.world.start(BridgeNode)
         return self.bridge
 
@@ -648,10 +648,7 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
 
 def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Path) -> None:
     absent = tmp_path / "absent.yaml"
-    absent.write_text(
-        (LIBRARY / "px4.yaml").read_text(encoding="utf-8").replace("px4_msgs/", "absent_msgs/"),
-        encoding="utf-8",
-    )
+    absent.write_text((LIBRARY / "px4.yaml").read_text().replace("px4_msgs/", "absent_msgs/"))
     with world_of("-p", f"map:={absent}") as world, pytest.raises(ParameterError) as refused:
         world.make(BridgeNode)
     assert "absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in str(
@@ -662,11 +659,11 @@ def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Pat
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Path) -> None:
-    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text())
     content["inputs"]["elevator"] = content["inputs"]["elevator"] | {
         "sign": sign * content["inputs"]["elevator"].get("sign", 1)
     }
-    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     check = CliRunner().invoke(
         app, ["check", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)]
     )

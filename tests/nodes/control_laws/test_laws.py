@@ -20,9 +20,9 @@ from rise_di_controller.node import ControllerNode
 
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
     """A scenario under another controller."""
-    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
+    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text())
     tree["/**/controller"]["ros__parameters"] = controller
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(yaml.safe_dump(tree))
     return path
 
 

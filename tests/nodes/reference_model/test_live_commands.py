@@ -35,7 +35,7 @@ def osprey(tmp_path: Path) -> Path:
         },
     )
     path = tmp_path / "live.yaml"
-    path.write_text(scenario_yaml(varied), encoding="utf-8")
+    path.write_text(scenario_yaml(varied))
     return path
 
 

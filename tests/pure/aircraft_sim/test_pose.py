@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from tests.builders import aircraft_parameters
+from tests.conftest import refusing
 
 from aircraft_sim import dynamics, pose
 from aircraft_sim.jsbsim_model import JsbsimModel
@@ -18,7 +19,6 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
-from flight_core.parameters import ParameterError
 from flight_core.tape import Signal
 from flight_core.units import GRAVITY
 
@@ -28,15 +28,7 @@ RATE = 100.0  # Hz
 QUIET: dict[str, Any] = {"gusts": {}, "sensors": {}}
 
 
-@pytest.mark.parametrize(
-    "angle",
-    [
-        -math.pi,
-        0.0,
-        math.pi,
-        3.2,
-    ],
-)
+@pytest.mark.parametrize("angle", [-math.pi, 0.0, math.pi, 3.2])
 def test_heading_wrapped_to_half_turn_either_way(angle: float) -> None:
     wrapped = pose.wrapped(angle)
     assert -math.pi < wrapped <= math.pi
@@ -123,7 +115,7 @@ def test_level_turn_keeps_attitude_and_costs_lift() -> None:
 def test_kinematics_and_wind_that_aircraft_cannot_have_refused(
     airframe: str, values: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         aircraft_parameters(airframe=airframe, **values)
 
 
@@ -277,5 +269,5 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
     ],
 )
 def test_pose_that_aircraft_cannot_measure_refused(section: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         aircraft_parameters(pose=section, rate=100.0)

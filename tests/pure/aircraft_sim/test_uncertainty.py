@@ -118,7 +118,7 @@ def test_a_seed_determines_the_aircraft() -> None:
 def test_yaml_text_of_airframe_reads_back_to_last_bit(name: str, tmp_path: Path) -> None:
     for airframe in (load_airframe(name), sample_airframe(load_airframe(name), 0.3, 0.3, seed=1)):
         path = tmp_path / f"{name}.yaml"
-        path.write_text(as_yaml(airframe), encoding="utf-8")
+        path.write_text(as_yaml(airframe))
         again = load_airframe(str(path))
         assert again == airframe
         assert again.matrix_a().tobytes() == airframe.matrix_a().tobytes()

@@ -20,6 +20,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.conftest import refusing
 from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
 from typer.testing import CliRunner
@@ -40,7 +41,6 @@ from autopilot_bridge.map_rows import MeasuredRow, OverrideRow
 from autopilot_bridge.params import BridgeConfig, ChannelMap, load_map
 from flight_cli.cli import application
 from flight_core import installation
-from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
 MAPS = sorted(MAP_FILES)
@@ -170,7 +170,7 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_of_map_states_own_trim_and_sign(name: str) -> None:
     """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
-    inputs = MAP_FILES[name].read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
+    inputs = MAP_FILES[name].read_text().split("\ninputs:\n")[1].split("\n\n")[0]
     assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [
         len(named_map(name).inputs)
     ]
@@ -221,9 +221,7 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
     for release, of_release in versions.items():
         messages = tmp_path / release / "msg"
         messages.mkdir(parents=True)
-        (messages.parent / "package.xml").write_text(
-            "<package><name>px4_msgs</name></package>", encoding="utf-8"
-        )
+        (messages.parent / "package.xml").write_text("<package><name>px4_msgs</name></package>")
         for type_name, fields in PUBLISHED.items():
             if type_name.startswith("px4_msgs/"):
                 name = type_name.rpartition("/")[2]
@@ -236,7 +234,7 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
                     for field, of in fields.items()
                     if (release, field) != ("2", "true_airspeed_m_s")
                 ]
-                (messages / f"{name}.msg").write_text("\n".join(lines), encoding="utf-8")
+                (messages / f"{name}.msg").write_text("\n".join(lines))
     options = [word for release in versions for word in ("--definitions", str(tmp_path / release))]
     result = CliRunner().invoke(application(["check"]), ["check", "px4", *options, "--json"])
     assert result.exit_code == 1
@@ -279,9 +277,9 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(
 def test_check_map_finds_field_that_row_cannot_use(
     key: str, change: dict[str, str], fault: str, tmp_path: Path
 ) -> None:
-    content = yaml.safe_load(MAP_FILES["odometry"].read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["odometry"].read_text())
     content["pose"][key] |= change
-    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content))
     result = CliRunner().invoke(
         application(["check"]),
         ["check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json"],
@@ -294,9 +292,7 @@ def test_check_map_finds_field_that_row_cannot_use(
 
 def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_path: Path) -> None:
     """The fields of the answer, below the line ---, do not count."""
-    (tmp_path / "package.xml").write_text(
-        "<package><name>ardupilot_msgs</name></package>", encoding="utf-8"
-    )
+    (tmp_path / "package.xml").write_text("<package><name>ardupilot_msgs</name></package>")
     for section in ("msg", "srv"):
         (tmp_path / section).mkdir()
     service = tmp_path / "srv" / "ModeSwitch.srv"
@@ -305,7 +301,7 @@ def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_pa
         ("uint8 mode\n---\nbool status", ""),
         ("uint8 number\n---\nuint8 mode", "no mode"),
     ):
-        service.write_text(text, encoding="utf-8")
+        service.write_text(text)
         kinds = [kind for _, _, kind in channel_map.used_topics()]
         rows = check_map(channel_map, [definitions_below(tmp_path, kinds)])
         assert [row.faults for row in rows if row.key == "messages.mode_after"] == [(fault,)]
@@ -318,10 +314,7 @@ def test_service_is_requested_and_does_not_fly() -> None:
         "mode_after"
     ]
     content["messages"]["mode_after"]["when"] = "heartbeat"
-    with pytest.raises(
-        ParameterError,
-        match=r"messages\.mode_after\.type: found the service ardupilot_msgs/srv/ModeSwitch",
-    ):
+    with refusing(r"messages\.mode_after\.type: found the service ardupilot_msgs/srv/ModeSwitch"):
         ChannelMap.validate_mapping(content, "map")
 
 
@@ -467,7 +460,7 @@ def test_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> N
         r"absent_msgs/msg/State: .*make messages PACKAGE=absent_msgs SOURCE=FOLDER "
         r".*ros-jazzy-absent-msgs"
     )
-    with pytest.raises(ParameterError, match=expected):
+    with refusing(expected):
         message_type("absent_msgs/msg/State")
 
 
@@ -514,13 +507,13 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
 def test_bad_map_is_one_sentence_that_names_row(
     place: tuple[str, ...], value: object, sentence: str
 ) -> None:
-    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text())
     part = content
     for key in place[:-1]:
         part[key] = dict(part[key])  # merged keys share one object
         part = part[key]
     part[place[-1]] = value
-    with pytest.raises(ParameterError, match=sentence) as refused:
+    with refusing(sentence) as refused:
         ChannelMap.validate_mapping(content, "map test")
     assert "\n" not in str(refused.value)
 
@@ -530,12 +523,12 @@ def test_a_missing_map_is_one_sentence() -> None:
         r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_mavlink, "
         r"px4, or the path of a channel map"
     )
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
-    with pytest.raises(ParameterError, match="lockstep"):
+    with refusing("lockstep"):
         BridgeConfig.validate_mapping({"map": "px4", "lockstep": True}, "bridge")
 
 
 def test_message_that_the_installed_package_lacks_is_refused() -> None:
-    with pytest.raises(ParameterError, match="found no Airspeed in the installed px4_msgs"):
+    with refusing("found no Airspeed in the installed px4_msgs"):
         message_type("px4_msgs/msg/Airspeed", lambda name: Message(Airspeed=0))

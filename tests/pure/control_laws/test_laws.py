@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 from tests.closed_loop import PROTOTYPE_SERVO
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.other_laws import COMMON, SECTIONS, example_installed
 from tests.pure.flight_analysis.test_replay import BUSY, equal
 
@@ -323,7 +323,7 @@ def test_another_law_or_observer_refused_in_flight() -> None:
             r"controller\.law: found \w+, expected the law and the observer that fly: "
             r"these change at a restart"
         )
-        with pytest.raises(ParameterError, match=expected):
+        with refusing(expected):
             controller_of_pi.retune(controller(name))
 
 
@@ -543,7 +543,7 @@ def refused(sentence: str, values: dict[str, Any]) -> None:
 
 
 def test_page_names_every_registered_law_and_parameters() -> None:
-    page = (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "laws.md").read_text()
     for name in laws.names():
         own = (
             []

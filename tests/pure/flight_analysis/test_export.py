@@ -49,7 +49,7 @@ def test_csv_and_parquet_hold_every_sample_to_last_bit(
 ) -> None:
     write_csv(tmp_path / "run.csv", [flight])
     write_parquet(tmp_path / "run.parquet", [flight])
-    with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as stream:
+    with (tmp_path / "run.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     read = pl.read_parquet(tmp_path / "run.parquet")
     assert len(rows) == len(read) == 1501

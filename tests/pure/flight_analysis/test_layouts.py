@@ -70,7 +70,7 @@ def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
         application(["layouts"]), ["layouts", "osprey_gust", "--folder", str(tmp_path / "new")]
     )
     assert result.exit_code == 0, result.output
-    files = {path.name: path.read_text(encoding="utf-8") for path in (tmp_path / "new").iterdir()}
+    files = {path.name: path.read_text() for path in (tmp_path / "new").iterdir()}
     assert files == {"osprey_gust.foxglove.json": JSON, "osprey_gust.plotjuggler.xml": XML}
     assert result.output.split() == [str(tmp_path / "new" / name) for name in sorted(files)]
 
@@ -127,16 +127,12 @@ def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
 def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
     """RViz shows each aircraft at the frame that guidance publishes, after REP 105."""
     fleet = tmp_path / "fleet.yaml"
-    fleet.write_text(
-        "aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}", encoding="utf-8"
-    )
+    fleet.write_text("aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}")
     result = CliRunner().invoke(
         application(["layouts"]), ["layouts", str(fleet), "--folder", str(tmp_path)]
     )
     assert result.exit_code == 0, result.output
-    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text(encoding="utf-8"))[
-        "configById"
-    ]
+    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text())["configById"]
     assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == [
         "map",
         "uav1",
@@ -157,9 +153,7 @@ def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
         for tab in ElementTree.parse(tmp_path / "fleet.plotjuggler.xml").iter("Tab")
     ]
     assert tabs[len(TABS) + 1 :][: len(TABS)] == [f"uav2 {title}" for title in TABS]
-    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text(encoding="utf-8"))[
-        "Visualization Manager"
-    ]
+    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text())["Visualization Manager"]
     models = [display for display in shown["Displays"] if display["Class"].endswith("/RobotModel")]
     assert [(model["TF Prefix"], Path(model["Description File"])) for model in models] == [
         (name, tmp_path / "aircraft.urdf") for name in ("uav1", "uav3")

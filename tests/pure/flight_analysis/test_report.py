@@ -98,7 +98,7 @@ def titles(figure: Figure | None) -> list[str]:
 def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
     path = tmp_path / "report.html"
     write_page(path, [recorded("run", scenario, tape, outcome)])
-    return path.read_text(encoding="utf-8")
+    return path.read_text()
 
 
 def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> RecordedFlight:
@@ -265,7 +265,7 @@ def test_metrics_of_several_flights_compared_by_channel_name(pair: list[Recorded
 
 def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> None:
     write_page(tmp_path / "comparison.html", pair)
-    page = (tmp_path / "comparison.html").read_text(encoding="utf-8")
+    page = (tmp_path / "comparison.html").read_text()
     assert "2 flights compared" in page
     assert '<td class="better">&times;0.500</td>' in page
     assert headings(page) == [
@@ -330,7 +330,7 @@ def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.Monkey
 def test_vendored_plotly_is_that_of_hash_and_of_release_of_python_package() -> None:
     vendor = Path(html.__file__).parent / "vendor"
     bundle = (vendor / "plotly-basic.min.js").read_bytes()
-    assert hashlib.sha256(bundle).hexdigest() in (vendor / "README.md").read_text(encoding="utf-8")
+    assert hashlib.sha256(bundle).hexdigest() in (vendor / "README.md").read_text()
     release = re.compile(r"plotly\.js (?:\(.*\) )?v(\S+)")
     ours, theirs = (release.search(text[:200]) for text in (bundle.decode(), get_plotlyjs()))
     assert ours is not None

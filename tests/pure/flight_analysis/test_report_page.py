@@ -21,10 +21,7 @@ from flight_analysis.report.html import write_page
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 PLOTS = "[...document.querySelectorAll('figure > div')]"
 
@@ -150,7 +147,7 @@ def test_replay_shows_pose_and_surfaces_of_flight(
     assert seek(0.5) != seek(5.0)  # level, then in a roll
     assert "ENGAGED" in browser.run("document.getElementById('replay-now').textContent")
     assert "grid" in browser.run("document.getElementById('replay-legend').textContent")
-    stored = page.read_text(encoding="utf-8")
+    stored = page.read_text()
     topics, info = json.loads(
         stored.partition('id="replay-data">')[2].partition("</script>")[0]
     ).values()

@@ -41,7 +41,7 @@ def flown(
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 def test_full_disk_behind_standard_output_is_one_sentence() -> None:
-    with Path("/dev/full").open("w", encoding="utf-8") as full:
+    with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "flight_cli.cli", "--help"]
         result = subprocess.run(
             command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
@@ -68,9 +68,7 @@ def test_flight_ends_with_table_log_and_report(
 
 
 def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
-    summary = json.loads(
-        (flown[0] / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
-    )
+    summary = json.loads((flown[0] / "runs" / "latest" / "summary.json").read_text())
     assert (summary["scenario"], summary["outcome"], summary["duration"]) == (
         "osprey_gust",
         "completed",
@@ -84,7 +82,7 @@ def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedPro
 def test_report_is_one_page_that_needs_no_network(
     flown: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
-    page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
+    page = (flown[0] / "runs" / "latest" / "report.html").read_text()
     assert 'src="http' not in page
     assert "gust: from the entry of a gust to 1 s after its end" in page
     assert "periods without a new y" in page
@@ -153,10 +151,8 @@ def test_help_names_every_option() -> None:
 def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diverges(
     tmp_path: Path, osprey_gust: Scenario
 ) -> None:
-    text = osprey_gust.path.read_text(encoding="utf-8")
-    (tmp_path / "mine.yaml").write_text(
-        text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8"
-    )
+    text = osprey_gust.path.read_text()
+    (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"))
     flown = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
     assert flown.returncode == 3
     assert "outcome: diverged at t = " in flown.stdout
@@ -164,9 +160,7 @@ def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diver
 
 
 def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
-    (tmp_path / "jax.py").write_text(
-        "raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8"
-    )
+    (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')")
     shown = rise_di(
         "campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path
     )  # -m puts the working folder first
@@ -295,7 +289,7 @@ cli.main()
 
 
 def test_keys_of_the_first_page_are_keys_of_a_scenario() -> None:
-    page = (REPOSITORY / "docs" / "get-started.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "get-started.md").read_text()
     keys = re.findall(r"^\| `(\w+\.\w+)` \|", page.partition("15 keys")[2], re.MULTILINE)
     assert len(keys) == 15
     for key in keys:

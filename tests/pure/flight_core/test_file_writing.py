@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.conftest import refusing
 
 from flight_analysis.report.run_folder import REPORT, SUMMARY, write_report
 from flight_cli.report import report
@@ -44,7 +45,7 @@ def test_no_module_writes_by_itself() -> None:
     """Every writer is `flight_core.files`, but for the modules of OWN_WRITERS."""
     writers = set()
     for path in SOURCES.glob("*/*/**/*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 given = [value.value for value in node.args if isinstance(value, ast.Constant)]
                 opens = node.func.attr in {"open", "fdopen"} and bool(
@@ -83,14 +84,14 @@ def test_failed_write_keeps_old_content(tmp_path: Path) -> None:
 def test_link_is_replaced_not_followed(tmp_path: Path, target: str) -> None:
     elsewhere, path = tmp_path / "elsewhere", tmp_path / "page"
     if target == "file":
-        elsewhere.write_text("precious", encoding="utf-8")
+        elsewhere.write_text("precious")
     path.symlink_to(elsewhere)
     write_file(path, "page")
     assert not path.is_symlink()
-    assert path.read_text(encoding="utf-8") == "page"
+    assert path.read_text() == "page"
     assert elsewhere.exists() == (target == "file")
     if target == "file":
-        assert elsewhere.read_text(encoding="utf-8") == "precious"
+        assert elsewhere.read_text() == "precious"
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link to a device"])
@@ -120,7 +121,7 @@ def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, 
     outcome survives.
     """
     write_report(run, "completed")
-    (run / REPORT).write_text("an older page", encoding="utf-8")
+    (run / REPORT).write_text("an older page")
     before = files_in(run)
     survived = 0
     for n in count(1):
@@ -152,7 +153,7 @@ def test_report_of_links_writes_nothing_elsewhere(run: Path, tmp_path: Path) -> 
     outside = tmp_path / "outside"
     outside.mkdir()
     precious = outside / "precious"
-    precious.write_text("precious", encoding="utf-8")
+    precious.write_text("precious")
     (run / "osprey_gust.yaml").unlink(missing_ok=True)
     (run / "osprey_gust.yaml").symlink_to(outside / "dangling")
     (run / SUMMARY).symlink_to(precious)
@@ -169,7 +170,7 @@ def test_report_of_read_only_archive_goes_to_output(
     assert files_in(run) == before
     assert {SUMMARY, REPORT, "osprey_gust.yaml"} == set(files_in(tmp_path / "pages" / "today"))
     assert "pages/today/report.html" in capsys.readouterr().out
-    with pytest.raises(ParameterError, match="output: found a comparison, expected one run"):
+    with refusing("output: found a comparison, expected one run"):
         report([run, run], output=tmp_path / "pages")
 
 

@@ -63,13 +63,11 @@ def test_workspace_names_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 
 def test_targets_and_extras_exist() -> None:
-    targets = re.findall(
-        r"^([\w -]+):", (REPOSITORY / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    targets = re.findall(r"^([\w -]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
     assert {target.removeprefix("make ") for target in TARGETS.values()} <= {
         word for line in targets for word in line.split()
     }
-    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
     assert {*TARGETS} == {*EXTRAS.values()} == extras.keys() - {"all"}

@@ -5,6 +5,7 @@
 from pathlib import Path
 
 import pytest
+from tests.conftest import refusing
 from tests.joint_states import JOINT_STATE, vector
 from typer.testing import CliRunner
 
@@ -38,7 +39,7 @@ def test_unprintable_text_of_a_scenario_is_refused() -> None:
     class Named(Config):
         name: str
 
-    with pytest.raises(ParameterError, match=r"name: found .*, expected printable characters"):
+    with refusing(r"name: found .*, expected printable characters"):
         Named.validate_mapping({"name": ESCAPES}, "section")
 
 
@@ -60,12 +61,7 @@ def test_shown_paths_are_printable() -> None:
     assert display_path(Path("/runs") / ESCAPES).isprintable()
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "report",
-    ],
-)
+@pytest.mark.parametrize("command", ["report"])
 def test_command_prints_names_of_files_as_escapes(command: str, run: Path) -> None:
     name = ESCAPES.replace("\n", "")
     folder = run.rename(run.with_name(name))

@@ -25,13 +25,12 @@ import psutil
 import pytest
 from numpy.typing import NDArray
 from rich.console import Console
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.joint_states import JOINT_STATE, parameter_event, path, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance.path import route_outline
 from flight_guidance.route_file import Origin, Waypoint
@@ -324,10 +323,7 @@ def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
 
 
 def geojson(path: Path, *geometries: dict[str, Any], **members: Any) -> Path:
-    path.write_text(
-        json.dumps({"type": "GeometryCollection", "geometries": geometries} | members),
-        encoding="utf-8",
-    )
+    path.write_text(json.dumps({"type": "GeometryCollection", "geometries": geometries} | members))
     return path
 
 
@@ -372,7 +368,7 @@ def test_background_in_plane_of_flight(tmp_path: Path) -> None:
 def test_background_that_is_no_map_refused(
     geometries: list[dict[str, Any]], members: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         read_background(
             geojson(tmp_path / "file.geojson", *geometries, **members), Origin(47.40, 8.50)
         )
@@ -447,7 +443,7 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
 
     against(recorded)(client)
     for file in FILES.values():
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text()
         assert "://" not in text
         assert "innerHTML" not in text
 

@@ -120,9 +120,7 @@ def test_ended_recording_opened_by_viewer_itself(recorded: Path) -> None:
 
 
 def test_a_missing_extra_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
-    (tmp_path / "foxglove.py").write_text(
-        "raise ModuleNotFoundError(name='foxglove')\n", encoding="utf-8"
-    )
+    (tmp_path / "foxglove.py").write_text("raise ModuleNotFoundError(name='foxglove')\n")
     ended = subprocess.run(
         command(recorded, "--foxglove"),
         capture_output=True,

@@ -49,7 +49,7 @@ def test_every_name_loads() -> None:
 
 def type_checker_imports() -> set[tuple[str | None, str, str]]:
     """Module, name and name in `rise_di` of each import for type checkers."""
-    tree = ast.parse(Path(str(rise_di.__file__)).read_text(encoding="utf-8"))
+    tree = ast.parse(Path(str(rise_di.__file__)).read_text())
     block = next(node for node in tree.body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
     return {
@@ -90,7 +90,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_the_page_of_the_interface_has_every_name() -> None:
-    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text()
     assert sorted(re.findall(r"^::: rise_di\.(\w+)$", page, re.MULTILINE)) == rise_di.__all__
 
 

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import linprog
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.maps import named_map
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.identification.sign_check import check_scenario
 from rise_di_controller.allocation import Allocation, allocate, allocation
@@ -228,7 +227,7 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
 def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(
     changes: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         find_scenario("osprey_servo").vary(controller=mixed(**changes))
 
 

@@ -32,13 +32,13 @@ def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
     """The same flight with an airframe whose positive elevator pitches the nose down; D is
     unchanged.
     """
-    airframe = yaml.safe_load((LIBRARY / "osprey.yaml").read_text(encoding="utf-8"))
+    airframe = yaml.safe_load((LIBRARY / "osprey.yaml").read_text())
     elevator = list(airframe["inputs"]).index("elevator")
     airframe["inputs"]["elevator"]["positive"] = "trailing edge down"
     for row in airframe["B"]:
         row[elevator] = -row[elevator]
     path = folder / "trailing_edge_down.yaml"
-    path.write_text(yaml.safe_dump(airframe, sort_keys=False), encoding="utf-8")
+    path.write_text(yaml.safe_dump(airframe, sort_keys=False))
     return scenario.vary(aircraft={"airframe": str(path)})
 
 
@@ -113,14 +113,7 @@ def fly_small(D: list[float], K: list[float]) -> FloatArray:
     return fly(SMALL, law_params(K, 1.0, [2.0, 0.2], D, omega=2.0), SINES, 0.01, bound=10.0)
 
 
-@pytest.mark.parametrize(
-    "K",
-    [
-        [1.0, 1.0],
-        [20.0, 5.0],
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("K", [[1.0, 1.0], [20.0, 5.0]], ids=str)
 def test_negative_determinant_diverges_with_identity_d(K: list[float]) -> None:
     """A negative determinant with D = I diverges for every K."""
     # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the

@@ -74,10 +74,8 @@ class BridgeSetup:
 
     def change_map(self, **changes: Any) -> None:
         """Change keys of the map; of a mapping some of its keys."""
-        content = yaml.safe_load(Path(self.map).read_text(encoding="utf-8"))
-        Path(self.map).write_text(
-            yaml.safe_dump(merged(content, changes), sort_keys=False), encoding="utf-8"
-        )
+        content = yaml.safe_load(Path(self.map).read_text())
+        Path(self.map).write_text(yaml.safe_dump(merged(content, changes), sort_keys=False))
 
     def autopilot(self) -> Process:
         """Start the simulated autopilot."""
@@ -229,7 +227,7 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
     u = log.tape["u"].values
     assert not u.any()  # what is sent at an engagement: the trim
     assert len(u) > 100  # of 450
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary = json.loads((run / "summary.json").read_text())
     assert summary["outcome"].startswith("completed")
     assert summary["engagements"] == []
     assert summary["notes"][0].startswith("never engaged")
@@ -276,7 +274,7 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
     assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary = json.loads((run / "summary.json").read_text())
     (engagement,) = summary["engagements"]
     assert engagement["reason"] == "disengaged by request"
     tape = read_run(run).tape
@@ -302,14 +300,14 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
 ) -> None:
     # Roll alone, 11 s in place of 52 s for four inputs: the other axes of Joy are NaN, which leaves
     # them at trim.
-    content = yaml.safe_load(Path(setup.map).read_text(encoding="utf-8"))
+    content = yaml.safe_load(Path(setup.map).read_text())
     content |= {
         "instant": "p",
         "outputs": {"p": content["outputs"]["p"]},
         "inputs": {"aileron": content["inputs"]["aileron"]},
     }
     del content["pose"], content["topics"]["/ap/airspeed"], content["topics"]["/ap/pose/filtered"]
-    Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False))
     setup.autopilot()
     options = ("--speed", "25", "--set", "amplitude=0.3", "--write", "found", "--json")
     # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and

@@ -26,7 +26,7 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    content = yaml.safe_load(MAP_FILES["ardupilot_mavlink"].read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_mavlink"].read_text())
     content["link"]["url"] = f"udpin:127.0.0.1:{port}"
     for row in (content["silence"], *content["conditions"].values()):
         row["max_age"] = (
@@ -34,7 +34,7 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
         )
     for row in (*content["outputs"].values(), *content["pose"].values()):
         row["max_age"] = 2.0  # s: a host pauses for up to a second
-    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     autopilot = start("tests.ros.mavlink_autopilot", str(SCENARIO), str(port)).wait_for("ready")
     with peer(topics=("y", "u", "bridge/would_send", "mavlink/ATTITUDE")) as node:

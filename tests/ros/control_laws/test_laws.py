@@ -72,7 +72,7 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
     """Two seconds of a scenario with commands and lost samples, under another controller."""
-    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
+    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text())
     sections = {
         name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()
     }
@@ -81,7 +81,7 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
     sections["aircraft"]["sensors"]["dropout"] = 0.2
     sections["controller"].clear()
     sections["controller"].update(controller)
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(yaml.safe_dump(tree))
     return path
 
 
