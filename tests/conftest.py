@@ -8,9 +8,11 @@ import subprocess
 import tempfile
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
+from typer.testing import CliRunner, Result
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -39,6 +41,13 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[ParameterError]]:
     """Expect a ParameterError whose sentence has a match of the pattern."""
     return pytest.raises(ParameterError, match=sentence)
+
+
+def invoke(command: str, *words: str, **options: Any) -> Result:
+    """Run a command of rise-di in this process."""
+    from flight_cli.cli import application  # noqa: PLC0415 - the tests of nodes need no command
+
+    return CliRunner().invoke(application([command]), [command, *words], **options)
 
 
 def pytest_configure(config: pytest.Config) -> None:

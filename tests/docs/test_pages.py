@@ -14,9 +14,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.conftest import REPOSITORY
 from tools import parameters
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [
     REPOSITORY / "docs" / "get-started.md",
     REPOSITORY / "docs" / "reference" / "python.md",

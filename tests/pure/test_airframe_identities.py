@@ -207,7 +207,7 @@ def test_height_is_a_state() -> None:
 
 
 @pytest.mark.parametrize(
-    ("unit", "factor"),
+    "unit, factor",
     [
         ("ft", 0.3048), ("kt", 0.514444), ("mph", 0.44704), ("km/h", 0.277778), ("nmi", 1852.0),
         ("slug", 14.5939),

@@ -359,7 +359,7 @@ def test_wrong_model_is_told_in_one_sentence(mistake: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "changes", "words"),
+    "name, text, changes, words",
     [("a.txt", "no matrix here", {}, "found none of these"), ("a.mat", "no MAT-file", {}, "-v7"),
         ("a.st", AVL_ST.replace("Clp =", "Clx ="), BODY | {"speed": "176 ft/s"}, "no Clp"),],
 )  # fmt: skip

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.conftest import REPOSITORY
 from typer.testing import CliRunner
 
 from autopilot_bridge.params import LIBRARY
 from flight_cli.cli import application
 
-ROOT = Path(__file__).resolve().parents[2]
-DOCKER = ROOT / "docker"
+DOCKER = REPOSITORY / "docker"
 AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load((DOCKER / "autopilot.yaml").read_text())[
     "services"
 ]
@@ -80,7 +80,7 @@ def test_only_link_of_autopilot_is_open() -> None:
     source, target, access = profile.split(":")
     assert (
         DOCKER / source
-    ).resolve() == ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
+    ).resolve() == REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
     assert (DOCKER / source).is_file()
     assert agent["environment"] == {"FASTRTPS_DEFAULT_PROFILES_FILE": target}
     assert access == "ro"

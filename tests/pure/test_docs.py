@@ -5,7 +5,8 @@
 import re
 from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+from tests.conftest import REPOSITORY
+
 TOP = (
     "README.md",
     "CONTRIBUTING.md",

@@ -12,8 +12,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from tests.conftest import REPOSITORY
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCES = REPOSITORY / "ros_ws" / "src"
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "flight_ros"}
 ROS_SUFFIXES = ("_msgs", "_interfaces", "_srvs")

@@ -61,7 +61,7 @@ def test_lost_samples_start_failsafe() -> None:
 
 
 @pytest.mark.parametrize(
-    ("t", "y", "sentence"),
+    "t, y, sentence",
     [
         (
             1.0,
@@ -109,7 +109,7 @@ def test_scenario_of_parts_flies_as_its_file(flown: Tape) -> None:
 
 
 @pytest.mark.parametrize(
-    ("parts", "sentence"),
+    "parts, sentence",
     [
         (
             {},
@@ -268,14 +268,14 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
     assert again.shape == first.shape
 
 
-@pytest.mark.parametrize(("name", "actions"), [("osprey_learn", 4), ("osprey_twin", 7)])
+@pytest.mark.parametrize("name, actions", [("osprey_learn", 4), ("osprey_twin", 7)])
 def test_vector_environment_takes_a_learner_and_an_allocation(name: str, actions: int) -> None:
     """The agent acts in place of the learner; it commands the effectors of the allocation."""
     flights = rise_di.FlightVectorEnv(rise_di.find_scenario(name, 1.0), 2)
     assert flights.action_space.shape == (2, actions)
 
 
-@pytest.mark.parametrize(("actions", "expected"), [(np.full((2, M), np.nan), "finite")])
+@pytest.mark.parametrize("actions, expected", [(np.full((2, M), np.nan), "finite")])
 def test_vector_environment_refuses_actions(actions: FloatArray, expected: str) -> None:
     flights = rise_di.FlightVectorEnv(SCENARIO, 2)
     with pytest.raises(rise_di.ParameterError, match="reset"):

@@ -12,12 +12,12 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
+from tests.conftest import REPOSITORY
 
-ROOT = Path(__file__).parents[2]
-ADVISORIES: list[dict[str, str]] = yaml.safe_load((ROOT / ".ci/advisories.yaml").read_text())
-WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+ADVISORIES: list[dict[str, str]] = yaml.safe_load((REPOSITORY / ".ci/advisories.yaml").read_text())
+WORKFLOWS = sorted((REPOSITORY / ".github/workflows").glob("*.yml"))
 LOCKED = re.findall(
-    r"^([a-z0-9][a-z0-9._-]*)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE
+    r"^([a-z0-9][a-z0-9._-]*)==(\S+)", (REPOSITORY / "requirements.lock").read_text(), re.MULTILINE
 )
 
 
@@ -60,9 +60,9 @@ JOBS = [
     for name, job in yaml.safe_load(path.read_text())["jobs"].items()
 ]
 WITH_RIGHTS = [(name, job) for name, job, rights in JOBS if "write" in rights.values()]
-RELEASE: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())[
-    "jobs"
-]
+RELEASE: dict[str, Any] = yaml.safe_load(
+    (REPOSITORY / ".github/workflows/release.yml").read_text()
+)["jobs"]
 PROGRAM = re.compile(
     r"\.ci/|\b(pip|pipx|uv|uvx|npm|npx|yarn|conda|apt|apt-get|curl|wget|make|python[\d.]*|node|docker|git)\b"
 )
@@ -75,7 +75,7 @@ def test_one_job_has_rights() -> None:
     assert [name for name, _ in WITH_RIGHTS] == ["release.publish"]
 
 
-@pytest.mark.parametrize(("name", "job"), WITH_RIGHTS)
+@pytest.mark.parametrize("name, job", WITH_RIGHTS)
 def test_job_with_rights_runs_no_program_of_others(name: str, job: dict[str, Any]) -> None:
     """A package that runs there could change what is published, or publish in the name of the
     project.
@@ -111,15 +111,18 @@ def test_build_of_a_release_runs_one_script() -> None:
         if "upload-artifact" in step.get("uses", "")
     ]
     assert uploads == [len(RELEASE["build"]["steps"]) - 1]
-    assert ".ci/wheel" not in re.sub(r"#.*", "", (ROOT / ".ci/release").read_text())
+    assert ".ci/wheel" not in re.sub(r"#.*", "", (REPOSITORY / ".ci/release").read_text())
 
 
 @pytest.mark.parametrize(
     "path",
-    ["Makefile", *(f".ci/{p.name}" for p in sorted((ROOT / ".ci").iterdir()) if not p.suffix)],
+    [
+        "Makefile",
+        *(f".ci/{p.name}" for p in sorted((REPOSITORY / ".ci").iterdir()) if not p.suffix),
+    ],
 )
 def test_installation_is_of_locked_hashes(path: str) -> None:
-    text = (ROOT / path).read_text()
+    text = (REPOSITORY / path).read_text()
     unlocked = [
         line
         for line in INSTALL.findall(re.sub(r"^\s*#.*", "", text, flags=re.MULTILINE))
@@ -128,7 +131,9 @@ def test_installation_is_of_locked_hashes(path: str) -> None:
     assert len(unlocked) == UNLOCKED.get(path, 0), unlocked
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / ".ci").glob("*.txt")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / ".ci").glob("*.txt")), ids=lambda path: path.stem
+)
 def test_list_of_a_script_has_a_hash_for_each_version(path: Path) -> None:
     text = path.read_text()
     rows = re.findall(
@@ -138,6 +143,8 @@ def test_list_of_a_script_has_a_hash_for_each_version(path: Path) -> None:
 
 
 def test_uv_is_that_of_the_makefile() -> None:
-    version = re.search(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    version = re.search(
+        r"^UV_VERSION := (\S+)", (REPOSITORY / "Makefile").read_text(), re.MULTILINE
+    )
     assert version is not None
-    assert f"uv=={version[1]} " in (ROOT / ".ci/uv.txt").read_text()
+    assert f"uv=={version[1]} " in (REPOSITORY / ".ci/uv.txt").read_text()

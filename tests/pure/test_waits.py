@@ -98,7 +98,7 @@ def faults(source: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("source", "found"),
+    "source, found",
     [
         ("time.sleep(0.1)", 1),
         ("peer.spin(0.3, each=send)", 1),

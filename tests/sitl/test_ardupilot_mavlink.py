@@ -322,7 +322,7 @@ def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(
 
 
 @pytest.mark.parametrize(
-    ("how", "mode"), [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")]
+    "how, mode", [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")]
 )
 def test_mode_after_a_release_is_the_pilots_or_one_that_flies(
     plane: ArduPlane, how: str, mode: str

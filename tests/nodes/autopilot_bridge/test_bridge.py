@@ -321,7 +321,7 @@ def test_bridge_that_did_not_run_releases_and_can_be_engaged_again(
 
 
 @pytest.mark.parametrize(
-    ("topic", "kind", "count", "sentence"),
+    "topic, kind, count, sentence",
     [
         (
             "/ap/airspeed",
@@ -390,7 +390,7 @@ def test_engagement_waits_for_awaited_condition_and_can_be_withdrawn(setup: Setu
 
 
 @pytest.mark.parametrize(
-    ("lost", "reason", "within"),
+    "lost, reason, within",
     [
         (0, "the transmitter is lost (data is 0)", 2 * TICK),
         (None, "transmitter: data is 0.8", 0.8 + 2 * TICK),
@@ -518,7 +518,7 @@ def test_topic_whose_publisher_has_left_named_as_that_of_a_client(setup: Setup) 
 
 
 @pytest.mark.parametrize(
-    ("answer", "reason"),
+    "answer, reason",
     [
         (
             lambda _: ChangeState.Response(success=False),
@@ -690,7 +690,7 @@ def serialised(message: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("name", "message", "expected"),
+    "name, message, expected",
     [
         (
             "ardupilot_2024",

@@ -27,7 +27,7 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("law", "sentence"),
+    "law, sentence",
     [
         (
             "pid",

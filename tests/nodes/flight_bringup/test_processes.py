@@ -73,7 +73,7 @@ def test_process_ending_while_others_wait_named_at_once(
 
 
 @pytest.mark.parametrize(
-    ("end", "flew_never", "cause"),
+    "end, flew_never, cause",
     [
         ("import os\nos.kill(os.getpid(), 9)\n", True, "controller was killed by SIGKILL"),
         ("", True, "controller was shut down"),
@@ -157,7 +157,7 @@ LOSES_CONTACT = (
 
 
 @pytest.mark.parametrize(
-    ("end", "cause"),
+    "end, cause",
     [
         ("import os\nos.kill(os.getpid(), 9)\n", "aircraft was killed by SIGKILL"),
         (

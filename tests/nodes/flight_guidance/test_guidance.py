@@ -245,7 +245,7 @@ TWO = ((0.0, 0.0, 50.0), (0.0, 900.0, 55.0))
 
 
 @pytest.mark.parametrize(
-    ("message", "sentence"),
+    "message, sentence",
     [
         (route("odom", *TWO), "route: found the frame 'odom', expected 'map'"),
         (route("map", TWO[0]), "route: found 1 waypoints"),

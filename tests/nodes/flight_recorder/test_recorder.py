@@ -364,7 +364,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize(
-    ("least", "reason"),
+    "least, reason",
     [
         ("0.0", "no space left for "),
         ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB"),
@@ -413,7 +413,7 @@ def test_too_little_space_at_start_rejected(osprey_gust: Scenario, disk: Path) -
 
 
 @pytest.mark.parametrize(
-    ("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)]
+    "rate, depth", [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)]
 )
 def test_publisher_keeps_history_of_two_seconds_for_recorder(rate: float, depth: int) -> None:
     assert publisher_qos(period_ns(rate, "rate")).depth == depth

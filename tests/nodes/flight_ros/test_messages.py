@@ -116,7 +116,7 @@ def invalid_samples() -> list[tuple[str, bytes]]:
     ]
 
 
-@pytest.mark.parametrize(("reason", "raw"), invalid_samples())
+@pytest.mark.parametrize("reason, raw", invalid_samples())
 @pytest.mark.parametrize("known_layout", [False, True])
 def test_invalid_message_rejected_with_reason(reason: str, raw: bytes, known_layout: bool) -> None:
     decoder = Decoder(("q", "V"))

@@ -37,7 +37,7 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    "arguments, sentence",
     [
         (["-p", "k_g:=-1.0"], "controller.k_g: found -1.0, expected greater than 0"),
         (["-p", "max_agee:=1.0"], "controller.max_agee: unknown key, expected max_age perhaps"),
@@ -68,7 +68,7 @@ def test_an_invalid_parameter_is_one_sentence(
 
 
 @pytest.mark.parametrize("name", ["aircraft", "reference_model"])
-@pytest.mark.parametrize(("ago", "refused"), [(11.0, True), (9.0, False)])
+@pytest.mark.parametrize("ago, refused", [(11.0, True), (9.0, False)])
 def test_start_time_long_ago_is_refused(
     name: str, ago: float, refused: bool, osprey_gust: Scenario
 ) -> None:

@@ -230,7 +230,7 @@ def test_without_lock_each_publisher_is_taken() -> None:
 
 
 @pytest.mark.parametrize(
-    ("raw", "reason"),
+    "raw, reason",
     [
         (b"", "malformed"),
         (message()[:30], "malformed"),
@@ -247,7 +247,7 @@ def test_invalid_message_does_not_lock(raw: bytes, reason: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stamp_ns", "reason"), [(-101, "old"), (101, "future"), (-100, ""), (100, "")]
+    "stamp_ns, reason", [(-101, "old"), (101, "future"), (-100, ""), (100, "")]
 )
 def test_stamps_are_limited_both_ways(stamp_ns: int, reason: str) -> None:
     setup = Setup(max_age=MAX_AGE)

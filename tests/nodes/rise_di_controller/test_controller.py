@@ -250,7 +250,7 @@ HOUR_AHEAD = 3600.0
 
 
 @pytest.mark.parametrize(
-    ("message", "age", "reason"),
+    "message, age, reason",
     [
         (to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "/peer#1"), None, "y: finite"),
         (to_message(0, ("q", "V", "p", "x"), np.zeros(4), "/peer#1"), None, "y: name"),
@@ -329,7 +329,7 @@ def test_saturation_limits_can_be_added_in_flight(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         ({"k_g": -1.0}, "controller.k_g: found -1.0, expected greater than 0"),
         (
@@ -482,7 +482,7 @@ def test_clock_of_ticks_outlives_step_of_system_clock_and_step_is_told(flight: F
 
 
 @pytest.mark.parametrize(
-    ("begin", "cause"),
+    "begin, cause",
     [
         (None, "no publisher"),
         (
@@ -517,9 +517,7 @@ def test_waiting_for_y_is_told_with_its_cause(
     )  # every 2 s
 
 
-@pytest.mark.parametrize(
-    ("rate", "named"), [(9.0, True), (20.0, True), (50.0, False), (200.0, False)]
-)
+@pytest.mark.parametrize("rate, named", [(9.0, True), (20.0, True), (50.0, False), (200.0, False)])
 def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(
     rate: float, named: bool, flight: Flight
 ) -> None:

@@ -192,7 +192,7 @@ def test_lost_aileron_acts_like_zero_column_of_b() -> None:
     assert (actual == expected).all()
 
 
-@pytest.mark.parametrize(("part", "thrust"), [(0.5, 0.35), (0.0, 0.0), (1.0, 0.7), (-1.0, -0.7)])
+@pytest.mark.parametrize("part, thrust", [(0.5, 0.35), (0.0, 0.0), (1.0, 0.7), (-1.0, -0.7)])
 def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float) -> None:
     """0.5 in trim and 0.2 above it; without any effect it is an engine that is lost."""
     params = osprey(faults=[f"thrust weak 0 {part}"]).actuators
@@ -365,7 +365,7 @@ COMMANDS = (0.2 * np.random.default_rng(1).normal(size=30)).tolist()
 
 
 @pytest.mark.parametrize(
-    ("rate", "stop"),
+    "rate, stop",
     [(2.0, math.inf), (math.inf, 0.1), (2.0, 0.1)],
     ids=["rate limit", "end stops", "both"],
 )

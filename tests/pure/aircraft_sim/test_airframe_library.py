@@ -121,8 +121,7 @@ def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "published", "si"),
-    [("f16_longitudinal", 0.989, 0.302), ("b747_longitudinal", 0.607, 0.282)],
+    "name, published, si", [("f16_longitudinal", 0.989, 0.302), ("b747_longitudinal", 0.607, 0.282)]
 )
 def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: float) -> None:
     # F-16: U_12 = 0.1737 / 0.17555 (ft/s) / (rad/s), times 0.3048 in SI.
@@ -297,7 +296,7 @@ def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]
 
 
 @pytest.mark.parametrize(
-    ("name", "coefficients"),
+    "name, coefficients",
     [("aerosonde_lateral", SECOND_EDITION), ("aerosonde_first_edition_lateral", FIRST_EDITION)],
 )
 def test_the_aerosondes_follow_from_their_published_coefficients(
@@ -332,7 +331,7 @@ def toy(k: float) -> Airframe:
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
 @pytest.mark.parametrize(
-    ("k", "zero", "kind"),
+    "k, zero, kind",
     [
         (3.0, -2.0, ZeroDynamics.STABLE),
         (1.0, 0.0, ZeroDynamics.MARGINAL),

@@ -183,7 +183,7 @@ def test_inside_assumption_2_error_falls_with_square_of_period(
     assert coarse / fine == pytest.approx(4.0, rel=0.05)
 
 
-@pytest.mark.parametrize(("name", "channel"), [("step", 0), ("turbulence", 1)])
+@pytest.mark.parametrize("name, channel", [("step", 0), ("turbulence", 1)])
 def test_outside_assumption_2_shorter_period_does_not_help(
     name: str, channel: int, osprey_gust: Scenario
 ) -> None:

@@ -93,7 +93,7 @@ def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "output", "sign", "duration"),
+    "name, output, sign, duration",
     [
         ("elevator", "q", -1.0, 0.2),  # nose down
         ("throttle", "V", 1.0, 1.0),  # more thrust
@@ -113,7 +113,7 @@ def test_positive_command_has_sign_of_table(
 
 
 @pytest.mark.parametrize(
-    ("axis", "state", "scale"),
+    "axis, state, scale",
     # A wind w along x, y, z of the flight path adds -w to airspeed, -w/V0 to sideslip, -w/V0 to
     # alpha.
     [
@@ -278,7 +278,7 @@ def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(
 
 
 @pytest.mark.parametrize(
-    ("condition", "sentence"),
+    "condition, sentence",
     [
         (
             ("c172p", 20.0, 1219.2),
@@ -323,7 +323,7 @@ def test_the_ground_ends_a_flight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         ({"airframe": "jsbsim:../c172p"}, r"airframe: found 'jsbsim:../c172p', where no file is"),
         ({"speed": None}, r"speed: found none, expected the true airspeed to trim at, m/s"),

@@ -135,7 +135,7 @@ def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("commands", "sentence"),
+    "commands, sentence",
     [
         ({"flaps": "fcs/flap"}, "commands: found 'flaps', expected an input: elevator"),
         (
@@ -255,7 +255,7 @@ def test_root_of_user_has_names_and_engines(
 
 
 @pytest.mark.parametrize(
-    ("path", "sentence"),
+    "path, sentence",
     [
         (
             "nowhere.xml",

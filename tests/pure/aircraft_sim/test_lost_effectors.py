@@ -47,7 +47,7 @@ def accelerations(airframe: str, lost: str) -> dict[str, float]:
     return dict(zip(load_airframe(airframe).states, (x / STEP).tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("lost", "toward"), [("left_thrust", -1.0), ("right_thrust", 1.0)])
+@pytest.mark.parametrize("lost, toward", [("left_thrust", -1.0), ("right_thrust", 1.0)])
 def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     lost: str, toward: float
 ) -> None:
@@ -108,7 +108,7 @@ def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("airframe", "effector"),
+    "airframe, effector",
     [
         ("osprey_twin", "left_thrust"),
         ("osprey_vtail", "thrust"),

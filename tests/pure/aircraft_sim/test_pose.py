@@ -106,7 +106,7 @@ def test_level_turn_keeps_attitude_and_costs_lift() -> None:
 
 
 @pytest.mark.parametrize(
-    ("airframe", "values", "sentence"),
+    "airframe, values, sentence",
     [
         ("b747_lateral", {"kinematics": "euler"}, "no state alpha, theta"),
         ("osprey", {"wind": [3.0]}, "wind"),
@@ -259,7 +259,7 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "sentence"),
+    "section, sentence",
     [
         ({"noise": {"pitch": 1.0}}, "pose.noise: found pitch, expected some of phi, theta"),
         (

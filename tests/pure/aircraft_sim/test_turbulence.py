@@ -65,7 +65,7 @@ def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("feet", "wind", "sigma", "lengths", "intensities"),
+    "feet, wind, sigma, lengths, intensities",
     [
         # c = 0.177 + 0.000823 h. At 1000 ft c = 1, and all lengths are 1000 ft, all intensities
         # W_20 / 10.

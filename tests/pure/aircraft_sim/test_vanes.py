@@ -225,7 +225,7 @@ def test_frozen_vane_is_left_out_and_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         (
             {"aircraft": {"vanes": {}, "sensors": {}}},

@@ -395,7 +395,7 @@ def test_engagement_refused_with_sentence_of_condition() -> None:
 
 
 @pytest.mark.parametrize(
-    ("status", "reason"),
+    "status, reason",
     [
         ({"armed": 1.0}, "the aircraft is not armed (arming_state is 1)"),
         ({"offboard": 5.0}, "the mode is not offboard (nav_state is 5)"),
@@ -438,7 +438,7 @@ def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
 
 
 @pytest.mark.parametrize(
-    ("valid", "reason"),
+    "valid, reason",
     [
         (0.0, "the transmitter is lost (valid is 0)"),
         (np.nan, "transmitter: valid is 0.90 s old (/fmu/out/manual_control_setpoint)"),
@@ -545,7 +545,7 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("condition", "raw", "sentence"),
+    "condition, raw, sentence",
     [
         ("manual", 15.0, "the mode is not MANUAL (mode is 15)"),  # GUIDED
         ("armed", 0.0, "the aircraft is not armed (armed is 0)"),
@@ -824,7 +824,7 @@ def enveloped_bridge() -> Bridge:
 
 
 @pytest.mark.parametrize(
-    ("name", "raw", "channel"), [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)]
+    "name, raw, channel", [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)]
 )
 def test_leaving_envelope_releases_channels_with_sentence(
     name: str, raw: float, channel: float
@@ -954,7 +954,7 @@ def followed(
 
 
 @pytest.mark.parametrize(
-    ("begins", "until", "end", "outcome"),
+    "begins, until, end, outcome",
     [
         (False, 60.0, 60.0, "completed"),
         (False, 59.0, 64.0, "completed"),

@@ -20,10 +20,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
-from typer.testing import CliRunner
 
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import (
@@ -39,7 +38,6 @@ from autopilot_bridge.channel_map import (
 from autopilot_bridge.map_check import check_map, definitions_below
 from autopilot_bridge.map_rows import MeasuredRow, OverrideRow
 from autopilot_bridge.params import BridgeConfig, ChannelMap, load_map
-from flight_cli.cli import application
 from flight_core import installation
 from flight_core.vectors import ChannelError
 
@@ -236,7 +234,7 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
                 ]
                 (messages / f"{name}.msg").write_text("\n".join(lines))
     options = [word for release in versions for word in ("--definitions", str(tmp_path / release))]
-    result = CliRunner().invoke(application(["check"]), ["check", "px4", *options, "--json"])
+    result = invoke("check", "px4", *options, "--json")
     assert result.exit_code == 1
     status = "/fmu/out/vehicle_status_v1: version 4, whose topic is /fmu/out/vehicle_status_v4"
     found = {
@@ -247,12 +245,10 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
         "conditions.armed": ["", status],
         "conditions.offboard": ["", status],
     }
-    alone = CliRunner().invoke(application(["check"]), ["check", "px4", *options[:2]])
+    alone = invoke("check", "px4", *options[:2])
     assert alone.exit_code == 0
     assert "1: 24 of 24 rows hold" in alone.output
-    refused = CliRunner().invoke(
-        application(["check"]), ["check", "px4", "--definitions", str(tmp_path / "1" / "msg")]
-    )
+    refused = invoke("check", "px4", "--definitions", str(tmp_path / "1" / "msg"))
     assert "expected a folder with the sources of a message package" in str(refused.exception)
 
 
@@ -260,14 +256,12 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(installation, "find_spec", lambda name: None)
-    result = CliRunner().invoke(
-        application(["check"]), ["check", "ardupilot_mavlink", "--definitions", "installed"]
-    )
+    result = invoke("check", "ardupilot_mavlink", "--definitions", "installed")
     assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
 
 
 @pytest.mark.parametrize(
-    ("key", "change", "fault"),
+    "key, change, fault",
     [
         ("v_north", {"turned_by": "pose.pose.orientatoin"}, "no orientatoin"),
         ("phi", {"field": "pose.covariance"}, "pose.covariance: no w, x, y, z"),
@@ -280,10 +274,7 @@ def test_check_map_finds_field_that_row_cannot_use(
     content = yaml.safe_load(MAP_FILES["odometry"].read_text())
     content["pose"][key] |= change
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content))
-    result = CliRunner().invoke(
-        application(["check"]),
-        ["check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json"],
-    )
+    result = invoke("check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json")
     found = {
         row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])
     }
@@ -500,7 +491,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "sentence"),
+    "place, value, sentence",
     REFUSALS,
     ids=lambda argument: ".".join(argument) if isinstance(argument, tuple) else "",
 )

@@ -598,7 +598,7 @@ def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.Monkey
     assert made.problem() == f"no message of system 1 over udpin:127.0.0.1:{port} for 3 s"
 
 
-@pytest.mark.parametrize(("name", "key"), [("ardupilot", "mode"), ("ardupilot_mavlink", "param2")])
+@pytest.mark.parametrize("name, key", [("ardupilot", "mode"), ("ardupilot_mavlink", "param2")])
 def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(
     name: str, key: str
 ) -> None:

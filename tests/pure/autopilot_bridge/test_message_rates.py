@@ -83,7 +83,7 @@ def test_rate_that_stays_low_is_requested_each_second_and_ends_the_engagement() 
     assert np.diff([instant for instant, _ in stream.again]) == pytest.approx(1.0, abs=0.11)
 
 
-@pytest.mark.parametrize(("part", "is_slow"), [(0.75, False), (0.65, True)])  # the bound is 0.7
+@pytest.mark.parametrize("part, is_slow", [(0.75, False), (0.65, True)])  # the bound is 0.7
 def test_bound_of_slow_rate(part: float, is_slow: bool) -> None:
     stream = Stream().run(10.0).run(20.0, ATTITUDE=part * 40.0)
     assert bool(stream.rates.slow(20.0)) is is_slow

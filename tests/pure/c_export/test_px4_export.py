@@ -163,7 +163,7 @@ def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "refusal", "latches"),
+    "changes, refusal, latches",
     [
         ({"armed": False}, NOT_ARMED, False),
         ({"has_rates": False}, NO_RATES, False),

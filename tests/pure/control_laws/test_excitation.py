@@ -132,7 +132,7 @@ def test_limits_act_on_the_excitation() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         ({"amplitude": [0.02, 0.02, 0.02]}, "controller.amplitude: found 3 values, expected 4"),
         (

@@ -606,7 +606,7 @@ def test_a_parameter_of_another_law_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "sentence"),
+    "name, changes, sentence",
     [
         (
             "pi",

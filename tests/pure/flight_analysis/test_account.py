@@ -24,12 +24,7 @@ import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
-from flight_analysis.report.account import (
-    Account,
-    TopicAccount,
-    account,
-    final_outcome,
-)
+from flight_analysis.report.account import Account, TopicAccount, account, final_outcome
 from flight_analysis.report.html import write_page
 from flight_analysis.report.paper import write_latex
 from flight_analysis.report.run_folder import read_flight
@@ -184,7 +179,7 @@ def test_replay_claims_no_tick_without_its_u(
 
 
 @pytest.mark.parametrize(
-    ("begin", "outcome"),
+    "begin, outcome",
     [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")],
 )
 def test_flight_counts_from_its_first_u(
@@ -200,7 +195,7 @@ def test_flight_counts_from_its_first_u(
 
 
 @pytest.mark.parametrize(
-    ("of_y", "lost", "lacks"),
+    "of_y, lost, lacks",
     [("without", 0, True), ("with", 0, True), ("without", 1, True), ("after", 0, False)],
     ids=[
         "log ends with y and pose",
@@ -248,13 +243,7 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("found", "expected", "whole"),
-    [
-        (96, 97, True),
-        (95, 97, False),
-        (1, 2, True),
-        (0, 1, False),
-    ],
+    "found, expected, whole", [(96, 97, True), (95, 97, False), (1, 2, True), (0, 1, False)]
 )
 def test_one_missing_sample_is_no_lack_of_short_topic(
     found: int, expected: int, whole: bool

@@ -56,8 +56,7 @@ def margin() -> float:
 
 
 @pytest.mark.parametrize(
-    ("beyond", "verdict"),
-    [(-2.0, ""), (-0.001, "within the margin"), (0.001, "more than the margin")],
+    "beyond, verdict", [(-2.0, ""), (-0.001, "within the margin"), (0.001, "more than the margin")]
 )
 def test_age_of_u_beside_delay_margin_of_gains(
     beyond: float, verdict: str, tape: Tape, margin: float

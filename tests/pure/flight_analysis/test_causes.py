@@ -393,7 +393,7 @@ def test_ticks_of_less_than_nine_tenths_are_no_success(
 
 
 @pytest.mark.parametrize(
-    ("numbers", "starts"),
+    "numbers, starts",
     [
         ([1, 2, 3, 4], []),
         ([41, 43, 42, 44], []),

@@ -46,7 +46,7 @@ def flown(*north: float, engaged: int = 0) -> Tape:
 
 
 @pytest.mark.parametrize(
-    ("north", "outside"),
+    "north, outside",
     [
         ((0.0, 400.0, 0.0), Outside(0.0, 0.0, left=False)),
         ((490.0, 510.0, 520.0, 490.0), LEFT),

@@ -16,12 +16,11 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
-from typer.testing import CliRunner
+from tests.conftest import invoke
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.layouts import MAP_TOPICS, channels_of, foxglove, plotjuggler
-from flight_cli.cli import application
 from flight_core.tape import Tape
 
 CHANNELS = channels_of(find_scenario("osprey_gust"))
@@ -66,9 +65,7 @@ def leaves(tree: Any) -> Iterator[str]:
 
 
 def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        application(["layouts"]), ["layouts", "osprey_gust", "--folder", str(tmp_path / "new")]
-    )
+    result = invoke("layouts", "osprey_gust", "--folder", str(tmp_path / "new"))
     assert result.exit_code == 0, result.output
     files = {path.name: path.read_text() for path in (tmp_path / "new").iterdir()}
     assert files == {"osprey_gust.foxglove.json": JSON, "osprey_gust.plotjuggler.xml": XML}
@@ -128,9 +125,7 @@ def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
     """RViz shows each aircraft at the frame that guidance publishes, after REP 105."""
     fleet = tmp_path / "fleet.yaml"
     fleet.write_text("aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}")
-    result = CliRunner().invoke(
-        application(["layouts"]), ["layouts", str(fleet), "--folder", str(tmp_path)]
-    )
+    result = invoke("layouts", str(fleet), "--folder", str(tmp_path))
     assert result.exit_code == 0, result.output
     panels = json.loads((tmp_path / "fleet.foxglove.json").read_text())["configById"]
     assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == [

@@ -104,7 +104,7 @@ def guided(**channels: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    ("channels", "expected"),
+    "channels, expected",
     [
         ({"phi_c": -0.1}, [("turn", 5.0, 8.0)]),  # 5.7 deg
         ({"phi_c": 0.08}, []),  # 4.6 deg

@@ -60,12 +60,7 @@ def silent(name: str, duration: int, begin: float, end: float) -> Kept:
     return np.asarray((t <= begin) | (t >= end))
 
 
-@pytest.mark.parametrize(
-    "share",
-    [
-        0.3,
-    ],
-)
+@pytest.mark.parametrize("share", [0.3])
 def test_samples_that_the_sensor_of_y_drops_are_no_lack(share: float) -> None:
     """And more than that are: half as many again is above four deviations of their number."""
     flown = scenario(sensors={"dropout": share})
@@ -73,12 +68,7 @@ def test_samples_that_the_sensor_of_y_drops_are_no_lack(share: float) -> None:
     assert lacks(flown, 60, {"y": dropped("y", 60, 1.5 * share)})[0].startswith("y ")
 
 
-@pytest.mark.parametrize(
-    "share",
-    [
-        0.3,
-    ],
-)
+@pytest.mark.parametrize("share", [0.3])
 @pytest.mark.parametrize("name", [name for name in RATES if name != "y"])
 def test_what_the_sensor_of_y_drops_excuses_no_other_topic(name: str, share: float) -> None:
     """Half of what y may lose is missing of another topic."""
@@ -114,7 +104,7 @@ def test_silence_of_a_steady_topic_is_named_by_its_times(
     assert found[0].endswith(f"no sample from t = 30.000 to {30.0 + length:.3f} s")
 
 
-@pytest.mark.parametrize(("end", "named"), [(598.0, True), (598.9, True), (599.1, False)])
+@pytest.mark.parametrize("end, named", [(598.0, True), (598.9, True), (599.1, False)])
 @pytest.mark.parametrize("name", ["y", "truth"])
 def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: bool) -> None:
     """Of a long flight, where the share of the missing samples is below a hundredth."""

@@ -65,7 +65,7 @@ def test_svg_keeps_text_and_rows(flight: RecordedFlight, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "width", "channels", "words"),
+    "name, width, channels, words",
     [
         ("fig.gif", "88mm", "", "figure: found fig.gif, expected a name that ends in .pdf"),
         ("fig.pdf", "8mm", "", "width: found 8mm, expected 30 mm to 1 m"),

@@ -194,7 +194,7 @@ MODES: dict[str, tuple[list[Tick], list[Mode]]] = {
 }
 
 
-@pytest.mark.parametrize(("events", "modes"), MODES.values(), ids=MODES)
+@pytest.mark.parametrize("events, modes", MODES.values(), ids=MODES)
 def test_a_replay_passes_the_same_modes(events: list[Tick], modes: list[Mode]) -> None:
     result = replay(driven(PATIENT, [FLY] * 20 + events), PATIENT)
     assert equal(result), result.first()
@@ -242,7 +242,7 @@ BUSY = {
 
 
 @pytest.mark.parametrize(
-    ("topic", "channels"),
+    "topic, channels",
     [
         (
             "internals",
@@ -505,7 +505,7 @@ def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("setting", "sentence"),
+    "setting, sentence",
     [
         ("controller.k_g=-1", "controller.k_g: found -1, expected greater than 0"),
         (

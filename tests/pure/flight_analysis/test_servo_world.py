@@ -42,7 +42,7 @@ def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scen
 
 
 @pytest.mark.parametrize(
-    ("aircraft", "controller", "rms"),
+    "aircraft, controller, rms",
     [
         pytest.param({}, {}, (7.6, 0.088, 9.9, 6.4), id="soft, gusts"),
         pytest.param({}, NO_SIGN, (13.7, 0.178, 22.2, 14.0), id="PI, gusts"),

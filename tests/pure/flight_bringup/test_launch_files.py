@@ -410,7 +410,7 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("given", "topics"),
+    "given, topics",
     [
         ({}, "/pose,/truth,/y,/y_m"),  # the controller publishes u and internals
         ({"controller": "false", "aircraft": "true"}, "/internals,/u,/y_m"),

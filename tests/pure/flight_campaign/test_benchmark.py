@@ -147,7 +147,7 @@ def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("enter", "sentence"),
+    "enter, sentence",
     [
         (
             lambda task: PI | {"rate": 50.0},
@@ -176,7 +176,7 @@ def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Set
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    "words, sentence",
     [
         (["no_such_module:enter"], "found 'no_such_module:enter'"),
         (["osprey_servo", "osprey_gust"], "expected one scenario for each airframe"),

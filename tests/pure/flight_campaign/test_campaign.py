@@ -199,7 +199,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    "options, sentence",
     [
         (
             {"spread": Spread({"A[q,gamma]": 0.5})},
@@ -267,7 +267,7 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
 
 
 @pytest.mark.parametrize(
-    ("scenario", "sentence"),
+    "scenario, sentence",
     [
         (
             find_scenario("jsbsim_c172p_learn"),
@@ -444,7 +444,7 @@ def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
 
 
-@pytest.mark.parametrize(("channel", "place"), [("V", -1), ("thrust", -1), ("q", 0)])
+@pytest.mark.parametrize("channel, place", [("V", -1), ("thrust", -1), ("q", 0)])
 def test_sweep_of_channel_multiplies_that_value_alone(channel: str, place: int) -> None:
     swept = definition(20, 20, Sweep(parameter=f"beta[{channel}]", factors=(1.0, 2.0)))
     own, double = (swept.scenario(case).controller.model_dump()["beta"] for case in range(2))

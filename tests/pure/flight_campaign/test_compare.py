@@ -171,7 +171,7 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    "arguments, words",
     [
         (["--laws", "rise,magic"], "'magic'"),
         (["--uncertainty", "0.3,1"], "0 and below 1"),

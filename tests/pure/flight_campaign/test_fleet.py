@@ -301,7 +301,7 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "sentence"),
+    "scenario, sentence",
     [
         (
             SERVO.vary(aircraft={"sensors": {"dropout": 0.1}}),

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, invoke
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.replay import recorded_scenario
@@ -96,7 +96,7 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    "arguments, sentence",
     [
         (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
         (
@@ -143,7 +143,7 @@ def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
 
 
 def test_help_names_every_option() -> None:
-    shown = CliRunner().invoke(application(["fly"]), ["fly", "--help"])
+    shown = invoke("fly", "--help")
     for option in ("--duration", "--in-process", "--set", "--json"):
         assert option in shown.stdout
 
@@ -236,30 +236,26 @@ def test_name_that_is_gone_is_one_sentence_with_the_new_one(words: str) -> None:
 
 
 def test_option_that_became_a_setting_names_it() -> None:
-    result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--y-rate", "50"])
+    result = invoke("gains", "osprey", "--y-rate", "50")
     assert str(result.exception) == "--y-rate: found an option that is gone, expected --set y_rate"
-    unknown = CliRunner().invoke(
-        application(["export"]), ["export", "osprey_servo", "--set", "rate=50"]
-    )
+    unknown = invoke("export", "osprey_servo", "--set", "rate=50")
     assert str(unknown.exception) == "--set: found 'rate=50', expected one of drawn, runner, seed"
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
-    listed = json.loads(
-        CliRunner().invoke(application(["scenarios"]), ["scenarios", "--json"]).output
-    )
+    listed = json.loads(invoke("scenarios", "--json").output)
     assert [row["name"] for row in listed] == sorted(path.stem for path in LIBRARY.glob("*.yaml"))
     (servo,) = (row for row in listed if row["name"] == "osprey_servo")
     assert (servo["aircraft"], servo["law"]) == ("osprey", "rise_di")
     assert servo["flies"].startswith("Commands on every channel and two gusts")
-    shown = CliRunner().invoke(application(["scenarios"]), ["scenarios", "osprey_gust"])
+    shown = invoke("scenarios", "osprey_gust")
     assert "osprey_gust" in shown.output
     assert "osprey_route" not in shown.output
 
 
 def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
     for name in COMMANDS:
-        shown = CliRunner().invoke(application([name]), [name, "--help"], prog_name="rise-di")
+        shown = invoke(name, "--help", prog_name="rise-di")
         assert shown.exit_code == 0, name
         assert f"Usage: rise-di {name}" in shown.stdout
     listed = rise_di("--help", cwd=tmp_path).stdout

@@ -700,7 +700,7 @@ def arrivals(
 
 
 @pytest.mark.parametrize(
-    ("arrival", "copies"),
+    "arrival, copies",
     [
         (lambda stamp: (stamp // 500_000 + 1) * 500_000, None),
         (lambda stamp: stamp, lambda stamp: stamp + 250_000),
@@ -769,7 +769,7 @@ DEAD = np.random.default_rng(3).normal(2.0, 0.3, (round(DURATION * RATE), 1))  #
 
 
 @pytest.mark.parametrize(
-    ("flags", "taken"),
+    "flags, taken",
     [
         ({"H": (0, 1), "U": (0, 1), "Pri": (1, 1)}, "1 of 0 and 1: the primary"),
         ({"H": (0, 1), "U": (1, 1), "Pri": (0, 0)}, "1 of 0 and 1: healthy and used"),

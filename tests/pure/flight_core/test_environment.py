@@ -49,7 +49,7 @@ def test_right_environment_passes_in_a_millisecond() -> None:
 
 
 @pytest.mark.parametrize(
-    ("variables", "sentence"),
+    "variables, sentence",
     [
         ({"HOME": ""}, r"ROS_LOG_DIR: found none and no HOME, expected .* ROS_LOG_DIR=FOLDER"),
         (
@@ -102,7 +102,7 @@ def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "before", "sentence"),
+    "options, before, sentence",
     [
         (["--net"], "true", "error: 127.0.0.1: cannot be reached"),
         (

@@ -57,7 +57,7 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "adapter"), PAIRS, ids=map(str, range(len(PAIRS))))
+@pytest.mark.parametrize("kind, adapter", PAIRS, ids=map(str, range(len(PAIRS))))
 @given(value=VALUES)
 @example(value=(1, 2.0))
 @example(value=10**400)
@@ -99,7 +99,7 @@ class Outer(Config):
 
 
 @pytest.mark.parametrize(
-    ("values", "sentence"),
+    "values, sentence",
     [
         ({}, "set.inner: missing, expected a value"),
         ({"inner": {}}, "set.inner.a: missing, expected the rate, Hz"),
@@ -157,7 +157,7 @@ def test_unknown_rule_or_type_raises(annotation: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "value"),
+    "text, value",
     [
         ("1e-3", 1e-3),
         ("6e1", 60.0),
@@ -175,14 +175,7 @@ def test_numbers_are_those_of_yaml_1_2(text: str, value: float) -> None:
     assert (type(read), read) == (type(value), value)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "060",
-        "1:00",
-        "1e",
-    ],
-)
+@pytest.mark.parametrize("text", ["060", "1:00", "1e"])
 def test_ambiguous_numbers_are_no_numbers(text: str) -> None:
     """YAML 1.1 reads 060 as 48 and 1:00 as 60. Such text stays text, so a number field refuses
     it.
@@ -199,13 +192,6 @@ def test_dumped_yaml_reads_back(value: object) -> None:
     assert parse_yaml(dump_yaml({"a": value}), "file", "a mapping") == {"a": value}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1e3",
-        "0o17",
-        "12e45",
-    ],
-)
+@pytest.mark.parametrize("text", ["1e3", "0o17", "12e45"])
 def test_text_like_a_number_is_quoted(text: str) -> None:
     assert parse_yaml(dump_yaml({"a": text}), "file", "a mapping") == {"a": text}

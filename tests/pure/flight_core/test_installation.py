@@ -31,7 +31,7 @@ class Installed(NamedTuple):
 
 
 @pytest.mark.parametrize(
-    ("origin", "command"),
+    "origin, command",
     [  # PEP 610
         ('{"url": "file:///home/user/rise-di", "dir_info": {}}',
         'pip install "rise-di[campaign] @ file:///home/user/rise-di"'),

@@ -107,7 +107,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD]
+    "change, sentence", BAD.items(), ids=[change[1].strip()[:40] for change in BAD]
 )
 def test_a_bad_scenario_is_one_sentence(
     change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path
@@ -195,8 +195,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
 
 
 @pytest.mark.parametrize(
-    ("section", "values", "sentence"),
-    [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows],
+    "section, values, sentence", [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows]
 )
 def test_invalid_section_of_aircraft_refused_by_name(
     section: str, values: Any, sentence: str
@@ -206,7 +205,7 @@ def test_invalid_section_of_aircraft_refused_by_name(
 
 
 @pytest.mark.parametrize(
-    ("section", "values", "sentence"),
+    "section, values, sentence",
     [
         (
             "inertial_coupling",
@@ -221,7 +220,7 @@ def test_section_without_data_in_airframe_refused(section: str, values: Any, sen
 
 
 @pytest.mark.parametrize(
-    ("section", "values", "sentence"),
+    "section, values, sentence",
     [
         (
             "gusts",

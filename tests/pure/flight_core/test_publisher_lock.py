@@ -67,7 +67,7 @@ def test_a_change_of_publisher_is_returned_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})]
+    "late, modes", [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})]
 )
 def test_delayed_reference_awaited_up_to_age_limit(
     late: float, modes: set[Mode], osprey_gust: Scenario

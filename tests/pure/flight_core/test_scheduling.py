@@ -58,7 +58,7 @@ print([(one / "sched").read_text() for one in THREADS.iterdir()])
 
 
 @pytest.mark.parametrize(
-    ("policy", "priority"),
+    "policy, priority",
     [(("--fifo", "50"), 48), (("--rr", "50"), 48), (("--fifo", "2"), 1), (("--other", "0"), 0)],
     ids=["FIFO", "round robin", "no lower one", "default policy"],
 )

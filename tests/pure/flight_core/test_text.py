@@ -5,11 +5,9 @@
 from pathlib import Path
 
 import pytest
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.joint_states import JOINT_STATE, vector
-from typer.testing import CliRunner
 
-from flight_cli.cli import application
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import Config, ParameterError
@@ -67,7 +65,7 @@ def test_command_prints_names_of_files_as_escapes(command: str, run: Path) -> No
     folder = run.rename(run.with_name(name))
     log = next(folder.glob("*.mcap")).rename(folder / f"{name}_0.mcap")
     log.write_bytes(log.read_bytes()[:-1000])
-    output = CliRunner().invoke(application([command]), [command, str(folder)]).output
+    output = invoke(command, str(folder)).output
     assert r"]0;PWNED\x07" in output
     assert "\x1b" not in output
     assert "\x07" not in output

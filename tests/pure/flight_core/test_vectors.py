@@ -30,7 +30,7 @@ def test_order_of_publisher_does_not_matter(values: list[tuple[str, float]]) -> 
 
 
 @pytest.mark.parametrize(
-    ("names", "values", "reason"),
+    "names, values, reason",
     [
         (["q", "V"], [1.0], "length"),
         (["q", "W"], [1.0, 2.0], "name"),

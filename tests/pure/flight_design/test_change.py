@@ -59,7 +59,7 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(
     assert changed(lat).endswith(f": aileron has {100 * lat.left['aileron']:.0f} % of its effect")
 
 
-@pytest.mark.parametrize(("model", "found"), [(0.6, False), (0.72, True)])
+@pytest.mark.parametrize("model, found", [(0.6, False), (0.72, True)])
 def test_loss_within_what_a_model_may_err_is_no_change(
     damaged: tuple[Recording, Airframe], model: float, *, found: bool
 ) -> None:

@@ -199,7 +199,7 @@ def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
     ).all()
 
 
-@pytest.mark.parametrize(("topic", "k"), [("u", 0), ("u", 1), ("y", 2), ("y", 3)])
+@pytest.mark.parametrize("topic, k", [("u", 0), ("u", 1), ("y", 2), ("y", 3)])
 def test_each_wrong_sign_found_in_experiment(experiment: Tape, topic: str, k: int) -> None:
     name = {"u": INPUTS, "y": OUTPUTS}[topic][k]
     wrong = Tape({**experiment.signals, topic: turned(experiment[topic], name)})

@@ -116,7 +116,7 @@ def test_gains_of_theorem_1_meet_conditions() -> None:
 
 @pytest.mark.equation(29, 30, "Step 2")
 @pytest.mark.parametrize(
-    ("change", "failing"),
+    "change, failing",
     [
         ({"beta": np.array([72.0, 7.0, 2.9])}, ["beta (29) of c"]),
         ({"k_d": np.array([20.0, 2.7])}, ["k_d, step 3 of a"]),
@@ -255,7 +255,7 @@ def test_wrong_D_refused_with_one_that_fits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "sentence"),
+    "inputs, sentence",
     [
         (
             ("elevator", "thrust", "rudder", "aileron"),
@@ -303,7 +303,7 @@ def osprey_loop(
 
 
 @pytest.mark.parametrize(
-    ("factor", "K", "Lambda", "margin"),
+    "factor, K, Lambda, margin",
     [
         (3.0, (18.0, 2.0, 18.0, 9.0), (5.0, 0.5, 5.0, 3.0), 0.045),
         (5.0, (18.0, 2.0, 18.0, 9.0), (5.0, 0.5, 5.0, 3.0), 0.064),
@@ -359,7 +359,7 @@ def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
     return peaks[1] > peaks[0]
 
 
-@pytest.mark.parametrize(("lag", "factor"), [(0.02, 3.0), (0.02, 5.0), (0.05, 3.0)])
+@pytest.mark.parametrize("lag, factor", [(0.02, 3.0), (0.02, 5.0), (0.05, 3.0)])
 def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(
     lag: float, factor: float
 ) -> None:
@@ -457,7 +457,7 @@ def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "expected"),
+    "option, value, expected",
     [
         ("--set", "rate=nan", "--set rate: found nan, expected 1 to 1000 Hz"),
         ("--lag", "fast", "--lag: found 'fast', expected seconds separated by commas"),

@@ -170,7 +170,7 @@ def test_an_output_without_response_ends_the_identification() -> None:
         respond(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)))
 
 
-@pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
+@pytest.mark.parametrize("speed, authority", [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
 def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s
     # w / e. The pulse's edge of 0.1 s rounds that off by less than 1 %.
@@ -265,7 +265,7 @@ def rise_di(*arguments: str) -> Result:
 
 
 @pytest.mark.parametrize(
-    ("airframe", "sentence"),
+    "airframe, sentence",
     [
         ("osprey", "aircraft: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
         (

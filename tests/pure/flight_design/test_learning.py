@@ -356,7 +356,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
 
 
 @pytest.mark.parametrize(
-    ("gain", "sentence"),
+    "gain, sentence",
     [
         # of a sample; 333 of 1000 are held out, and the limit is 8
         (0.03, "p and r changed, log-likelihood 10: rudder has 5 % of its effect"),
@@ -454,7 +454,7 @@ def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(
 
 
 @pytest.mark.parametrize(
-    ("delay", "deviation", "margin"),
+    "delay, deviation, margin",
     [
         (0.0, 0.004, 0.03),  # 8 and 10 ms are within the 30 ms of the start
         (0.02, 0.002, 0.034),  # found, two deviations, and 10 ms that are left
@@ -507,7 +507,7 @@ RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
 
 
 @pytest.mark.parametrize(
-    ("flown", "frequency", "tested"),
+    "flown, frequency, tested",
     [
         ((1, 1, 1), 0.0, True),
         ((1, 2, 1), 0.0, False),  # fell back 5 s ago

@@ -104,7 +104,7 @@ MATTER = (
 """What moves the outputs: the effect of each input, roll damping, and the coupling of yaw."""
 
 
-@pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
+@pytest.mark.parametrize("air, uncertainty", FLIGHTS)
 def test_entries_that_matter_found_within_deviations(air: str, uncertainty: float) -> None:
     found = identified(air, uncertainty)
     true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), found.entries)
@@ -129,7 +129,7 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
         assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < bound, name
 
 
-@pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
+@pytest.mark.parametrize("air, uncertainty", FLIGHTS)
 def test_innovations_of_held_out_samples_are_smaller_and_whiter(
     air: str, uncertainty: float
 ) -> None:

@@ -658,7 +658,7 @@ def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> 
 
 
 @pytest.mark.parametrize(
-    ("law", "objective", "channels"),
+    "law, objective, channels",
     [
         ("rise", "nominal", 3),  # the fourth channel, the airspeed, is below
         ("rise", "uncertain", 4),

@@ -29,12 +29,7 @@ AXES = {"elevator": "PITCH", "thrust": "THROTTLE", "aileron": "ROLL", "rudder": 
 ENDS = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "REVERSED": 0.0}  # us, of the shipped maps
 PARAMETERS = {
     f"RC{number}_{end}": value for number in range(1, 5) for end, value in ENDS.items()
-} | {
-    "RCMAP_ROLL": 1.0,
-    "RCMAP_PITCH": 2.0,
-    "RCMAP_THROTTLE": 3.0,
-    "RCMAP_YAW": 4.0,
-}
+} | {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 4.0}
 
 
 def agreement(
@@ -62,7 +57,7 @@ def test_shipped_map_agrees_with_the_parameters_that_it_names(name: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("parameter", "value", "expected", "mend"),
+    "parameter, value, expected, mend",
     [
         ("RC2_MIN", 1100.0, 1000.0, "change `range`, `scale` and `offset`"),
         ("RC4_TRIM", 1440.0, 1500.0, "calibrate the transmitter with its trims"),
@@ -127,7 +122,7 @@ def elevator() -> Stick:
     return stick_of(named_map("ardupilot"), "elevator")
 
 
-@pytest.mark.parametrize(("is_reversed", "sign"), [(0.0, 1.0), (1.0, -1.0)])
+@pytest.mark.parametrize("is_reversed, sign", [(0.0, 1.0), (1.0, -1.0)])
 def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign: float) -> None:
     """SRV_Channel::pwm_from_angle: from the trim to either end, each with a slope of its own."""
     servo = servo_of(elevator(), "elevator", SURFACE | {"SERVO5_REVERSED": is_reversed})
@@ -137,7 +132,7 @@ def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign
     )
 
 
-@pytest.mark.parametrize(("is_reversed", "part"), [(False, 0.25), (True, 0.75)])
+@pytest.mark.parametrize("is_reversed, part", [(False, 0.25), (True, 0.75)])
 def test_deflection_of_a_throttle_is_that_from_its_end(is_reversed: bool, part: float) -> None:
     """SRV_Channel::pwm_from_range: a reversed throttle is open at its lower end."""
     stick = stick_of(named_map("ardupilot"), "thrust")
@@ -146,7 +141,7 @@ def test_deflection_of_a_throttle_is_that_from_its_end(is_reversed: bool, part: 
 
 
 @pytest.mark.parametrize(
-    ("name", "positive", "raw"),
+    "name, positive, raw",
     [
         ("ardupilot", "nose up", 0.5),
         ("ardupilot", "nose down", -0.5),
@@ -170,7 +165,7 @@ def test_servo_without_one_of_its_parameters_is_refused(absent: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "sentence"),
+    "values, sentence",
     [
         ({"SERVO5_FUNCTION": 77.0}, "found no servo with SERVOn_FUNCTION 19 in the log"),
         (

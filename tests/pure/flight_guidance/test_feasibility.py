@@ -79,9 +79,7 @@ def test_a_speed_below_the_floor_is_refused() -> None:
     assert flyable((*CORNER[:2], CORNER[2]._replace(speed=number(sentence))), RADIUS, PERIOD, CAN)
 
 
-@pytest.mark.parametrize(
-    ("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)]
-)
+@pytest.mark.parametrize("altitude, side, rate", [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
 def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate: float) -> None:
     """A climb is flown before the leg, a descent after the leg: clear of what the higher waypoint
     was meant to clear.

@@ -89,7 +89,7 @@ EDGE_NORTH = Zone((-2000.0, 500.0, 500.0, -2000.0), (-3000.0, -3000.0, 3000.0, 3
 EDGE_EAST = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-2000.0, -2000.0, 500.0, 500.0))
 
 
-@pytest.mark.parametrize(("edge", "course"), [(EDGE_NORTH, 0.0), (EDGE_EAST, math.pi / 2.0)])
+@pytest.mark.parametrize("edge, course", [(EDGE_NORTH, 0.0), (EDGE_EAST, math.pi / 2.0)])
 @pytest.mark.parametrize("wind", [0.0, 7.5, -7.5])
 def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float) -> None:
     """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t =
@@ -431,7 +431,7 @@ HOLE = {
 
 
 @pytest.mark.parametrize(
-    ("duration", "wind", "zones", "margin"),
+    "duration, wind, zones, margin",
     [
         pytest.param(34.0, (7.5, 0.0), {}, 16.2, id="head on in a wind of 0.3 V"),
         pytest.param(24.0, (0.0, 0.0), HOLE, 12.5, id="no-fly zone ahead"),
@@ -498,7 +498,7 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "sentence"),
+    "section, sentence",
     [
         (
             {

@@ -310,7 +310,7 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("waypoints", "radius", "sentence"),
+    "waypoints, radius, sentence",
     [
         ([(0.0, 0.0)], 200.0, "route: found 1 waypoints, expected two or more"),
         ([(0.0, 0.0), (1000.0, 0.0)], 90.0, "guidance.radius: found 90 m, expected at least 100 m"),

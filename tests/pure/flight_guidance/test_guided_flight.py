@@ -198,13 +198,7 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
 
 
-@pytest.mark.parametrize(
-    "leg",
-    [
-        2.0,
-        0.5,
-    ],
-)
+@pytest.mark.parametrize("leg", [2.0, 0.5])
 def test_leg_that_route_does_not_have_refused(leg: float) -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(
@@ -296,7 +290,7 @@ def test_stale_y_gives_no_command() -> None:
         made.take_pose(still, 400 * MS)
 
 
-@pytest.mark.parametrize(("gap", "continues"), [(5, True), (50, False)])
+@pytest.mark.parametrize("gap, continues", [(5, True), (50, False)])
 def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
     """u_m goes on from the last u_m after a short pause, and starts again after a long pause."""
     made = flying()
@@ -331,7 +325,7 @@ def test_new_command_bounds_slew() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "sentence"),
+    "values, sentence",
     [
         ({"pitch": 0.1}, "target: found pitch, expected some of phi, heading"),
         ({"phi": 0.1, "heading": 0.1}, "expected one lateral and one vertical command at most"),
@@ -348,7 +342,7 @@ def test_refused_command_changes_nothing(values: dict[str, float], sentence: str
 
 
 @pytest.mark.parametrize(
-    ("section", "sentence"),
+    "section, sentence",
     [
         ({"period": 13.0}, r"guidance.period: found 13.0 s, expected at least 16.5 s: max\(14 s"),
         (
@@ -410,7 +404,7 @@ def test_omitted_numbers_follow_from_sections() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         (
             {"guidance": {"speed": 30.0, "route": None}},
@@ -509,7 +503,7 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    "words, sentence",
     [
         (
             ["guide", "bank=3"],
@@ -546,7 +540,7 @@ def test_steep_climb_slows_and_keeps_airspeed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shortfall", "expected"),
+    "shortfall, expected",
     [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))],
 )
 def test_airspeed_error_limits_climb_and_sink(

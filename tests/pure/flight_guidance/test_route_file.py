@@ -102,7 +102,7 @@ def test_plane_errs_by_4_m() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ending", "content"),
+    "ending, content",
     [
         (".geojson", line()),
         (".json", {"type": "Feature", "properties": None, "geometry": line()}),
@@ -221,7 +221,7 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    "name, content",
     [
         ("r.geojson", {"type": "MultiLineString", "coordinates": [SQUARE]}),
         ("r.geojson", {"type": "MultiPoint", "coordinates": SQUARE}),
@@ -269,7 +269,7 @@ def test_files_of_other_programs_hold_same_route(name: str, content: Any, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "heights"),
+    "name, content, heights",
     [
         ("r.geojson", line([place[:2] for place in SQUARE]), [30.0, 30.0, 30.0]),
         (
@@ -357,7 +357,7 @@ def jump(item: int, count: int) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize(
-    ("rows", "places", "skipped"),
+    "rows, places, skipped",
     [
         ((A, B, jump(1, 2), C), "ABABABC", ""),  # so often again (MAVLink, MAV_CMD_DO_JUMP)
         ((A, jump(4, -1), B, C), "AC", "NAV_WAYPOINT (item 3)"),
@@ -389,7 +389,7 @@ def test_mission_is_flown_in_the_order_of_an_autopilot(
 
 
 @pytest.mark.parametrize(
-    ("rows", "sentence"),
+    "rows, sentence",
     [
         ((A, B, jump(9, 1)), r"DO_JUMP \(item 3\) to 9.0, expected a jump to an item"),
         ((A, B, jump(1, 1), jump(1, 1)), r"DO_JUMP \(item 3\), a loop inside of a loop"),
@@ -460,7 +460,7 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "sentence"),
+    "command, sentence",
     [
         (179, "not flown: DO_SET_HOME (item 2)"),
         (
@@ -661,7 +661,7 @@ def test_home_is_return_point_of_fence_without_rally_points(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("rows", "sentence"),
+    "rows, sentence",
     [
         (WPL_FENCE[:2], "found 2 of the 3 corners of a polygon, expected all"),
         (
@@ -770,7 +770,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "sentence"),
+    "name, content, sentence",
     [
         (
             "r.abc",

@@ -42,7 +42,7 @@ CONFIG = GuidanceConfig.validate_mapping(SECTION, "guidance")
 MS = 1_000_000  # ns
 
 
-@pytest.mark.parametrize(("distance", "radius"), [(2000.0, 150.0), (2000.0, -150.0), (20e3, 150.0)])
+@pytest.mark.parametrize("distance, radius", [(2000.0, 150.0), (2000.0, -150.0), (20e3, 150.0)])
 def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) -> None:
     """The way to a circle is the tangent and an arc, with a turn to the tangent at the start."""
 
@@ -129,7 +129,7 @@ def test_largest_wind_takes_whole_bank() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wind", "V", "sentence"),
+    "wind, V, sentence",
     [
         (
             30.0,
@@ -310,7 +310,7 @@ def circling(
     return log
 
 
-@pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
+@pytest.mark.parametrize("turns, wait", [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in
     the west.
@@ -369,12 +369,7 @@ def log_of(count: int, **channels: ArrayLike) -> Tape:
     level: dict[str, Any] = (
         dict.fromkeys(names, 0.0)
         | dict(zip(LEARNED, Authority(), strict=True))
-        | {
-            "mode": Mode.ENGAGED,
-            "mode.lateral": Lateral.ROUTE,
-            "V_c": SPEED,
-            "pose.v_north": SPEED,
-        }
+        | {"mode": Mode.ENGAGED, "mode.lateral": Lateral.ROUTE, "V_c": SPEED, "pose.v_north": SPEED}
     )
     level |= {name.replace("__", "."): value for name, value in channels.items()}
     values = np.column_stack(

@@ -145,14 +145,7 @@ def test_file_is_ros2_profile_with_installed_definitions_and_hashes(recorded: Pa
         assert any(record.name == "rosbag2" for record in reader.iter_metadata())
 
 
-@pytest.mark.parametrize(
-    "fraction",
-    [
-        0.4,
-        0.6,
-        0.9,
-    ],
-)
+@pytest.mark.parametrize("fraction", [0.4, 0.6, 0.9])
 def test_truncated_file_read_up_to_last_complete_chunk(
     fraction: float, tape: Tape, run: Path
 ) -> None:
@@ -540,7 +533,7 @@ def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("numbers", "lost"), [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)]
+    "numbers, lost", [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)]
 )
 def test_lost_messages_are_known_of_one_publisher_alone(
     numbers: list[int], lost: int | None, tmp_path: Path

@@ -256,7 +256,7 @@ MISSING = "bag_1.mcap: named in metadata.yaml and missing"
 
 
 @pytest.mark.parametrize(
-    ("names", "metadata", "note"),
+    "names, metadata, note",
     [
         (["bag_0.mcap", "", "bag_2.mcap"], True, MISSING),
         (["", "bag_1.mcap", "bag_2.mcap"], True, MISSING.replace("_1", "_0")),

@@ -53,7 +53,7 @@ def test_topics_selected_by_full_or_last_name_and_start_by_flight_time(run: Path
 
 
 @pytest.mark.parametrize(
-    ("topics", "start", "sentence"),
+    "topics, start, sentence",
     [
         (
             ["y", "z"],
@@ -163,7 +163,7 @@ def test_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("durability", "depth", "early"),
+    "durability, depth, early",
     [("transient_local", 1, 1), (1, 3, 2), ("volatile", 1, 0), (1, 20_000, 0)],
 )
 def test_start_in_the_middle_sends_latched_messages_first(

@@ -49,7 +49,7 @@ def test_wait_ends_at_deadline_or_at_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("period_ns", "spin_time"), [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)]
+    "period_ns, spin_time", [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)]
 )
 def test_busy_wait_before_deadline_limited_to_fraction_of_period(
     period_ns: int, spin_time: float, monkeypatch: pytest.MonkeyPatch

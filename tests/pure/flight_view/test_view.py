@@ -168,7 +168,7 @@ def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Pat
     assert flight.state() == "ended"
 
 
-@pytest.mark.parametrize(("backlog", "state"), [(0, "reading"), (10**9, "recording")])
+@pytest.mark.parametrize("backlog, state", [(0, "reading"), (10**9, "recording")])
 def test_long_logs_read_in_slices(
     backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -349,7 +349,7 @@ def test_background_in_plane_of_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("geometries", "members", "sentence"),
+    "geometries, members, sentence",
     [
         (
             [LINE],
@@ -449,7 +449,7 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "method", "headers", "expected"),
+    "path, method, headers, expected",
     [
         ("/", "GET", {"Host": "evil.example"}, 403),
         ("/", "GET", {"Host": "127.0.0.1.evil.example"}, 403),
@@ -634,7 +634,7 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "headers", "expected"),
+    "path, headers, expected",
     [
         ("/news/0", {"Host": "evil.example"}, 403),
         ("/news/0", {"Origin": "http://evil.example"}, 403),

@@ -172,7 +172,7 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
 
 
 @pytest.mark.parametrize(
-    ("name", "effector", "channel"),
+    "name, effector, channel",
     [
         ("osprey_twin", "left_elevator", "q"),
         ("osprey_vtail", "left_aileron", "p"),
@@ -211,7 +211,7 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         ({"T": [1.0] * 15}, "allocation.T: found 15 values, expected 16: 4 rows of 4"),
         ({"effect": [1.0] * 16}, "allocation.T: found effect T that is off I"),

@@ -172,7 +172,7 @@ def test_signs_of_omega_are_as_built(task: Task) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sign", "largest", "low", "high"),
+    "sign, largest, low, high",
     [
         # Measured with 74 aircraft: ratios 3.98 to 4.00, so 3 % is ten times their scatter and
         # excludes any other order. The ultimate bound at 8 ms is 2e-5 to 1.3e-3, for signals of

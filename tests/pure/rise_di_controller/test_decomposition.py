@@ -170,7 +170,7 @@ def test_omega_without_s_d_u_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("Omega", "minor"),
+    "Omega, minor",
     [
         ([[0.0, 0.0], [0.0, 0.0]], 1),
         ([[1e-17, 1.0], [1.0, 0.0]], 1),  # zero up to rounding
@@ -193,7 +193,7 @@ def test_minor_zero_by_rounding_refused(Omega: list[list[float]], minor: int, un
 
 
 @pytest.mark.parametrize(
-    ("Omega", "sentence"),
+    "Omega, sentence",
     [
         (np.ones((1, 3)), r"Omega: found shape \(1, 3\), expected as many outputs as inputs"),
         (np.array([[math.nan]]), r"Omega: found \[\[nan\]\], expected finite values"),

@@ -17,7 +17,7 @@ LEARNED = np.array([True])
 
 
 @pytest.mark.parametrize(
-    ("errors", "expected"),
+    "errors, expected",
     [
         ((0.02, 0.01), False),  # twice the largest before, but small
         ((0.2, 0.07), False),  # less than three times
@@ -98,7 +98,7 @@ def test_wind_and_small_oscillations_are_none(e: FloatArray) -> None:
     assert flown(e).periods == [0.0]
 
 
-@pytest.mark.parametrize(("amplitude", "expected"), [(0.05, True), (0.02, False)])
+@pytest.mark.parametrize("amplitude, expected", [(0.05, True), (0.02, False)])
 def test_record_oscillates_by_more_than_is_harmless(amplitude: float, expected: bool) -> None:
     """Harmless is an rms of 0.02 rad/s, an amplitude of 0.028."""
     y = np.stack(

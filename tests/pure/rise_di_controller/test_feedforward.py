@@ -248,7 +248,7 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    "change, sentence",
     [
         (
             {"A": (1.0,) * 15},

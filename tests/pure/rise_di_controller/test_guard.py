@@ -157,7 +157,7 @@ def test_new_sample_is_step_of_law() -> None:
     assert second.u.tolist() == u.tolist()
 
 
-@pytest.mark.parametrize(("gap_ms", "dt_ms"), [(1, 2), (25, 25), (80, 80), (200, 100)])
+@pytest.mark.parametrize("gap_ms, dt_ms", [(1, 2), (25, 25), (80, 80), (200, 100)])
 def test_measured_dt_clipped_between_fifth_and_ten_periods(gap_ms: int, dt_ms: int) -> None:
     (engaged,) = run((0, sample(0, 1.0), [sample(0)]))
     _, inputs = tick(engaged, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])

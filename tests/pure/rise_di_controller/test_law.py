@@ -144,7 +144,7 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "change", "beyond", "expected"),
+    "before, after, change, beyond, expected",
     [
         (1.0, 3.0, 0.5, 0.2, 2.2),  # 0.2 of 0.5 beyond: 60 % of the increment of 2 are kept
         (1.0, 3.0, -0.5, -0.2, 2.2),

@@ -83,7 +83,7 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(
     assert config.outputs[channel] in lost[0]
 
 
-@pytest.mark.parametrize(("channel", "bound"), [(0, 34.9066), (3, 340.0)])
+@pytest.mark.parametrize("channel, bound", [(0, 34.9066), (3, 340.0)])
 def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> None:
     """2000 deg/s, the range of a gyro, and the speed of sound: of y and of y_m, so that the law
     never engages with more.

@@ -84,7 +84,7 @@ def aileron_flight(*, guarded: bool) -> Tape:
 
 
 @pytest.mark.parametrize(
-    ("guarded", "wrong_way", "recovered", "commanded"),
+    "guarded, wrong_way, recovered, commanded",
     [
         # Measured 0.0422 rad/s, 0.58 s, 5.3 deg. The prototype, with unknown timing: conditional
         # integration 0.041, 0.65 s, 5.7 deg; back-calculation 0.058, 0.65 s, 6.3 deg.

@@ -61,7 +61,7 @@ def y_at(V: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("V", "scale"),
+    "V, scale",
     [
         (0.0, 1.0),
         (SPEED, 0.3),

@@ -163,7 +163,7 @@ def test_other_models_at_another_speed_leave_u_as_it_is(scheduled: RiseDiConfig,
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         (
             {"slow": None},
@@ -255,7 +255,7 @@ def test_learned_models_of_all_speeds_fly_and_go_back_at_once(
 
 
 @pytest.mark.parametrize(
-    ("name", "factor", "sentence"),
+    "name, factor, sentence",
     [
         (
             "schedule.fast.F",
