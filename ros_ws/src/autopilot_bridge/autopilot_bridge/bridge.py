@@ -20,6 +20,7 @@ from autopilot_bridge.map_rows import ConditionRow, InputRow, MeasuredRow, Outpu
 from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_core.text import sentences
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
 UNBOUNDED = (
@@ -243,14 +244,14 @@ class Bridge:
             for name, row in conditions
             if row.awaited is awaited and not (row.transmitter and self._blind)
         )
-        return "; ".join(filter(None, (self._violation(name, row, now_ns) for name, row in rows)))
+        return sentences(*(self._violation(name, row, now_ns) for name, row in rows))
 
     def _lost(self, now_ns: int) -> str:
         """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence;
         empty where it is.
         """
         unmet = (self._unmet(now_ns, awaited=awaited) for awaited in (False, True))
-        return "; ".join(filter(None, (self.conflict, *unmet)))
+        return sentences(self.conflict, *unmet)
 
     def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
         reading = self._conditions.get(name)
@@ -327,9 +328,7 @@ class Bridge:
             if ends
             else ""
         )
-        return "; ".join(
-            filter(None, (warning, self.problem, self._silent_overrides(now_ns), self._blindness()))
-        )
+        return sentences(warning, self.problem, self._silent_overrides(now_ns), self._blindness())
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -366,12 +365,10 @@ class Bridge:
             lambda _: self._outside(),
             lambda _: self._outside("engage_if"),
             lambda _: self._away_from_trim(),
-            lambda _: "; ".join(filter(None, map(self._beyond_range, self.channel_map.trims))),
+            lambda _: sentences(*map(self._beyond_range, self.channel_map.trims)),
         )
         dry_run = "dry_run is true: nothing is sent" if self.dry_run else ""
-        return "; ".join(
-            filter(None, (dry_run, next(filter(None, (check(now_ns) for check in checks)), "")))
-        )
+        return sentences(dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))
 
     def _unfit_parameters(self) -> str:
         """The parameters of the autopilot with which the bridge does not engage, as a sentence."""
@@ -400,9 +397,7 @@ class Bridge:
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
-        return "; ".join(
-            filter(None, (_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns)))
-        )
+        return sentences(_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns))
 
     def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
@@ -502,9 +497,7 @@ class Bridge:
         elif self.phase is Phase.ENGAGED:
             measured = _sentence(self.stale(now_ns))
             cause = self.problem if measured else ""
-            reasons = (
-                "; ".join(filter(None, (self._lost(now_ns), measured, cause))) or self._outside()
-            )
+            reasons = sentences(self._lost(now_ns), measured, cause) or self._outside()
             if ended := reasons or self._does_not_answer(now_ns):
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):

@@ -29,6 +29,7 @@ from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
+from flight_core.text import sentences
 from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
@@ -180,7 +181,7 @@ class Link:
         engagement works.
         """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
-        return "; ".join(filter(None, (self._clash, second)))
+        return sentences(self._clash, second)
 
     def listen(self, name: str) -> deque[ReceivedMessage]:
         """The queue in which messages of a name arrive."""
@@ -214,7 +215,7 @@ class Link:
                 f"no message of system {self._config.system} over {self._config.url} for "
                 f"{SILENCE:g} s"
             )
-            return "; ".join(filter(None, (silence, self._refused, self.conflict)))
+            return sentences(silence, self._refused, self.conflict)
         names = [name] if name else list(self._config.rates)
         slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
         refusals = {
@@ -225,7 +226,7 @@ class Link:
             for message, sentence in refusals.items()
             if not self._rates.comes(message, now)
         ]
-        return "; ".join(filter(None, [self.conflict, *slow, *denied, *([TAKEN] if slow else [])]))
+        return sentences(self.conflict, *slow, *denied, *([TAKEN] if slow else []))
 
     def refusal(self) -> str:
         """Why an engagement would not have the rates of the map, as a sentence."""
@@ -250,7 +251,7 @@ class Link:
             if is_silent
             else ""
         )
-        return "; ".join(filter(None, (self._rates.lasting(now), station)))
+        return sentences(self._rates.lasting(now), station)
 
     def station(self) -> str:
         """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a

@@ -42,7 +42,7 @@ from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
-from flight_core.text import bounded
+from flight_core.text import bounded, sentences
 from flight_core.vectors import ChannelError
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
@@ -544,7 +544,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         bridge.conflict = self._conflict
         if link is None:
             return
-        bridge.conflict = "; ".join(filter(None, (self._conflict, link.conflict, link.lost())))
+        bridge.conflict = sentences(self._conflict, link.conflict, link.lost())
         bridge.problem = link.refusal()
         for name, value in tuple(link.parameters.items()):
             bridge.take_parameter(name, value)

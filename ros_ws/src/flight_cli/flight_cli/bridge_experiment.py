@@ -26,6 +26,7 @@ from flight_core.files import display_path, link_latest, write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
+from flight_core.text import sentences
 from flight_design.gains.requirement import Requirement
 from flight_design.identification.bridge_identification import (
     Channels,
@@ -91,18 +92,7 @@ def identify_behind_bridge(
     try:
         trims, response, channels = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
-        raise ParameterError("; ".join(filter(None, (str(error), ended)))) from None
-    if COMMANDS in tape:
-        later = channel_map.link_delay if link_delay is None else link_delay
-        channels = over_link(channels, later or 0.0)
-        _show_link(console, channel_map, later)
-    else:
-        require(
-            link_delay is None,
-            "link_delay",
-            link_delay,
-            "a log of rise-di import: an experiment over the link contains its delay",
-        )
+        raise ParameterError(sentences(str(error), ended)) from None
     channel_map, narrower = within_range(channel_map, trims)
     for sentence in narrower:
         say(console, sentence)

@@ -21,3 +21,8 @@ def bounded(text: str) -> str:
     if len(text) > MAX_LENGTH:
         text = f"{text[: MAX_LENGTH // 2]} ... {text[5 - MAX_LENGTH // 2 :]}"
     return printable(text)
+
+
+def sentences(*parts: str) -> str:
+    """The parts that are not empty, as one text."""
+    return "; ".join(filter(None, parts))

@@ -35,6 +35,7 @@ from flight_analysis.report.summary import (
 )
 from flight_core.modes import Mode
 from flight_core.tape import Tape
+from flight_core.text import sentences
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
@@ -253,9 +254,7 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
                 *map(format_value, (quantity[name] for name in metrics), factors),
             ]
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
-    legend = (
-        "; ".join(filter(None, [leg_results(guidance["legs"]), GUIDANCE_LEGEND])) if rows else ""
-    )
+    legend = sentences(leg_results(guidance["legs"]), GUIDANCE_LEGEND) if rows else ""
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
 
 
