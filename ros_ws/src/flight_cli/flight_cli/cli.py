@@ -23,7 +23,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.words import Command, Commands
+from flight_cli.words import Command
 
 FAILED = 1
 BAD_INPUT = 2
@@ -109,7 +109,7 @@ def application(words: Collection[str]) -> typer.Typer:
     """The command line with the commands among the words; further commands have name and help
     alone.
     """
-    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, cls=Commands)
+    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
     app.callback()(_options)
     for group, commands in GROUPS.items():
         for name, sentence in commands.items():

@@ -1,15 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of a command line: settings of a command by --set, and the new name of a removed
-command or option.
-"""
+"""The words of a command line: options with their help, and settings of a command by --set."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 from flight_core.parameters import ParameterError, require
 
@@ -34,37 +31,14 @@ def argument(text: str, **rules: Any) -> Any:
 AsJson = Annotated[bool, option("Print the result as JSON, nothing else.", "--json")]
 Namespace = Annotated[str, option("Namespace of the aircraft.")]
 """Options of several commands."""
-GONE = MappingProxyType(
-    {
-        "airframe": "rise-di airframes FILE --write FOLDER",
-        "check-map": "rise-di check MAP --definitions FOLDER",
-        "check-signs": "rise-di check MAP",
-        "fleet": "rise-di fly FILE",
-        "flightgear": "rise-di watch --flightgear HOST:PORT",
-        "guidance": "rise-di guide, as in: rise-di guide hold",
-        "repair": "rise-di report RUN --repair",
-        "target": "rise-di guide, as in: rise-di guide heading=90",
-        "check --bag": "--run",
-        "campaign --resume": "rise-di campaign FOLDER",
-        "fly --composed": "--set composed",
-        "fly --one-process": "--lockstep --set composed",
-        "identify --log": "rise-di identify RUN",
-        "identify --output": "--write",
-        "layouts --fleet": "rise-di layouts FILE",
-        "watch --control-real": "--control --set real",
-    }
-)
-"""The new name of a removed command, or of a removed option of a command."""
 
 
 class Command(TyperCommand):
-    """A command with settings beside options, and a sentence for a removed option."""
+    """A command with settings beside options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name. Raises ParameterError for a removed option and an unknown
-        setting.
-        """
-        return super().parse_args(ctx, [*_joined(self.name or "", args, self._spellings())])
+        """Parse the words after the name. Raises ParameterError for an unknown setting."""
+        return super().parse_args(ctx, [*_joined(args, self._spellings())])
 
     def invoke(self, ctx: Any) -> Any:
         """Call the function. Raises ParameterError with the spelling of the option for the key."""
@@ -89,16 +63,7 @@ class Command(TyperCommand):
         }
 
 
-class Commands(TyperGroup):
-    """Commands by name, and a sentence for a removed command."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command of the first word. Raises ParameterError for a removed command."""
-        require(args[0] not in GONE, args[0], "a command that is gone", GONE.get(args[0], ""))
-        return super().resolve_command(ctx, args)
-
-
-def _joined(command: str, args: Sequence[str], spellings: Mapping[str, str]) -> Iterator[str]:
+def _joined(args: Sequence[str], spellings: Mapping[str, str]) -> Iterator[str]:
     """The words, a setting joined to a single word; further words of --set stay where the command
     has this option.
     """
@@ -118,12 +83,6 @@ def _joined(command: str, args: Sequence[str], spellings: Mapping[str, str]) -> 
                 yield from (SET, text)
         else:
             name = option.removeprefix("--").replace("-", "_")
-            for key in settings & {name, f"route.{name}"} if option.startswith("--") else ():
-                require(False, option, "an option that is gone", f"{SET} {key}")
-            require(
-                f"{command} {option}" not in GONE,
-                option,
-                "an option that is gone",
-                GONE.get(f"{command} {option}", ""),
-            )
+            spelled = settings & {name, f"route.{name}"} if option.startswith("--") else set()
+            require(not spelled, option, "no option", f"{SET} {min(spelled, default='')}")
             yield word
