@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of an aircraft that `rise-di identify` identified by step tests."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
+from flight_analysis.report.summary import display_unit
+from flight_cli.gains import speed_of_margin
+from flight_cli.output import new_table, say
+from flight_core.units import si_per_unit
+from flight_design.identification.step_identification import IdentifiedAircraft
+
+LINEAR = (
+    0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
+)
+
+
+def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
+    """Print the trim, the responses, the gains and the flights of an aircraft."""
+    trim = identified.trim
+    steps = identified.responses
+    states = dict(zip(STATES, trim.states, strict=True))
+    degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
+    say(
+        console,
+        f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude "
+        f"{states['altitude']:.5g} m, "
+        + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
+        + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
+        f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
+    )
+    stops = new_table(
+        "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
+    )
+    columns = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
+    responses = new_table(
+        "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns
+    )
+    for j, name in enumerate(INPUTS):
+        stops.add_row(
+            name,
+            *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])),
+        )
+        column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
+        responses.add_row(
+            name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{identified.D[j]:+d}"
+        )
+    console.print(stops)
+    console.print(responses)
+    for name, spread in zip(INPUTS, steps.spread, strict=True):
+        if spread < LINEAR:
+            differ = f"the slopes of its steps differ by a factor of {1.0 / spread:.2g}"
+            console.print(f"{name} is not linear: {differ}; the largest is used")
+    for sentence in steps.rejected:
+        say(console, f"rejected: {sentence}")
+
+    _show_gains(console, identified)
+    _show_flights(console, identified)
+
+
+def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
+    steps = identified.responses
+    answer = identified.selection.engineering
+    controller = answer.controller
+    params = answer.controller.law_params()
+    headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
+    table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings)
+    for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
+        response = (
+            abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)])
+            * params.input_scale[i]
+        )
+        figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
+        table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
+    console.print(table)
+    margin = (
+        "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
+    )
+    if answer.delay_margin:
+        margin += f", {speed_of_margin(identified.selection.study, answer)}"
+    if identified.sideslip_zero > 0.0:
+        say(
+            console,
+            f"with p and r constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s:"
+            " a zero in the right half plane, outside the theorem; the sideslip feedback of "
+            "--guidance flies it",
+        )
+    sign = controller.sampled_sign()[0].name.lower()
+    say(console, f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}")
+
+
+def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
+    headings = [f"{name}\n{display_unit(unit).unit}" for name, unit in OUTPUTS.items()]
+    alone = ", with the gains alone" if identified.scenario().rise_di().learn is not None else ""
+    flights = new_table(
+        f"\nFlights of 60 s in one process{alone}: rms of the error",
+        ["flight", *headings, "outcome"],
+        ("flight", "outcome"),
+        ("outcome",),
+    )
+    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS])
+    for title, flight in identified.flights.items():
+        errors = [
+            f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()
+        ]
+        flights.add_row(title, *errors, flight.text)
+        largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
+    console.print(flights)
+    console.print(largest)
+
+
+def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, Any]:
+    """What the step tests gave, SI."""
+    trim = identified.trim
+    steps = identified.responses
+    by_input = {
+        name: {
+            "trim": float(trim.commands[j]),
+            "lower": float(trim.lower[j]),
+            "upper": float(trim.upper[j]),
+            "step": float(steps.size[j]),
+            "spread": float(steps.spread[j]),
+            "Omega": dict(zip(OUTPUTS, steps.Omega[:, j].tolist(), strict=True)),
+            "lag": float(steps.lag[j]),
+            "D": identified.D[j],
+        }
+        for j, name in enumerate(INPUTS)
+    }
+    return {
+        "airframe": identified.condition.title,
+        "speed": identified.condition.speed,
+        "altitude": identified.condition.altitude,
+        "trim": dict(zip(STATES, trim.states.tolist(), strict=True)),
+        "residuals": dict(zip(RESIDUALS, trim.residuals.tolist(), strict=True)),
+        "inputs": by_input,
+        "rejected": list(steps.rejected),
+        "coupling": identified.coupling,
+        "sideslip_zero": identified.sideslip_zero,
+        "lost": identified.failure,
+        "delay_margin": identified.selection.engineering.delay_margin,
+        "controller": identified.scenario().controller.model_dump(exclude_defaults=True),
+        "flights": {title: flight._asdict() for title, flight in identified.flights.items()},
+        "scenario": str(path),
+    }
