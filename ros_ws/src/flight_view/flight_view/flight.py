@@ -6,10 +6,9 @@ recording.
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import IntEnum
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
@@ -20,15 +19,10 @@ from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
-from flight_analysis.metrics import ModelSpan, known_entries, settling_bands
-from flight_analysis.report.guided import mission_drawing
+from flight_analysis.metrics import known_entries, settling_bands
 from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.summary import (
-    NO_UNIT,
     display_unit,
-    display_units,
-    model_rows,
-    pulse_edges,
 )
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
@@ -36,9 +30,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
-from flight_guidance import guidance_state
 from flight_guidance.odometry import ROUTE_FRAMES
-from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
 from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE, full_names
 from flight_log.disk import is_locked
@@ -57,6 +49,7 @@ from flight_log.named_vectors import (
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
 from flight_view.background import Line
+from flight_view.description import MODES, Flown, described, mission, rms_by_model
 from flight_view.series import Series
 
 LEARNED = "learned"  # entries of A and B, as identified in flight
@@ -132,16 +125,6 @@ class _Topic:
     columns: NDArray[np.intp] | None = None  # of the kept channels
 
 
-class _Flown(NamedTuple):
-    """Successive ticks under the same parameters of the controller."""
-
-    digest: float
-    start_ns: int
-    stop_ns: int
-    ticks: int  # engaged
-    squares: Mapping[str, float]  # of these, sums of e^2 by output
-
-
 class Flight:
     """A flight in a log. `update` reads new messages.
 
@@ -164,17 +147,11 @@ class Flight:
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[PageEvent] = []
-        modes = {
-            "": Mode,
-            "mode": guidance_state.Mode,
-            "mode.lateral": guidance_state.Lateral,
-            "mode.vertical": guidance_state.Vertical,
-        }
-        # What a page shows beside the samples, ready for JSON: the names of modes; `_described`
+        # What a page shows beside the samples, ready for JSON: the names of modes; `described`
         # once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
-            "modes": {channel: _mode_names(kind) for channel, kind in modes.items()},
+            "modes": MODES,
             "background": background,
         }
         self.notes: list[str] = []
@@ -193,7 +170,7 @@ class Flight:
         self._first_ns: int | None = None
         self._mode = -1
         self._banded = 0  # rows of internals behind the bands
-        self._flown: list[_Flown] = []
+        self._flown: list[Flown] = []
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
@@ -253,23 +230,7 @@ class Flight:
         """
         if LEARNED not in self.samples or not self._flown:
             return {}
-        digests = list(dict.fromkeys(span.digest for span in self._flown))
-        ends_ns = [*(span.start_ns for span in self._flown[1:]), self._flown[-1].stop_ns]
-        spans = []
-        for span, stop_ns in zip(self._flown, ends_ns, strict=True):
-            start, stop = (
-                (stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns)
-            )
-            if span.ticks:
-                rms = {
-                    name: math.sqrt(square / span.ticks) for name, square in span.squares.items()
-                }
-                spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
-        units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | (
-            {} if self.scenario is None else display_units(self.scenario)
-        )
-        headings, rows = model_rows(spans, units)
-        return {"headings": ["", *headings], "rows": rows}
+        return rms_by_model(self._flown, self.start_ns, self.scenario)
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
@@ -405,7 +366,7 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            self.description |= _described(
+            self.description |= described(
                 self.scenario
             )  # reads the airframe, maybe a file of another machine
         except ParameterError as error:
@@ -511,7 +472,7 @@ class Flight:
             stop_ns = int(stamp_ns[rows[-1]])
             counted = rows[engaged[rows]]
             squares = {name: float(np.sum(e[counted] ** 2)) for name, e in errors.items()}
-            span = _Flown(digest, start_ns, stop_ns, len(counted), squares)
+            span = Flown(digest, start_ns, stop_ns, len(counted), squares)
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}
@@ -590,7 +551,7 @@ class Flight:
         if guided is None:
             return
         try:
-            self.description |= _mission(guided, waypoints)
+            self.description |= mission(guided, waypoints)
         except ParameterError:
             return  # guidance says so in the log
         self.described += 1
@@ -632,45 +593,3 @@ def _shown(value: Any) -> str:
 def _text(text: str) -> str:
     """A text from the log: printable and of bounded length."""
     return printable(text)[:MAX_TEXT]
-
-
-def _mode_names(modes: type[IntEnum]) -> dict[str, str]:
-    """The names of modes by number, as text."""
-    return {str(int(mode)): mode.name for mode in modes}
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _described(scenario: Scenario) -> dict[str, Any]:
-    """Units, what a positive input does, limits, gusts, commands and route of a scenario.
-
-    Raises ParameterError where the airframe cannot be read.
-    """
-    controller = scenario.controller
-    guided = scenario.guidance
-    limits = controller.effector_limits()
-    bounds = zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True)
-    waypoints = () if guided is None else guided.waypoints()
-    return {
-        "scenario": controller.summary(),
-        "duration": scenario.flight.duration,
-        "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
-        "positive": scenario.aircraft.channels().positive,
-        "limits": {name: [*map(_finite_or_none, pair)] for name, *pair in bounds},
-        "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
-        "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
-        "speed": scenario.aircraft.channels().speed,
-        **({"route": []} if guided is None else _mission(guided, waypoints)),
-    }
-
-
-def _mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north,
-    east, altitude, m.
-
-    Raises ParameterError for a route that cannot be flown.
-    """
-    drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
-    return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the page shows of a scenario beside the samples, ready for JSON."""
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import ModelSpan
+from flight_analysis.report.guided import mission_drawing
+from flight_analysis.report.summary import NO_UNIT, display_units, model_rows, pulse_edges
+from flight_core.modes import Mode
+from flight_core.rates import NANOSECONDS
+from flight_guidance import guidance_state
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.route_file import Waypoint
+
+KINDS: dict[str, type[IntEnum]] = {
+    "": Mode,
+    "mode": guidance_state.Mode,
+    "mode.lateral": guidance_state.Lateral,
+    "mode.vertical": guidance_state.Vertical,
+}
+MODES = {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in KINDS.items()}
+"""Names of the modes of the controller and of guidance by channel and number."""
+
+
+class Flown(NamedTuple):
+    """Successive ticks under the same parameters of the controller."""
+
+    digest: float
+    start_ns: int
+    stop_ns: int
+    ticks: int  # engaged
+    squares: Mapping[str, float]  # of these, sums of e^2 by output
+
+
+def rms_by_model(
+    flown: Sequence[Flown], start_ns: int, scenario: Scenario | None
+) -> dict[str, Any]:
+    """Headings and rows of the rms of the measured error by model, from the ticks of a flight."""
+    digests = list(dict.fromkeys(span.digest for span in flown))
+    ends_ns = [*(span.start_ns for span in flown[1:]), flown[-1].stop_ns]
+    spans = []
+    for span, stop_ns in zip(flown, ends_ns, strict=True):
+        start, stop = ((stamp_ns - start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
+        if span.ticks:
+            rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
+            spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
+    known = {} if scenario is None else display_units(scenario)
+    headings, rows = model_rows(spans, dict.fromkeys(flown[0].squares, NO_UNIT) | known)
+    return {"headings": ["", *headings], "rows": rows}
+
+
+def _finite_or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def described(scenario: Scenario) -> dict[str, Any]:
+    """Units, what a positive input does, limits, gusts, commands and route of a scenario.
+
+    Raises ParameterError where the airframe cannot be read.
+    """
+    controller = scenario.controller
+    guided = scenario.guidance
+    limits = controller.effector_limits()
+    bounds = zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True)
+    waypoints = () if guided is None else guided.waypoints()
+    return {
+        "scenario": controller.summary(),
+        "duration": scenario.flight.duration,
+        "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
+        "positive": scenario.aircraft.channels().positive,
+        "limits": {name: [*map(_finite_or_none, pair)] for name, *pair in bounds},
+        "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
+        "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
+        "speed": scenario.aircraft.channels().speed,
+        **({"route": []} if guided is None else mission(guided, waypoints)),
+    }
+
+
+def mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
+    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north,
+    east, altitude, m.
+
+    Raises ParameterError for a route that cannot be flown.
+    """
+    drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
+    return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}
