@@ -10,6 +10,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import refusing
 
 from aircraft_sim.airframe import Airframe, airframes, check_identities, load_airframe
@@ -201,9 +202,7 @@ def test_height_is_a_state() -> None:
         [-0.05, -3.0, 0.98, 0.0, 0.0],
         [0.0, -46.0, -3.6, 0.0, 0.0],
     ]
-    np.testing.assert_allclose(
-        A, [*expected, [0.0, 0.0, 1.0, 0.0, 0.0], [0.0, -V0, 0.0, V0, 0.0]], atol=1e-12
-    )
+    assert_allclose(A, [*expected, [0.0, 0.0, 1.0, 0.0, 0.0], [0.0, -V0, 0.0, V0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -263,10 +262,10 @@ def test_output_of_body_axes_has_the_transfer_function_of_stability_axes() -> No
         control.ss(frame.matrix_a(), frame.matrix_b(), frame.matrix_c(), np.zeros((2, 2)))(1j)
         for frame in (body, stability)
     ]
-    np.testing.assert_allclose(responses[0], responses[1], rtol=1e-9)
+    assert_allclose(responses[0], responses[1], rtol=1e-9)
     plant = control.ss(body.matrix_a(), body.matrix_b(), body.matrix_c(), np.zeros((2, 2)))
     facts = airframe_facts(body)
-    np.testing.assert_allclose(facts.zeros, np.sort_complex(control.zeros(plant)), atol=1e-6)
+    assert_allclose(facts.zeros, np.sort_complex(control.zeros(plant)), atol=1e-6)
     assert facts.outputs == ("q", "V")
     assert facts.integrated == ("theta",)
 
@@ -274,15 +273,15 @@ def test_output_of_body_axes_has_the_transfer_function_of_stability_axes() -> No
 def test_coordinates_of_selected_states_are_the_states() -> None:
     C = load_airframe("osprey").matrix_c()
     P, N, H = output_coordinates(C)
-    np.testing.assert_array_equal(P, C.T)
-    np.testing.assert_array_equal(N, H)
-    np.testing.assert_array_equal(H, np.eye(8)[:, ~C.any(axis=0)])
+    assert_array_equal(P, C.T)
+    assert_array_equal(N, H)
+    assert_array_equal(H, np.eye(8)[:, ~C.any(axis=0)])
 
 
 def test_coordinates_rebuild_the_state() -> None:
     C = airframe(body_axes()[0]).matrix_c()
     P, N, H = output_coordinates(C)
     x = np.array([1.0, -2.0, 0.3, 0.7])
-    np.testing.assert_allclose(P @ (C @ x) + N @ (H.T @ x), x, rtol=1e-12)
+    assert_allclose(P @ (C @ x) + N @ (H.T @ x), x, rtol=1e-12)
     with refusing("independent outputs"):
         output_coordinates(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))

@@ -13,6 +13,7 @@ import pytest
 import scipy.io
 import scipy.signal
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import REPOSITORY, refusing
 from typer.testing import CliRunner
 
@@ -105,12 +106,12 @@ def tool_file(folder: Path, name: str, text: str) -> Path:
 def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
     frame, _ = import_airframe(system, thrust=True, **NAMES)
     library = load_airframe("navion_longitudinal")
-    np.testing.assert_allclose(frame.matrix_a(), library.matrix_a(), rtol=1e-12, atol=0.0)
-    np.testing.assert_allclose(
+    assert_allclose(frame.matrix_a(), library.matrix_a(), rtol=1e-12, atol=0.0)
+    assert_allclose(
         frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0
     )  # g of 32.2 ft/s^2 in the thrust
     assert frame.speed == pytest.approx(library.speed)
-    np.testing.assert_allclose(
+    assert_allclose(
         frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12
     )  # alpha_0 is 0 in stability axes
     assert frame.outputs == ("q", "V")
@@ -119,9 +120,7 @@ def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
 def test_gusts_are_minus_the_columns_of_the_flow() -> None:
     """W. MacKunis et al. 2010 take the gust as minus the column of alpha; w is V0 alpha."""
     frame, _ = import_airframe(SYSTEM, thrust=True, **NAMES)
-    np.testing.assert_allclose(
-        frame.gust_direction("vertical")[:3], -frame.matrix_a()[:3, 1], rtol=1e-4
-    )
+    assert_allclose(frame.gust_direction("vertical")[:3], -frame.matrix_a()[:3, 1], rtol=1e-4)
     assert "theta" not in frame.gusts["vertical"]
 
 
@@ -180,7 +179,7 @@ def test_matlab_file_carries_names(tmp_path: Path) -> None:
     group, _ = import_airframe(tmp_path / "group.mat", **given, inputs="elevator: rad nose down")
     assert note == "A and B of flat.mat"
     assert flat.name == "flat"
-    np.testing.assert_array_equal(flat.matrix_a(), group.matrix_a())
+    assert_array_equal(flat.matrix_a(), group.matrix_a())
 
 
 def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
@@ -203,7 +202,7 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
         [4.488, -0.350, -0.760, 0.0],
         [0.0, 1.0, 0.0, 0.0],
     ]
-    np.testing.assert_allclose(lateral, printed, rtol=0.03, atol=1e-9)
+    assert_allclose(lateral, printed, rtol=0.03, atol=1e-9)
     entry = {(row, column): matrix[x.index(row), x.index(column)] for row in x for column in x}
     assert entry["V", "V"] == pytest.approx(-0.045, rel=0.02)
     assert entry["alpha", "V"] * 176.0 * 0.3048 == pytest.approx(
@@ -212,7 +211,7 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
     assert entry["alpha", "alpha"] == pytest.approx(-2.02, rel=0.02)
     assert entry["q", "alpha"] == pytest.approx(-8.8, rel=0.02)  # M_alpha, p. 153
     assert entry["q", "q"] == pytest.approx(-2.05, rel=0.03)
-    np.testing.assert_allclose(
+    assert_allclose(
         frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005
     )  # by hand: q S c C_m / I_y
     assert frame.inputs["elevator"].unit == "deg"
@@ -269,7 +268,7 @@ def test_avl_system_matrix_has_the_published_eigenvalues(tmp_path: Path, axes: f
     """The same user prints AVL's eigenvalues: -9.466 +-3.209j, -0.1385 +-0.668j, 6.824 m/s."""
     frame, _ = import_airframe(tool_file(tmp_path, "supra.txt", supra(axes)), speed=6.824)
     poles = np.linalg.eigvals(frame.matrix_a()[:4, :4])
-    np.testing.assert_allclose(
+    assert_allclose(
         np.sort_complex(poles),
         [-9.4662 - 3.2089j, -9.4662 + 3.2089j, -0.1385 - 0.668j, -0.1385 + 0.668j],
         atol=2e-3,
@@ -309,8 +308,8 @@ def test_xflr5_log_gives_both_motions(tmp_path: Path) -> None:
     )  # fmt: skip
     frame, note = import_airframe(tool_file(tmp_path, "plane.log", log))
     assert frame.speed == pytest.approx(25.0, rel=1e-4)
-    np.testing.assert_allclose(frame.matrix_a()[4:, 4:], lateral, rtol=1e-5)
-    np.testing.assert_allclose(frame.matrix_b()[4:, 1], b747.matrix_b()[:, 1], rtol=1e-5)
+    assert_allclose(frame.matrix_a()[4:, 4:], lateral, rtol=1e-5)
+    assert_allclose(frame.matrix_b()[4:, 1], b747.matrix_b()[:, 1], rtol=1e-5)
     assert list(frame.inputs) == ["elevator", "rudder"]
     assert note == "XFLR5's matrices"
 
@@ -411,9 +410,7 @@ def test_command_writes_airframe_and_scenario(
     assert result.exit_code == 0
     assert "elevator (rad, positive: nose down)" in result.stdout
     read: Airframe = load_airframe("navion.yaml")
-    np.testing.assert_allclose(
-        read.matrix_a(), load_airframe("navion_longitudinal").matrix_a(), rtol=1e-12
-    )
+    assert_allclose(read.matrix_a(), load_airframe("navion_longitudinal").matrix_a(), rtol=1e-12)
     assert find_scenario("navion_flight.yaml").controller.D == (-1, 1)
 
 
@@ -449,10 +446,8 @@ def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
     text = (REPOSITORY / "docs" / "tutorials" / "textbook.md").read_text()
     page = yaml.safe_load(text.split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0])
     A = np.array(page["A"])
-    np.testing.assert_allclose(A[:3, :4], np.linalg.solve(mass, forces), rtol=0.01, atol=1e-4)
-    np.testing.assert_allclose(
-        A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4
-    )
+    assert_allclose(A[:3, :4], np.linalg.solve(mass, forces), rtol=0.01, atol=1e-4)
+    assert_allclose(A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4)
     assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == pytest.approx(
         [np.cos(theta), np.sin(theta)], abs=1e-4
     )

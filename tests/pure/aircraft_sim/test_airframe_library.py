@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_core.units import si_per_unit
@@ -102,7 +103,7 @@ def test_poles_are_the_published_ones(name: str) -> None:
 
 @pytest.mark.equation("Remark 1")
 def test_d_of_published_signs_matches_table(airframe: Airframe) -> None:
-    np.testing.assert_array_equal(airframe_facts(airframe).D, PUBLISHED[airframe.name].D)
+    assert_array_equal(airframe_facts(airframe).D, PUBLISHED[airframe.name].D)
 
 
 @pytest.mark.equation("Remark 1")
@@ -151,7 +152,7 @@ def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bo
 @pytest.mark.parametrize("name", SPLIT)
 def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse(name: str) -> None:
     facts = airframe_facts(name)
-    np.testing.assert_allclose(facts.Omega, np.eye(len(facts.outputs)), atol=1e-9)
+    assert_allclose(facts.Omega, np.eye(len(facts.outputs)), atol=1e-9)
     assert facts.in_theorem
 
 
@@ -165,11 +166,11 @@ def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
     both = np.array(
         [twin[:, 0] + twin[:, 1], twin[:, 5] + twin[:, 6], twin[:, 2] + twin[:, 3], twin[:, 4]]
     ).T
-    np.testing.assert_allclose(both, whole, atol=1e-12)
+    assert_allclose(both, whole, atol=1e-12)
     both = np.array(
         [tail[:, 0] + tail[:, 1], tail[:, 4], tail[:, 2] + tail[:, 3], tail[:, 0] - tail[:, 1]]
     ).T
-    np.testing.assert_allclose(both, whole, atol=1e-12)
+    assert_allclose(both, whole, atol=1e-12)
 
 
 def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
@@ -182,22 +183,20 @@ def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
     M_q = -q_S * 0.35714 * 1.30124 * 0.35714 / (2.0 * 18.0) / 0.165
     airframe = load_airframe("x8_elevons")
     A, rows = airframe.matrix_a(), [airframe.index("alpha"), airframe.index("q")]
-    np.testing.assert_allclose(A[rows, rows], [Z_alpha, M_q], rtol=0.01)
+    assert_allclose(A[rows, rows], [Z_alpha, M_q], rtol=0.01)
     assert A[airframe.index("q"), airframe.index("alpha")] == pytest.approx(M_alpha, rel=0.01)
 
 
 def test_zeros_of_the_osprey() -> None:
     zeros = airframe_facts(load_airframe("osprey")).zeros
     # -0.69 is Y_beta; -7.19 is Z_alpha with the elevator that holds q.
-    np.testing.assert_allclose(zeros, [-7.188, -0.69, 0.0, 0.0], atol=5e-4)
+    assert_allclose(zeros, [-7.188, -0.69, 0.0, 0.0], atol=5e-4)
 
 
 def test_minors_are_of_omega_in_si() -> None:
     facts = airframe_facts(load_airframe("f16_lateral"))
     per_degree = np.array([-0.7333, -0.7333 * -0.0620 - 0.1315 * -0.0319])
-    np.testing.assert_allclose(
-        facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12
-    )
+    assert_allclose(facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12)
 
 
 def test_the_foot_is_exact() -> None:
@@ -305,8 +304,8 @@ def test_the_aerosondes_follow_from_their_published_coefficients(
     A, B = lateral_state_space({**AEROSONDE, **coefficients})
     airframe = load_airframe(name)
     # The files keep four figures: half a unit of the fourth is at most 5e-4 of the value.
-    np.testing.assert_allclose(airframe.matrix_a(), A, rtol=5e-4, atol=1e-12)
-    np.testing.assert_allclose(airframe.matrix_b(), B, rtol=5e-4, atol=1e-12)
+    assert_allclose(airframe.matrix_a(), A, rtol=5e-4, atol=1e-12)
+    assert_allclose(airframe.matrix_b(), B, rtol=5e-4, atol=1e-12)
 
 
 def toy(k: float) -> Airframe:
@@ -342,7 +341,7 @@ def test_zero_dynamics_are_classified_by_their_zeros(
     k: float, zero: float, kind: ZeroDynamics
 ) -> None:
     facts = airframe_facts(toy(k))
-    np.testing.assert_allclose(facts.zeros, [zero], atol=1e-12)
+    assert_allclose(facts.zeros, [zero], atol=1e-12)
     assert facts.zero_dynamics is kind
     assert facts.in_theorem is (kind is not ZeroDynamics.UNSTABLE)
 
@@ -386,5 +385,5 @@ def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
         assert (
             len(found) == 4
         )  # rounding in dense coordinates must not turn infinite zeros into finite ones
-        np.testing.assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
+        assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
         assert controllable(T @ A @ np.linalg.inv(T), T @ B)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import solve_discrete_are
 from tests.builders import aircraft_parameters, rms, truth_of
 
@@ -78,7 +79,7 @@ def test_vane_reads_angle_relative_to_air() -> None:
             true["x.beta"] - true["gust.lateral"] / speed,
             true["x.alpha"] - true["gust.vertical"] / speed,
         ]
-        np.testing.assert_allclose(sample.value[4:], air, atol=1e-15)
+        assert_allclose(sample.value[4:], air, atol=1e-15)
 
 
 def test_vane_of_jsbsim_reads_its_air_angles() -> None:
@@ -157,9 +158,7 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
     S = solve_discrete_are(
         sampled.Phi.T, H.T, np.diag(np.concatenate(size) ** 2 * model.period), noise
     )
-    np.testing.assert_allclose(
-        L, S @ H.T @ np.linalg.inv(H @ S @ H.T + noise), rtol=1e-6, atol=1e-9
-    )
+    assert_allclose(L, S @ H.T @ np.linalg.inv(H @ S @ H.T + noise), rtol=1e-6, atol=1e-9)
 
 
 def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
@@ -182,12 +181,10 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
         )
 
     alone = z + params.L @ (e - params.H @ z)
-    np.testing.assert_array_equal(
-        corrected(none, [False, False]), corrected(np.ones(2), [True, True])
-    )
-    np.testing.assert_allclose(corrected(none, [False, False]), alone, rtol=1e-12)
+    assert_array_equal(corrected(none, [False, False]), corrected(np.ones(2), [True, True]))
+    assert_allclose(corrected(none, [False, False]), alone, rtol=1e-12)
     one = np.append(e - params.H @ z, (reading - params.vanes.H @ z)[1])
-    np.testing.assert_allclose(
+    assert_allclose(
         corrected(np.ones(2), [True, False]),
         alone + params.vanes.L[1] @ one,
         rtol=1e-12,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY, refusing
 from tests.other_laws import COMMON, SECTIONS, example_installed
@@ -233,7 +234,7 @@ def test_no_integral_winds_up_in_saturation(name: str) -> None:
     for group, value in fields(
         state.law
     ).items():  # the slowest filter is l1's, 4 rad/s: 5 s leave exp(-20) of a change
-        np.testing.assert_allclose(value, earlier[group], rtol=1e-7, err_msg=group)
+        assert_allclose(value, earlier[group], rtol=1e-7, err_msg=group)
     # so u leaves its limit with the first sample of the other sign, as fast as it may
     assert tick(parameters, state, 10_000, -0.5).u == pytest.approx(
         [-0.02 + 0.1 * DT] * 4, rel=1e-9
@@ -280,7 +281,7 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
     # of their rates
     _, u = law.control_law.step(state, measured, np.float64(1e-12), law.params)
     _, u_new = new.control_law.step(after, measured, np.float64(1e-12), new.params)
-    np.testing.assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
+    assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
 
 
 # Flight and replay
@@ -342,7 +343,7 @@ def test_linear_model_predicts_step_of_law(name: str) -> None:
         y = 1e-9 * generator.standard_normal(4)  # inside every softened or implicit sign
         state, u = law.control_law.step(state, at(y), np.float64(DT), law.params)
         predicted, z = linear.C @ z + linear.D @ y, linear.A @ z + linear.B @ y
-        np.testing.assert_allclose(u, predicted, rtol=1e-6, atol=1e-6 * np.abs(predicted).max())
+        assert_allclose(u, predicted, rtol=1e-6, atol=1e-6 * np.abs(predicted).max())
 
 
 def responses(name: str, parameters: Any, z: complex) -> FloatArray:
@@ -388,7 +389,7 @@ def test_linear_model_has_frequency_response_of_law(name: str) -> None:
     for omega in (0.1, 1.0, 10.0, 100.0):  # rad/s
         z = np.exp(1j * omega * DT)
         found = C @ np.linalg.solve(z * np.eye(len(A)) - A, B) + D
-        np.testing.assert_allclose(found, responses(name, parameters, z), rtol=1e-6, atol=1e-9)
+        assert_allclose(found, responses(name, parameters, z), rtol=1e-6, atol=1e-9)
 
 
 @EVERY_LAW
@@ -433,15 +434,13 @@ def test_law_is_same_under_jax(name: str) -> None:
     for measured in looks:
         many, _, u = law.control_law.limited(many, measured, np.float64(DT), params, limits)
         compiled, _, by_jax = limited(compiled, measured)
-        np.testing.assert_allclose(
-            by_jax, u, rtol=1e-9, atol=1e-12
-        )  # the order of additions differs
+        assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)  # the order of additions differs
         for k in range(3):
             one = Measurements(*(value[:, k] for value in measured[:5]))
             alone[k], _, of_one = law.control_law.limited(
                 alone[k], one, np.float64(DT), law.params, row
             )
-            np.testing.assert_allclose(u[:, k], of_one, rtol=1e-9, atol=1e-12)
+            assert_allclose(u[:, k], of_one, rtol=1e-9, atol=1e-12)
 
 
 # The observer
@@ -486,9 +485,9 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
         )
         x = x + L @ (error - H @ x)  # measurement update
         u = -min(1.0, (k + 1) * DT * 2.0) * (F @ x)
-        np.testing.assert_allclose(commanded, u, rtol=1e-9, atol=1e-12)
+        assert_allclose(commanded, u, rtol=1e-9, atol=1e-12)
         x = Phi @ x + Gamma @ u  # time update
-        np.testing.assert_allclose(state.z, x, rtol=1e-9, atol=1e-12)
+        assert_allclose(state.z, x, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", OBSERVED)
@@ -518,7 +517,7 @@ def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
     new = controller(name, observer=sections()[name]["observer"] | {"F": weaker})
     after = guard.retune(state, parameters.tuned_law(), new.tuned_law())
     assert state.law.u_o.any()
-    np.testing.assert_allclose(after.u_trim, state.u_trim + state.law.u_o, rtol=1e-12)
+    assert_allclose(after.u_trim, state.u_trim + state.law.u_o, rtol=1e-12)
     assert after.law.z.tolist() == (matrices(new).H.T @ e).tolist()
     assert not after.law.u_o.any()
     assert after.law.sigma.tolist() == [0.0]

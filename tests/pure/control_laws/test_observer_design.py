@@ -6,6 +6,7 @@ Riccati solver.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are
 
@@ -92,7 +93,7 @@ def test_step_of_aircraft_model_is_motion_of_equations() -> None:
     flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
         :, -1
     ]
-    np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
+    assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
 def test_extended_state_step_solves_equations() -> None:
@@ -110,7 +111,7 @@ def test_extended_state_step_solves_equations() -> None:
     flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
         :, -1
     ]
-    np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
+    assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])
@@ -134,11 +135,11 @@ def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
     expected = np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)
     # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit
     # circle
-    np.testing.assert_allclose(design.F, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    assert_allclose(design.F, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
     process, measured = np.diag(np.concatenate(noise) ** 2 * model.period), np.diag(model.noise**2)
     S = solve_discrete_are(Phi.T, H.T, process, measured)
     expected = S @ H.T @ np.linalg.inv(H @ S @ H.T + measured)
-    np.testing.assert_allclose(design.L, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    assert_allclose(design.L, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 def test_extended_state_observer_holds_aircraft_with_unknown_dynamics() -> None:

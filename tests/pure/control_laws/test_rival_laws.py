@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, solve_discrete_are
 from scipy.signal import lfilter
 
@@ -127,7 +128,7 @@ def test_inversion_cancels_model_and_leaves_error_own_dynamics(
     _, u = control_law.step(control_law.engage(measured, params), measured, np.array(DT), params)
     y_dot = osprey.C @ (osprey.A @ x + osprey.gravity @ np.sin(x) + osprey.B @ u)
     # e = 0.1, so e_dot = -0.1 K exactly; what is left is rounding of terms of size 10
-    np.testing.assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
+    assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
 
 
 def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -> None:
@@ -142,7 +143,7 @@ def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -
             control_law.engage(measured, params), measured, np.array(DT), params
         )[1]
     assert not u["di"].any()
-    np.testing.assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
+    assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
 def test_integral_of_inversion_rejects_constant_disturbance() -> None:
@@ -166,9 +167,7 @@ def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
         # unit circle
     ):
         expected = solve_discrete_are(estimator.Phi, estimator.Gamma, Q[k], R[k])
-        np.testing.assert_allclose(
-            found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max()
-        )
+        assert_allclose(found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
 def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps: int) -> FloatArray:
@@ -192,7 +191,7 @@ def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
     R = np.diag((0.1 / osprey.input_scale / size) ** 2)
     # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to
     # end
-    np.testing.assert_allclose(found, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
+    assert_allclose(found, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
     slow = np.sort(np.abs(np.linalg.eigvals(F - G @ found)))
     # two angles and four references decay with LEAK for any gain; all other modes of the loop are
     # faster than 0.3 1/s
@@ -294,7 +293,7 @@ def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
         y += model.period * (2.0 * u.item() + d)
     # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1
     # in 1000
-    np.testing.assert_allclose(values, values[0], rtol=1e-3)
+    assert_allclose(values, values[0], rtol=1e-3)
 
 
 def self_tuner_gains(**changes: float) -> dict[str, float]:
@@ -319,7 +318,7 @@ def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
         )
         y += DT * (A * y + Omega * u.item())
     # input scale 1 / 2; the prior is 1e8 times weaker than the signals
-    np.testing.assert_allclose(state.theta[0, :, 0], [A, Omega / 2.0, 0.0], atol=1e-4)
+    assert_allclose(state.theta[0, :, 0], [A, Omega / 2.0, 0.0], atol=1e-4)
 
 
 def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
@@ -354,7 +353,7 @@ def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
     found, *_ = np.linalg.lstsq(
         np.vstack([seen, of_step[:, None] * step]), np.append(residual, np.zeros(3 * ticks))
     )
-    np.testing.assert_allclose(state.theta[0, :, 0], nominal + found[-3:], rtol=1e-8)
+    assert_allclose(state.theta[0, :, 0], nominal + found[-3:], rtol=1e-8)
 
 
 def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalModel) -> None:
@@ -364,25 +363,19 @@ def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalM
     for _ in range(5):
         before, _ = control_law.step(before, calm, 5.0 * params.memory[0, 0], params)
     # exp(-25) of theta and exp(-50) of P are left; the bias alone is seen in calm
-    np.testing.assert_allclose(
-        before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9
-    )
-    np.testing.assert_allclose(before.P[:-1, :-1], state.P[:-1, :-1], atol=1e-12)
+    assert_allclose(before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9)
+    assert_allclose(before.P[:-1, :-1], state.P[:-1, :-1], atol=1e-12)
 
 
 def test_self_tuner_keeps_signs_and_least_size_of_effects(osprey: NominalModel) -> None:
     nu = np.array([[1.0], [2.0], [-1.0], [0.5]])
     Omega = self_tuner.nominal_theta(osprey)[:, 4:8, None]
     expected = np.linalg.solve(Omega[..., 0], nu)
-    np.testing.assert_allclose(self_tuner.solve(Omega, nu, osprey.D), expected, rtol=1e-12)
+    assert_allclose(self_tuner.solve(Omega, nu, osprey.D), expected, rtol=1e-12)
     for share in (-1.0, 0.0, 0.1):  # an estimate of the wrong sign, or too small
         wrong = share * np.eye(4)[..., None]
-        np.testing.assert_allclose(
-            self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT
-        )
-    np.testing.assert_allclose(
-        self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT
-    )
+        assert_allclose(self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT)
+    assert_allclose(self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT)
 
 
 def test_indi_needs_no_model_except_input_gain() -> None:
@@ -441,7 +434,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     for k in range(1, 6):
         state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
-    np.testing.assert_allclose(
+    assert_allclose(
         u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12
     )
 
@@ -513,5 +506,5 @@ def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
             params,
         )
         # nothing but the order of additions differs
-        np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(first, u[:, :1], rtol=1e-9, atol=1e-12)
+        assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)
+        assert_allclose(first, u[:, :1], rtol=1e-9, atol=1e-12)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy.io
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import REPOSITORY, refusing
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -83,10 +84,10 @@ def test_wrong_figure_is_told(
 def test_mat_file_has_a_structure_a_topic(flight: RecordedFlight, tmp_path: Path) -> None:
     write_mat(tmp_path / "run.mat", [flight])
     read = scipy.io.loadmat(tmp_path / "run.mat", simplify_cells=True)
-    np.testing.assert_array_equal(read["y"]["q"], flight.tape["y"]["q"])
-    np.testing.assert_array_equal(read["u"]["stamp_ns"], flight.tape["u"].stamp_ns)
-    np.testing.assert_allclose(np.diff(read["u"]["t"]), 0.01, atol=1e-9)
-    np.testing.assert_array_equal(read["internals"]["Pi_q"], flight.tape["internals"]["Pi.q"])
+    assert_array_equal(read["y"]["q"], flight.tape["y"]["q"])
+    assert_array_equal(read["u"]["stamp_ns"], flight.tape["u"].stamp_ns)
+    assert_allclose(np.diff(read["u"]["t"]), 0.01, atol=1e-9)
+    assert_array_equal(read["internals"]["Pi_q"], flight.tape["internals"]["Pi.q"])
     assert read["info"]["channels"]["internals"]["Pi_q"] == "Pi.q"
     assert read["info"]["outcome"] == "completed"
     names = [

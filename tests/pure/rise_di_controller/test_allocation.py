@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import linprog
 from tests.conftest import REPOSITORY, refusing
 from tests.maps import named_map
@@ -55,9 +56,7 @@ def test_a_demand_inside_the_limits_is_t_v_to_the_last_bit() -> None:
     for params, v in demands(1, 20, 0.05):
         u, given = allocate(v, np.zeros(len(params.T)), DT, params)
         assert given.tobytes() == v.tobytes()
-        np.testing.assert_allclose(
-            u, params.T @ v, rtol=1e-12, atol=1e-14
-        )  # a sum in another order
+        assert_allclose(u, params.T @ v, rtol=1e-12, atol=1e-14)  # a sum in another order
 
 
 @pytest.mark.parametrize("size", [0.9, 3.0])
@@ -68,7 +67,7 @@ def test_effectors_stay_inside_stops_and_rates_and_give_what_is_returned(size: f
             u, given = allocate(v, u_before, DT, params)
             assert (np.abs(u) <= params.limits.upper).all()
             assert (np.abs(u - u_before) <= 5.0 * DT + 1e-12).all()
-            np.testing.assert_allclose(params.effect @ u, given, rtol=1e-9, atol=1e-12)
+            assert_allclose(params.effect @ u, given, rtol=1e-9, atol=1e-12)
             u_before = u
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
 
 from aircraft_sim.airframe import load_airframe
 from flight_core.parameters import ParameterError
@@ -99,19 +100,17 @@ def test_unique_factors_are_recovered_from_their_product(known: SDU) -> None:
     recovered = decompose(product(known))
     # S has eigenvalues in [1, 101]: rounding is amplified by far less than 1e6, which a tolerance
     # of 1e-10 allows.
-    np.testing.assert_allclose(
-        recovered.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S))
-    )
-    np.testing.assert_array_equal(recovered.D, known.D)
-    np.testing.assert_allclose(recovered.U, known.U, atol=1e-10 * float(np.max(known.S)))
+    assert_allclose(recovered.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S)))
+    assert_array_equal(recovered.D, known.D)
+    assert_allclose(recovered.U, known.U, atol=1e-10 * float(np.max(known.S)))
 
 
 @given(matrices())
 def test_d_is_sign_of_ratios_of_leading_minors(Omega: FloatArray) -> None:
     D = decomposed(Omega).D
     minors = leading_minors(Omega)
-    np.testing.assert_array_equal(D, np.sign(minors / np.concatenate([[1.0], minors[:-1]])))
-    np.testing.assert_array_equal(D, signs(Omega))
+    assert_array_equal(D, np.sign(minors / np.concatenate([[1.0], minors[:-1]])))
+    assert_array_equal(D, signs(Omega))
 
 
 @given(matrices(), st.data())
@@ -119,7 +118,7 @@ def test_sign_change_of_input_changes_own_d_only(Omega: FloatArray, data: st.Dat
     D = decomposed(Omega).D
     k = data.draw(st.integers(0, len(Omega) - 1))
     flip = np.where(np.arange(len(Omega)) == k, -1.0, 1.0)
-    np.testing.assert_array_equal(signs(Omega * flip), D * flip)
+    assert_array_equal(signs(Omega * flip), D * flip)
 
 
 @given(matrices(), st.data())
@@ -132,7 +131,7 @@ def test_units_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
     units = arrays(
         np.float64, len(Omega), elements=st.sampled_from([1e-3, 0.01, 0.3048, 1.0, 57.3, 1e4])
     )
-    np.testing.assert_array_equal(signs(data.draw(units)[:, None] * Omega * data.draw(units)), D)
+    assert_array_equal(signs(data.draw(units)[:, None] * Omega * data.draw(units)), D)
 
 
 @given(matrices())
@@ -143,10 +142,8 @@ def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None
     assert pairing is not None
     outputs, inputs, input_signs, U = pairing
     rearranged = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
-    np.testing.assert_array_equal(signs(rearranged), np.ones(len(Omega)))
-    np.testing.assert_allclose(
-        decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U)))
-    )
+    assert_array_equal(signs(rearranged), np.ones(len(Omega)))
+    assert_allclose(decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U))))
 
 
 @pytest.mark.equation(10, 11)
@@ -154,9 +151,9 @@ def test_positive_diagonal_does_not_make_d_one() -> None:
     # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D
     # W.
     S, D, U = decompose(np.array([[1.0, 2.0], [2.0, 1.0]]))
-    np.testing.assert_array_equal(S, [[1.0, 2.0], [2.0, 7.0]])
-    np.testing.assert_array_equal(D, [1.0, -1.0])
-    np.testing.assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
+    assert_array_equal(S, [[1.0, 2.0], [2.0, 7.0]])
+    assert_array_equal(D, [1.0, -1.0])
+    assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
 
 
 def test_omega_without_s_d_u_refused() -> None:
@@ -208,13 +205,13 @@ def test_matrix_not_square_or_finite_refused(Omega: FloatArray, sentence: str) -
 def test_osprey_has_identity_d_and_little_coupling() -> None:
     # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe
     # file.
-    np.testing.assert_array_equal(signs(OSPREY), [1.0, 1.0, 1.0, 1.0])
+    assert_array_equal(signs(OSPREY), [1.0, 1.0, 1.0, 1.0])
     assert coupling(OSPREY) == pytest.approx(0.058, abs=5e-4)
 
 
 def test_textbook_elevator_sign_flips_the_first_d() -> None:
     trailing_edge_down = OSPREY * np.array([-1.0, 1.0, 1.0, 1.0])
-    np.testing.assert_array_equal(signs(trailing_edge_down), [-1.0, 1.0, 1.0, 1.0])
+    assert_array_equal(signs(trailing_edge_down), [-1.0, 1.0, 1.0, 1.0])
     assert pairing_of(trailing_edge_down).signs == (-1, 1, 1, 1)
 
 
