@@ -18,7 +18,6 @@ the time of any event beside a release with the event. The sticks act by RC_CHAN
 autopilot's log, each 0.1 s; PX4's own law by nav_state.
 """
 
-import argparse
 import json
 import os
 import re
@@ -37,6 +36,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 from benchmarks import evidence
+from benchmarks.tables import parser_of
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationConfig
@@ -352,9 +352,7 @@ def guided() -> dict[str, Any]:
     with arduplane(0.03) as plane:
         found, scenario = plane.folder / "found", plane.folder / "guided.yaml"
         program = plane.turns(starts, ALTITUDE + 20.0, 24.0)
-        scenario.write_text(
-            guided_scenario(found / "scenario.yaml", program, 24.0), encoding="utf-8"
-        )
+        scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0))
         with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
             flight.end(GUIDED + 100.0)
     return held_figures(plane.run, starts)
@@ -364,7 +362,7 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
     """How well a guided flight of turns at these times holds what it is commanded, and whether it
     replays.
     """
-    (one,) = json.loads((run / "summary.json").read_text(encoding="utf-8"))["engagements"]
+    (one,) = json.loads((run / "summary.json").read_text())["engagements"]
     tape = read_run(run).tape
     t, errors = tape.time("guidance"), control_errors(tape)
     stop = one["stop"] or GUIDED
@@ -404,7 +402,7 @@ def observed() -> dict[str, Any]:
         plane.say("param", "SIM_WIND_TURB", f"{OBSERVED_TURBULENCE:g}")
         for name in [*scenarios] * OBSERVED_PAIRS:
             scenario = plane.folder / f"{name}_observer.yaml"
-            scenario.write_text(scenario_yaml(scenarios[name]), encoding="utf-8")
+            scenario.write_text(scenario_yaml(scenarios[name]))
             with plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
                 flight.end(150.0)
             results.append({"observer": name, **tracking(plane)})
@@ -462,14 +460,14 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         loaded = load_map(channel_map)
         airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
         planned = experiment(loaded, 24.0, 0.2, str(airframe))
-        airframe.write_text(planned.airframe, encoding="utf-8")
+        airframe.write_text(planned.airframe)
         content = yaml.safe_load(planned.scenario)
         controller = content["/**/controller"]["ros__parameters"]
         controller["pause"] = 1.0
         controller["period"] = [PERIODS[name] for name in controller["inputs"]]
         place = controller["inputs"].index("elevator")
         controller["amplitude"][place] *= STRONGER_ELEVATOR
-        scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
+        scenario.write_text(yaml.safe_dump(content))
         duration = ExcitationConfig.validate_mapping(controller, "controller").duration
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
@@ -649,7 +647,7 @@ ERROR_GOALS = {
 def stored(name: str) -> dict[str, Any]:
     """The stored result of a measurement; empty where there is none."""
     file = FOLDER / f"{name}.json"
-    return dict(json.loads(file.read_text(encoding="utf-8"))["result"]) if file.is_file() else {}
+    return dict(json.loads(file.read_text())["result"]) if file.is_file() else {}
 
 
 def shows_all(experiment: dict[str, Any]) -> bool:
@@ -701,9 +699,7 @@ GOALS["arduplane"]["behind: .*"] = "<= 0.1"
 
 def main() -> None:
     """Measure, and write the rows and the page of evidence."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--sitl", type=Path, help="folder of the kit")
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
     parser.add_argument(
@@ -738,9 +734,7 @@ def main() -> None:
             result = IDENTIFICATIONS[name](arguments.log[0])
         else:
             result = MEASUREMENTS[name]()
-        (FOLDER / f"{name}.json").write_text(
-            json.dumps({"result": result}, indent=1), encoding="utf-8"
-        )
+        (FOLDER / f"{name}.json").write_text(json.dumps({"result": result}, indent=1))
         print(name, json.dumps(result), flush=True)
         figures = counted(result) if name == "signs" else result
         evidence.write(f"autopilots-{name}", evidence.rows(figures, GOALS.get(name, {})), begun)

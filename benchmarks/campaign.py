@@ -138,7 +138,7 @@ def main(
         }
         figures["memory_growth"] = many.memory / many.memory_early
         figures["1,000,000 aircraft of 60 s with gusts on a GPU"] = None  # s; no host has had a GPU
-        json_file.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+        json_file.write_text(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":

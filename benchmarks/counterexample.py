@@ -6,13 +6,12 @@ table of the theory page.
 python -m benchmarks.counterexample    # half a minute
 """
 
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from benchmarks.tables import plain, save_picture
 from matplotlib.figure import Figure
-from PIL import Image
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
@@ -26,7 +25,6 @@ BETAS = (2.0, 20.0, 100.0, 1000.0)
 DURATION = 1.5  # s, of the flights in the figure
 FLIGHTS = ((2.0, 1.0), (20.0, 1.0), (200.0, 1.0), (2.0, 0.0))  # beta, and whether f acts
 COLOURS = ("#1f6f8b", "#c8553d", "#5a8f29", "#888888")
-DPI, PALETTE = 110, 48  # pixels per inch, and colours of the file
 
 
 class Cycle(NamedTuple):
@@ -138,7 +136,6 @@ def plot(cycles: list[Cycle]) -> Figure:
         over_time.semilogy(
             t, e, color=colour, linewidth=1.4, linestyle="-" if acts else "--", label=label
         )
-    over_time.set_title("peaks of |e| over t in s", fontsize=10, loc="left")
     betas = np.array([cycle.beta for cycle in cycles])
     over_beta.loglog(
         betas,
@@ -150,10 +147,9 @@ def plot(cycles: list[Cycle]) -> Figure:
     over_beta.loglog(
         betas, [np.max(cycle.e) for cycle in cycles], "o", color=COLOURS[1], label="simulated"
     )
-    over_beta.set_title("limit of |e| over beta", fontsize=10, loc="left")
+    plain(over_time, "peaks of |e| over t in s")
+    plain(over_beta, "limit of |e| over beta")
     for axis in (over_time, over_beta):
-        axis.grid(color="#dddddd", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
         axis.legend(frameon=False, fontsize=9)
     return figure
 
@@ -161,9 +157,7 @@ def plot(cycles: list[Cycle]) -> Figure:
 def main() -> None:
     """Find the limit cycles, write the plot and print the figures that the theory page states."""
     cycles = [limit_cycle(beta) for beta in BETAS]
-    rendered = BytesIO()
-    plot(cycles).savefig(rendered, dpi=DPI)
-    Image.open(rendered).convert("RGB").quantize(PALETTE).save(IMAGE, optimize=True)
+    save_picture(plot(cycles), IMAGE, colours=48)
     for cycle in cycles:
         required = BOUND * (1.0 + cycle.gamma_2 / LAMBDA)
         slow, fast = cycle.multipliers

@@ -11,7 +11,6 @@ the table of these files.
 Goals are in benchmarks/evidence_goals.py. build/evidence/ has the logs.
 """
 
-import argparse
 import csv
 import json
 import math
@@ -28,6 +27,7 @@ from typing import Any, NamedTuple
 
 import psutil
 from benchmarks.evidence_goals import COMMANDS, GOALS, LONG, SECTIONS
+from benchmarks.tables import parser_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER, PAGE, BUILD = (
@@ -149,7 +149,7 @@ def write(name: str, figures: Iterable[Row], origin: Origin) -> None:
     ordered = sorted(figures)
     if len({figure.name for figure in ordered}) < len(ordered):
         raise ValueError(f"{name}: found a name twice, expected names that differ")
-    with (FOLDER / f"{name}.csv").open("w", encoding="utf-8", newline="") as stream:
+    with (FOLDER / f"{name}.csv").open("w", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(Row._fields + Origin._fields)
         writer.writerows(figure + origin for figure in ordered)
@@ -167,13 +167,13 @@ def write_page() -> None:
             "|---|---|---|",
         ]
         lines += [_line(FOLDER / f"{name}.csv", title) for name, title in titles.items()] + [""]
-    PAGE.write_text("\n".join(lines), encoding="utf-8")
+    PAGE.write_text("\n".join(lines))
 
 
 def _line(path: Path, title: str) -> str:
     if not path.exists():
         return f"| {title} | not measured | - |"
-    with path.open(encoding="utf-8", newline="") as stream:
+    with path.open(newline="") as stream:
         lines = list(csv.reader(stream))[1:]
     figures = {line[0]: Row(*line[:5]) for line in lines}
     origin = Origin(*lines[0][5:])
@@ -227,9 +227,7 @@ def _git(*arguments: str) -> str:
 
 def host() -> str:
     """Processor, cores, memory, system and Python of this host."""
-    cpuinfo = (
-        Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
-    )
+    cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
     memory = round(psutil.virtual_memory().total / 2**30)
     system = f"{platform.system()} {platform.release()}, Python {platform.python_version()}"
@@ -243,10 +241,7 @@ def measure(name: str) -> int:
     """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
     busy = psutil.cpu_percent(interval=2.0) / 100.0
     begun = origin(COMMANDS[name])  # before the run: a commit meanwhile is not what runs
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        (BUILD / f"{name}.log").open("w", encoding="utf-8") as log,
-    ):
+    with tempfile.TemporaryDirectory() as folder, (BUILD / f"{name}.log").open("w") as log:
         file = Path(folder) / "result.json"
         command = COMMANDS[name].replace("FILE", str(file)).replace("FOLDER", folder).split()
         command[0] = str(Path(sys.executable).parent / command[0])
@@ -254,7 +249,7 @@ def measure(name: str) -> int:
             command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True, check=False
         )
         log.write(done.stdout)
-        text = file.read_text(encoding="utf-8") if file.exists() else done.stdout
+        text = file.read_text() if file.exists() else done.stdout
     if COMMANDS[name].startswith("pytest"):
         ended = re.findall(r"(\d+) (passed|failed|skipped|error)", text.strip().rpartition("\n")[2])
         result: Any = {"failed": 0} | {kind: int(count) for count, kind in ended}
@@ -283,9 +278,7 @@ def measure(name: str) -> int:
 
 def main() -> int:
     """Measure, write the rows, write the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--again",
         action="append",

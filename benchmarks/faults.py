@@ -85,11 +85,11 @@ def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list
             while tests.poll() is None:
                 time.sleep(1.0)
                 if table.exists():
-                    bar.update(task, completed=table.read_text(encoding="utf-8").count("\n"))
+                    bar.update(task, completed=table.read_text().count("\n"))
         if not table.exists():
             sys.exit("error: no case matches")
         status = tests.returncode
-        return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()], status
+        return [json.loads(line) for line in table.read_text().splitlines()], status
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
@@ -169,7 +169,7 @@ def main(
     rows, status = fly(times, seed, only, scenario, guided)
     summaries = summarise(rows)
     if file is not None:
-        file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
+        file.write_text(json.dumps(summaries, indent=2) + "\n")
     Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))
     for bank in (summary for summary in summaries if summary["bank_deg"]):
         largest, last = (

@@ -18,7 +18,6 @@ figures are printed. A flight is home that is within HOME_RADII of home at the e
 an aircraft did not come home.
 """
 
-import argparse
 import csv
 import math
 import sys
@@ -30,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from benchmarks import evidence
 from benchmarks.guidance import aircraft_of, turbulence
+from benchmarks.tables import parser_of
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
@@ -274,9 +274,7 @@ def row_of(
 
 def main() -> int:
     """Fly, print the rows and store them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=[*AIRCRAFT], help="aircraft")
     parser.add_argument(
         "--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences; not stored"

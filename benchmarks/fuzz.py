@@ -12,7 +12,6 @@ that raises, hangs or takes too much memory it ends with a status other than 0 a
 in runs/fuzz/<target>/. Fix the reader and add the input to the corpus.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -27,6 +26,8 @@ from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
+
+from benchmarks.tables import parser_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CORPUS = REPOSITORY / "tests" / "corpus"
@@ -51,9 +52,7 @@ STACK = [
 
 def main() -> None:
     """Fuzz, or replay."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     names = (
         "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, "
         "targets, control, page or all"

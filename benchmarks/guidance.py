@@ -14,7 +14,6 @@ rectangle is flown without wind and with a wind of a fifth of the airspeed acros
 number is tuned to an aircraft. The 737 is identified first, which takes some minutes.
 """
 
-import argparse
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from benchmarks import evidence
 from benchmarks.evidence import row, split
-from benchmarks.tables import new_table
+from benchmarks.tables import new_table, parser_of
 from rich.console import Console
 
 from aircraft_sim.pose import wrapped
@@ -589,9 +588,7 @@ def main() -> None:
     """Fly, store the results and write the page; exit status 1 where a limit is not met or a point
     is lost.
     """
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")
     parser.add_argument(
         "--manoeuvres",

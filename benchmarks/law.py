@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.vectors import StampedVector
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 from rise_di_controller.law import engage, step, step_with_anti_windup
 
@@ -37,54 +37,48 @@ def percentiles(action: Callable[[int], object]) -> tuple[float, float, float]:
 FLOOR = "NumPy a * x + b"
 
 
+def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], object]:
+    """A whole tick after the engagement, with the k-th rows of y and y_m."""
+    controller = find_scenario(scenario).controller
+    tuned, limits = controller.tuned_law(), controller.guard()
+    first, stamp_ns = StampedVector(0, y_m[0]), limits.period_ns
+    engaged, _ = guard.tick(
+        guard.initial_state(4), 0, StampedVector(0, y[0]), [first], limits, tuned
+    )
+
+    def tick(k: int) -> object:
+        references = [first, StampedVector(stamp_ns, y_m[k])]
+        return guard.tick(
+            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
+        )
+
+    return tick
+
+
 def measure() -> dict[str, tuple[float, float, float]]:
     """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick,
     and the multiply-add.
     """
     controller = find_scenario("osprey_gust").controller
-    law, tuned, limits = controller.law_params(), controller.tuned_law(), controller.guard()
-    rng = np.random.default_rng(1)
-    y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
+    law, limits = controller.law_params(), controller.guard().limits
+    y, y_m = noise()[0], np.zeros(4)
     dt, zero = 0.01, np.zeros(4)
-    law_state = engage(y[0], y_m)
-    engaged, _ = guard.tick(
-        guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, tuned
-    )
-
-    def with_anti_windup(k: int) -> object:
-        return step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
-
-    def whole_tick(k: int) -> object:
-        stamp_ns = limits.period_ns
-        references = [StampedVector(0, y_m), StampedVector(stamp_ns, y_m)]
-        return guard.tick(
-            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
-        )
-
+    state = engage(y[0], y_m)
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),
-        "law.step": percentiles(lambda k: step(law_state, y[k], y_m, dt, law)),
-        "law.step_with_anti_windup": percentiles(with_anti_windup),
-        "guard.tick": percentiles(whole_tick),
+        "law.step": percentiles(lambda k: step(state, y[k], y_m, dt, law)),
+        "law.step_with_anti_windup": percentiles(
+            lambda k: step_with_anti_windup(state, y[k], y_m, dt, zero, zero, law, limits)
+        ),
+        "guard.tick": percentiles(ticked("osprey_gust", y, np.zeros_like(y))),
     }
 
 
 def measure_observer() -> tuple[float, float, float]:
     """Median, 99.9th percentile and maximum in us of a tick with feedforward and observer."""
-    controller = find_scenario("osprey_observer").controller
-    tuned, limits = controller.tuned_law(), controller.guard()
-    rng = np.random.default_rng(1)
-    y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, rng.normal(size=(REPEATS, 4)) * 0.01
-    references = [StampedVector(0, y_m[0])]
-    engaged, _ = guard.tick(
-        guard.initial_state(4), 0, StampedVector(0, y[0]), references, limits, tuned
-    )
-    stamp_ns = limits.period_ns
+    return percentiles(ticked("osprey_observer", *noise()))
 
-    def tick(k: int) -> object:
-        references = [StampedVector(0, y_m[0]), StampedVector(stamp_ns, y_m[k])]
-        return guard.tick(
-            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
-        )
 
-    return percentiles(tick)
+def noise() -> FloatArray:
+    """Rows of y and of y_m, shape (2, REPEATS, 4)."""
+    return 0.01 * np.random.default_rng(1).normal(size=(2, REPEATS, 4))

@@ -24,7 +24,6 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NamedTuple
@@ -33,8 +32,8 @@ import numpy as np
 import typer
 from benchmarks import evidence
 from benchmarks.evidence import row
+from benchmarks.tables import plain, save_picture
 from matplotlib.figure import Figure
-from PIL import Image
 from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
@@ -87,7 +86,6 @@ LABELS = {
     "learner": "learner",
     "true": "true model",
 }
-PALETTE = 32  # colours of the picture
 RIVALS, OBJECTIVE = (
     ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"),
     "gust_turbulence",
@@ -369,13 +367,11 @@ def learn(name: str, cell: Cell, number: int) -> Row:
         others = beside(cell.uncertainty, number) if cell.kind in {"learn", "rough"} else {}
         if cell.kind == "rough":
             prior = rough(number)
-            Path(folder, "prior.yaml").write_text(as_yaml(prior), encoding="utf-8")
+            Path(folder, "prior.yaml").write_text(as_yaml(prior))
             chosen = with_prior(chosen, folder)
         elif cell.kind == "coupled":
-            Path(folder, "prior.yaml").write_text(
-                as_yaml(load_airframe("osprey")), encoding="utf-8"
-            )
-            Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)), encoding="utf-8")
+            Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")))
+            Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)))
             chosen = with_prior(
                 learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder
             )
@@ -558,7 +554,7 @@ def read(path: Path) -> list[Row]:
     """
     if not path.exists():
         return []
-    with path.open(encoding="utf-8", newline="") as stream:
+    with path.open(newline="") as stream:
         lines = csv.DictReader(stream)
         if tuple(lines.fieldnames or ()) != Row._fields:
             return []
@@ -574,7 +570,7 @@ KINDS = tuple(Row.__annotations__.values())
 def write(path: Path, rows: Sequence[Row]) -> None:
     """Write the rows, sorted."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with path.open("w", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerows(
             (
@@ -762,9 +758,7 @@ def plot(rows: Sequence[Row]) -> Figure:
                 [place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2
             )
         axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
-        axis.set_title(f"A and B +-{100 * uncertainty:g} %: score", fontsize=10, loc="left")
-        axis.grid(axis="y", color="#dddddd", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis, f"A and B +-{100 * uncertainty:g} %: score", lines="y")
     axis.set_ylim(
         bottom=0.0
     )  # of both panels, once all points are drawn: it ends the automatic limits
@@ -824,9 +818,7 @@ def main(
     if found:
         evidence.write("learning", found, begun)
     if set(airs) <= set(whole):
-        rendered = BytesIO()
-        plot(rows).savefig(rendered, dpi=110)
-        Image.open(rendered).convert("RGB").quantize(PALETTE).save(IMAGE, optimize=True)
+        save_picture(plot(rows), IMAGE, colours=32)
 
 
 if __name__ == "__main__":

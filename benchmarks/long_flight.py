@@ -14,7 +14,6 @@ error, the memory of each process in the middle and at the end of the flight, an
 and to open the report.
 """
 
-import argparse
 import json
 import math
 import signal
@@ -32,6 +31,7 @@ import numpy as np
 import psutil
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.processes import PRIORITY, RISE_DI, delay_monitors, real_time
+from benchmarks.tables import parser_of
 from benchmarks.view import Client, figures_of_ticks, watching
 from numpy.typing import NDArray
 from tests.browser import CHROMIUM, Browser
@@ -225,7 +225,7 @@ def figures(
     xtrack = log["xtrack"][tape.time("guidance") > 30.0]
     replay = replay_guidance(tape, scenario.guidance)
     return {
-        "outcome": json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"],
+        "outcome": json.loads((run / "summary.json").read_text())["outcome"],
         "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario, delays, real_time=real_time),
@@ -257,9 +257,7 @@ def figures(
 
 def main() -> None:
     """Fly and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="of flight time")
     parser.add_argument(
         "--observer",
@@ -286,8 +284,7 @@ def main() -> None:
         runs = Path(folder)
         path = runs / "flown.yaml"
         path.write_text(
-            scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate)),
-            encoding="utf-8",
+            scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate))
         )
         begin = time.monotonic()
         memory, report_memory = fly(path, runs, options.mode)
@@ -305,7 +302,7 @@ def main() -> None:
         text = json.dumps(found, indent=1)
         print(text)
         if options.json is not None:
-            options.json.write_text(text + "\n", encoding="utf-8")
+            options.json.write_text(text + "\n")
 
 
 if __name__ == "__main__":

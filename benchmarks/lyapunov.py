@@ -6,12 +6,11 @@
 python -m benchmarks.lyapunov
 """
 
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from benchmarks.tables import plain, save_picture
 from matplotlib.figure import Figure
-from PIL import Image
 
 from flight_design.gains.lyapunov import Evidence, evidence, example, fly, lemma_2
 
@@ -19,7 +18,6 @@ IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.png"
 DT, DURATION = 0.01, 60.0  # s
 TOO_SMALL = 0.05
 COLOURS = ("#1f6f8b", "#c8553d")
-DPI, PALETTE = 110, 16  # pixels per inch, and colours of the file
 
 
 def flights() -> dict[str, Evidence]:
@@ -57,9 +55,7 @@ def plot(evidence_by_beta: dict[str, Evidence]) -> Figure:
     for axis, title in zip(
         axes.flat, ("V1 (31)", "V2 = V1 + P (48)", "|e| (3)", "|r| (4)"), strict=True
     ):
-        axis.set_title(title, fontsize=10, loc="left")
-        axis.grid(color="#dddddd", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis, title)
         if not title.startswith("V2"):
             axis.set_yscale("log")
     axes[0, 1].axhline(0.0, color="black", linewidth=0.8)
@@ -73,9 +69,7 @@ def main() -> None:
     """Fly both gain sets, write the plot and print the figures that the theory page states."""
     evidence_by_beta = flights()
     IMAGE.parent.mkdir(parents=True, exist_ok=True)
-    rendered = BytesIO()
-    plot(evidence_by_beta).savefig(rendered, dpi=DPI)
-    Image.open(rendered).convert("RGB").quantize(PALETTE).save(IMAGE, optimize=True)
+    save_picture(plot(evidence_by_beta), IMAGE, colours=16)
     for name, signals in evidence_by_beta.items():
         late = signals.t > 20.0
         e, r = (np.max(np.linalg.norm(signal[late], axis=1)) for signal in (signals.e, signals.r))

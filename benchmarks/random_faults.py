@@ -52,7 +52,7 @@ def main(
     }
     result |= {"status": status, "cases": cases, "failed": failed}
     if file is not None:
-        file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        file.write_text(json.dumps(result, indent=2) + "\n")
     for row in failed:
         print(f"seed {row['seed']}, {row['case']}: {row['error']}")
     print(f"{result['passed']} of {planned} draws passed, {two} of them with two faults at a time")

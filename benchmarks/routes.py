@@ -13,7 +13,6 @@ is a result, with the sentence. The wind is known as `guidance.wind`. No number 
 aircraft. Exit status 1: an error beyond its limit, a missed leg, or an aircraft lost.
 """
 
-import argparse
 import csv
 import math
 import sys
@@ -23,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from benchmarks import evidence
 from benchmarks.guidance import AIRCRAFT, OTHERS, aircraft_of, turbulence
+from benchmarks.tables import parser_of
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import with_route
@@ -213,9 +213,7 @@ def errors(tape: Tape, route: Route) -> tuple[float, float]:
 
 def main() -> int:
     """Fly, print the rows and store them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--only", nargs="*", choices=[*AIRCRAFT, *OTHERS], default=[*AIRCRAFT], help="aircraft"
     )

@@ -11,7 +11,6 @@ publishes the message again (an echo), an empty timer of rclpy, a loop that only
 rclpy that only spins, the writer of rosbags, a right message.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -32,7 +31,7 @@ from benchmarks import evidence, law, lockstep, receiver, recorder
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.nodes import open_node, ticks
 from benchmarks.processes import PRIORITY, RISE_DI, Child, delay_monitors, real_time, threads_ns
-from benchmarks.tables import new_table
+from benchmarks.tables import new_table, parser_of
 from rclpy.node import Node
 from rich.console import Console
 from rosbags.rosbag2 import CompressionMode
@@ -580,9 +579,7 @@ def _cell(value: float | None, floor: float | None) -> str:
 
 def main() -> None:
     """Measure, print, and write the figures to a file."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--only", choices=GROUPS, help="measure only this group")
     parser.add_argument(
         "--seconds",
@@ -603,9 +600,7 @@ def main() -> None:
         show(console, name, rows)
         measured += evidence_rows(rows)
     if options.json is not None:
-        options.json.write_text(
-            json.dumps({"evidence": measured}, indent=1) + "\n", encoding="utf-8"
-        )
+        options.json.write_text(json.dumps({"evidence": measured}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.nodes import open_node, termination, ticks
+from benchmarks.tables import parser_of
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
@@ -262,9 +263,7 @@ ROLES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
 
 def main() -> None:
     """Run one role."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("role", choices=ROLES)
     parser.add_argument("--executor", choices=EXECUTORS, default="single")
     parser.add_argument("--hz", type=float, default=500.0)

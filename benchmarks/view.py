@@ -13,7 +13,6 @@ screen, missed ticks.
     # that many flights, with a client for half of the time
 """
 
-import argparse
 import asyncio
 import itertools
 import json
@@ -32,6 +31,7 @@ import numpy as np
 import psutil
 from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
 from benchmarks.processes import RISE_DI, delay_monitors, real_time, threads_ns
+from benchmarks.tables import parser_of
 from numpy.typing import NDArray
 from scipy.stats import quantile_test
 from tests.browser import CHROMIUM, Browser
@@ -464,9 +464,7 @@ def probability(differences: FloatArray) -> float:
 
 def main() -> None:
     """Measure, and print the figures as JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument(
         "parts", nargs="*", choices=["open", "live", "frozen", "flights", []], help="all by default"
     )
@@ -497,7 +495,7 @@ def main() -> None:
     text = json.dumps(found, indent=2)
     print(text)
     if arguments.json is not None:
-        arguments.json.write_text(text, encoding="utf-8")
+        arguments.json.write_text(text)
 
 
 if __name__ == "__main__":
