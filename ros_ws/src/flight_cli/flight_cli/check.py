@@ -4,7 +4,6 @@
 an autopilot.
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -26,7 +25,7 @@ from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
-from flight_cli.words import AsJson, argument, option
+from flight_cli.words import AsJson, argument, option, warn
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
     SignCheck,
@@ -76,7 +75,7 @@ def check(
     for fault in version_faults(
         (topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")
     ):
-        print(f"warning: {fault}", file=sys.stderr)
+        warn(f"warning: {fault}")
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     if run is not None:
@@ -95,9 +94,9 @@ def check(
     else:
         _show(Console(), channel_map, checked, frame.name)
     for sentence in checked.uncertain:
-        print(f"not certain: {sentence}", file=sys.stderr)
+        warn(f"not certain: {sentence}")
     for sentence in checked.contradictions:
-        print(f"error: {sentence}", file=sys.stderr)
+        warn(f"error: {sentence}")
     if checked.contradictions:
         raise typer.Exit(CONTRADICTS)
 
@@ -182,10 +181,9 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
             if absent := sorted(
                 {kind.partition("/")[0] for kind in kinds if not is_known(types, kind)}
             ):
-                print(
+                warn(
                     f"note: {name}: no definition of {', '.join(absent)}: make messages, or "
-                    "another folder",
-                    file=sys.stderr,
+                    "another folder"
                 )
     if any(any(row.faults) for row in rows):
         raise typer.Exit(CONTRADICTS)

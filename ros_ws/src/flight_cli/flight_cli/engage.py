@@ -4,12 +4,11 @@
 disengagement.
 """
 
-import sys
 from typing import Annotated
 
 import typer
 
-from flight_cli.words import Namespace, option
+from flight_cli.words import Namespace, option, warn
 from flight_core.environment import require_ros_environment
 
 REFUSED = 1
@@ -40,12 +39,8 @@ def engage(
     from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
-        refusal = (
-            client.disengage()
-            if off
-            else client.engage(lambda line: print(line, file=sys.stderr), blind=blind)
-        )
+        refusal = client.disengage() if off else client.engage(warn, blind=blind)
     if refusal:
-        print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
+        warn(f"error: not {'disengaged' if off else 'engaged'}: {refusal}")
         raise typer.Exit(REFUSED)
     print("disengaged" if off else "engaged, the controller flies")

@@ -39,7 +39,7 @@ from flight_cli.route_options import (
     read_waypoints,
 )
 from flight_cli.settings import Settings, with_settings
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import AsJson, argument, option, setting, warn
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -211,7 +211,7 @@ def fly(
         chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)
     _require_flyable(chosen, autopilot, in_process=in_process)
     for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
-        print(f"warning: {sentence}", file=sys.stderr)
+        warn(f"warning: {sentence}")
     learn = _learner(chosen)
     run = new_run(chosen, runs)
     context.call_on_close(partial(remove_empty, run))
@@ -250,9 +250,7 @@ def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> in
         if status == 0:
             raise
         write_empty_summary(run, scenario, outcome)
-        print(
-            f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr
-        )
+        warn(f"error: {outcome}, before the first sample; see {display_path(run)}")
         return status
     outcome = result.flight.summary["outcome"]
     if as_json:

@@ -5,14 +5,13 @@ link, a route.
 """
 
 import math
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, read_waypoints
-from flight_cli.words import Namespace, argument
+from flight_cli.words import Namespace, argument, warn
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import ParameterError, require
 from flight_guidance.guidance_state import TARGETS
@@ -82,7 +81,7 @@ def guide(
         with GuidanceClient(namespace=namespace) as client:
             refusal = client.send_route(points) if points else client.call(command)
     if refusal:
-        print(f"error: refused: {refusal}", file=sys.stderr)
+        warn(f"error: refused: {refusal}")
         raise typer.Exit(REFUSED)
     print(
         SERVICES.get(

@@ -5,7 +5,6 @@ airframe from a flight's log.
 """
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -18,12 +17,7 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.jsbsim_aircraft import (
-    PREFIX,
-    NamedProperties,
-    named_properties,
-    require_aircraft,
-)
+from aircraft_sim.jsbsim_aircraft import PREFIX, NamedProperties, named_properties, require_aircraft
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -48,10 +42,11 @@ from flight_cli.output import (
     new_table,
     print_json,
     progress_bar,
+    require_yaml,
     say,
     write_text,
 )
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import AsJson, argument, option, setting, warn
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -337,10 +332,7 @@ def _identify_by_steps(
         f"none, and {path} exists",
         "a file to write over, or another",
     )
-    require(
-        path.suffix == ".yaml", "write", path, "a name that ends in .yaml, as scenario files do"
-    )
-    require(path.parent.is_dir(), "write", path, "a file in a folder that exists")
+    require_yaml("write", path)
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
@@ -356,7 +348,7 @@ def _identify_by_steps(
                 named=flown.named,
             )
     except FlightEnded as error:
-        print(f"error: {error}", file=sys.stderr)
+        warn(f"error: {error}")
         raise typer.Exit(CANNOT_FLY) from None
     chosen = identified.selection.engineering
     lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
@@ -373,10 +365,7 @@ def _identify_by_steps(
         show_identified(console, identified)
         console.print(f"scenario: {display_path(path)}", highlight=False)
     if identified.failure:
-        print(
-            f"error: {identified.condition.title} does not fly: {identified.failure}",
-            file=sys.stderr,
-        )
+        warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
         raise typer.Exit(CANNOT_FLY)
 
 
@@ -400,13 +389,7 @@ def _identify_log(
     refused.
     """
     if write is not None:
-        require(
-            write.suffix == ".yaml",
-            "--write",
-            write,
-            "a name that ends in .yaml, as airframe files do",
-        )
-        require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
+        require_yaml("--write", write)
     recorded = read_run(source.log, source.namespace, scenario_file(source.scenario))
     recorded.require()
     warn_of_lacks(recorded)

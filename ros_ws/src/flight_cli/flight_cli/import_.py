@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a bag of y, u and pose from the log of an autopilot."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import find_map, load_map
 from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table, say
-from flight_cli.words import argument, option
+from flight_cli.words import argument, option, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
@@ -108,7 +107,7 @@ def import_(
         LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE),
     )
     for sentence in notes:
-        print(f"warning: {sentence}", file=sys.stderr)
+        warn(f"warning: {sentence}")
     table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS

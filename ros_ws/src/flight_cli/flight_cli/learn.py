@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
@@ -21,12 +22,13 @@ from flight_cli.output import (
     entry_table,
     model_table,
     print_json,
+    require_yaml,
+    say,
     write_text,
 )
 from flight_cli.settings import Settings, with_settings
 from flight_cli.words import AsJson, argument, option
 from flight_core.files import display_path
-from flight_core.parameters import require
 from flight_core.text import printable
 from flight_design.learning.scenario_learner import learn_again, learned_yaml
 from flight_log.tape_reader import read_run
@@ -50,13 +52,7 @@ def learn(
     `controller.learn.prior` starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
     """
     if write is not None:
-        require(
-            write.suffix == ".yaml",
-            "--write",
-            write,
-            "a name that ends in .yaml, as airframe files do",
-        )
-        require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
+        require_yaml("--write", write)
     recorded = read_run(run, namespace, scenario_file(scenario))
     recorded.require()
     warn_of_lacks(recorded)
@@ -66,24 +62,15 @@ def learn(
     with console.status(f"learning from {printable(str(run))}"):
         result = learn_again(recorded.tape, others)
     for step in result.steps:
-        console.print(
-            f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-    account = log_account(recorded)
-    over = "" if account is None else account.over("internals")
-    part = f", {over}" if over else ""
+        lead = "" if step.proposed else "no model: "
+        say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
     if result.entries:
         console.print(entry_table(f"A and B of the last identification{part}", result.entries))
     if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
         console.print(model_table(models, display_units(flown), part))
     if result.model is not None and write is not None:
         write_text("--write", write, learned_yaml(result, str(run)))
-        console.print(
-            f"model: {display_path(write)}", highlight=False, markup=False, soft_wrap=True
-        )
+        say(console, f"model: {escape(display_path(write))}")
     if as_json:
         steps = [step._asdict() for step in result.steps]
         path = None if result.model is None or write is None else str(write)

@@ -4,14 +4,13 @@
 of several, what it lacks.
 """
 
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
-from flight_cli.words import option
+from flight_cli.words import option, warn
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
@@ -65,7 +64,7 @@ def warn_of_lacks(recorded: RecordedRun) -> None:
         *(() if account is None else account.notes()),
         *filter(None, [imported]),
     ):
-        print(f"warning: {sentence}", file=sys.stderr)
+        warn(f"warning: {sentence}")
 
 
 def warn_of_lacks_in(run: Path, namespace: str | None) -> None:

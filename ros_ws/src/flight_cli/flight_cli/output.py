@@ -45,6 +45,7 @@ from flight_analysis.report.summary import (
     time_flown,
 )
 from flight_core.files import write_file, writing
+from flight_core.parameters import require
 
 # exit statuses; bad input is 2 (`flight_cli.cli`)
 ENDED_EARLY = 3
@@ -302,3 +303,9 @@ def write_text(option: str, path: Path, text: str) -> None:
         return
     with writing(option, path, "the path of a file"):
         write_file(path, text)
+
+
+def require_yaml(option: str, path: Path) -> None:
+    """Raise ParameterError unless a path is that of a .yaml file in a folder that exists."""
+    require(path.suffix == ".yaml", option, path, "a name that ends in .yaml")
+    require(path.parent.is_dir(), option, path, "a file in a folder that exists")

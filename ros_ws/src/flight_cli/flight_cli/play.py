@@ -5,14 +5,13 @@ test.
 """
 
 import math
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
-from flight_cli.words import argument, option
+from flight_cli.words import argument, option, warn
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -69,10 +68,9 @@ def play(
         "a topic whose message type is installed",
     )
     if skipped:
-        print(
+        warn(
             f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type "
-            "that is not installed",
-            file=sys.stderr,
+            "that is not installed"
         )
     messages = [message for message in playback.messages if message.topic in types]
     with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:

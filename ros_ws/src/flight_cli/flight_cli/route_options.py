@@ -3,12 +3,11 @@
 """The options of the commands that read a route file."""
 
 import math
-import sys
 from pathlib import Path
 from typing import Annotated, overload
 
 from flight_cli.output import parse_numbers
-from flight_cli.words import setting
+from flight_cli.words import setting, warn
 from flight_core.parameters import require
 from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
@@ -63,7 +62,7 @@ def read_waypoints(
         file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line
     )
     for note in route.notes:
-        print(f"note: {note}", file=sys.stderr)
+        warn(f"note: {note}")
     return route.waypoints
 
 

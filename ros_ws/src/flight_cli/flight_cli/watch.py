@@ -13,7 +13,7 @@ from flight_bringup.processes import end_with_parent
 from flight_cli.flightgear import show_in_flightgear
 from flight_cli.log_options import REMAP, LogScenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
-from flight_cli.words import argument, option, setting
+from flight_cli.words import argument, option, setting, warn
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import missing
@@ -209,10 +209,9 @@ def _newest(runs: Path, namespace: str | None) -> Path:
     chosen = newest_run(runs, namespace)
     others = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
     if others and namespace is None:
-        print(
+        warn(
             f"note: shows {display_path(chosen)}; also in flight: {', '.join(others)}: name "
-            "one, or --namespace, or --fleet",
-            file=sys.stderr,
+            "one, or --namespace, or --fleet"
         )
     return chosen
 

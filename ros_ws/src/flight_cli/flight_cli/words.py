@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The words of a command line: options with their help, and settings of a command by --set."""
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
@@ -31,6 +32,11 @@ def argument(text: str, **rules: Any) -> Any:
 AsJson = Annotated[bool, option("Print the result as JSON, nothing else.", "--json")]
 Namespace = Annotated[str, option("Namespace of the aircraft.")]
 """Options of several commands."""
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr)
 
 
 class Command(TyperCommand):
