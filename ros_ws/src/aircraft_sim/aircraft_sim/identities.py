@@ -11,7 +11,7 @@ Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D. Reid,
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import combinations, permutations
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +42,6 @@ LIFT = (0.3, 2.8)
 """Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a
 rate, Z_q or Y_r; of the change of lift = weight with speed, which compressibility and thrust
 change: published aircraft have 0.78 to 1.02."""
-MANY = 4  # states of which every order is tried: 24
 FOREIGN = 0.02  # 1, the largest entry of an unrelated state in the row of an angle, SI
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("theta", "q"): (1.0, "", TURNED),
@@ -198,19 +197,11 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
 
 
 def _orders(count: int) -> Iterator[list[int]]:
-    """Orders other than the first: any of a few items, with the fewest moves first; of more items
-    the exchange of two.
-    """
-    first = list(range(count))
-    pairs = []
-    for i, j in combinations(first, 2):
-        pair = first.copy()
-        pair[i] = j
-        pair[j] = i
-        pairs.append(pair)
-    longer = (list(order) for order in permutations(first)) if count <= MANY else ()
-    yield from pairs
-    yield from (order for order in longer if order != first and order not in pairs)
+    """Orders in which two of the items are exchanged."""
+    for i, j in combinations(range(count), 2):
+        order = list(range(count))
+        order[i], order[j] = j, i
+        yield order
 
 
 def _dimensions(model: Model) -> Iterator[Finding]:

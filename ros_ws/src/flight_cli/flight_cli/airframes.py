@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
-from rich.table import Table
 
 from flight_cli.output import new_table, parse_numbers, print_json
 from flight_cli.words import AsJson, argument, option, setting
@@ -22,6 +21,8 @@ from flight_design.gains.airframe_properties import (
     marginal_sentence,
 )
 from rise_di.own_airframe import NewAirframe, new_airframe
+
+ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
 
 
 def airframes(
@@ -132,43 +133,16 @@ def airframes(
         print_json([_as_json(airframe) for airframe in facts])
         return
     console = Console()
-    signs = _table("Signs and pairing", "airframe", "D", "for D = I", "coupling")
-    for airframe in facts:
-        signs.add_row(
-            airframe.name,
-            "none"
-            if airframe.D is None
-            else " ".join("+" if sign > 0 else "-" for sign in airframe.D),
-            airframe.remedy,
-            "-" if airframe.coupling is None else f"{airframe.coupling:.3g}",
-        )
-    console.print(signs)
-    assumptions = _table(
-        "Assumptions 1 and 3", "airframe", "n, m", "controllable", "zeros", "integrated"
-    )
-    for airframe in facts:
-        yes = "yes" if airframe.controllable else "no"
-        assumptions.add_row(
-            airframe.name,
-            f"{airframe.n}, {airframe.m}",
-            yes,
-            airframe.zero_dynamics,
-            ", ".join(airframe.integrated) or "-",
-        )
-    console.print(assumptions)
-    roots = _table(
-        "Poles and zeros in 1/s, leading minors of C B in SI",
-        "airframe",
-        "poles",
-        "zeros at",
-        "minors",
-    )
-    for airframe in facts:
-        minors = "  ".join(f"{minor:.3g}" for minor in airframe.minors)
-        roots.add_row(
-            airframe.name, _format_roots(airframe.poles), _format_roots(airframe.zeros), minors
-        )
-    console.print(roots)
+    for title, headings, cells in (
+        ("Signs and pairing", ("D", "for D = I", "coupling"), _signs),
+        ("Assumptions 1 and 3", ("n, m", "controllable", "zeros", "integrated"), _assumptions),
+        (ROOTS, ("poles", "zeros at", "minors"), _roots),
+    ):
+        columns = ("airframe", *headings)
+        table = new_table(title, columns, columns, wrapped=headings if cells is _roots else ())
+        for airframe in facts:
+            table.add_row(airframe.name, *cells(airframe))
+        console.print(table)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
     console.print(
         f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling "
@@ -194,10 +168,20 @@ def _show_draft(draft: NewAirframe) -> None:
     print(f"fly it:   rise-di fly {display_path(draft.scenario_file)} --in-process")
 
 
-def _table(title: str, *headings: str) -> Table:
-    return new_table(
-        title, headings, left_aligned=headings, wrapped=("poles", "zeros at", "minors")
-    )
+def _signs(facts: AirframeFacts) -> tuple[str, str, str]:
+    D = "none" if facts.D is None else " ".join("+" if sign > 0 else "-" for sign in facts.D)
+    return D, facts.remedy, "-" if facts.coupling is None else f"{facts.coupling:.3g}"
+
+
+def _assumptions(facts: AirframeFacts) -> tuple[str, str, str, str]:
+    controllable = "yes" if facts.controllable else "no"
+    integrated = ", ".join(facts.integrated) or "-"
+    return f"{facts.n}, {facts.m}", controllable, facts.zero_dynamics, integrated
+
+
+def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
+    minors = "  ".join(f"{minor:.3g}" for minor in facts.minors)
+    return _format_roots(facts.poles), _format_roots(facts.zeros), minors
 
 
 def _format_roots(roots: ComplexArray) -> str:

@@ -11,7 +11,7 @@ import hmac
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -33,6 +33,7 @@ RATE = 5.0  # requests a second
 BURST = 10.0  # and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
+AXES = ("north", "east", "altitude")  # of a waypoint
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
@@ -348,11 +349,7 @@ class Control:
         gains = gains_of(self._controller())
         chosen = {}
         for name, value in values.items():
-            if name not in gains:
-                raise RefusedError(
-                    HTTPStatus.BAD_REQUEST,
-                    f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}",
-                )
+            _require_known(name, gains, "gain")
             chosen[name] = _like(name, gains[name], value)
             _require_range(name, chosen[name], gains[name])
         return self._apply(request, chosen, undo=True)
@@ -425,15 +422,8 @@ class Control:
         known = _faults_of(self._flight.scenario)
         values = _mapping(request, "values")
         for name in values:
-            if name not in known:
-                raise RefusedError(
-                    HTTPStatus.BAD_REQUEST,
-                    f"{short_repr(name)}: no fault, expected one of {', '.join(known)}",
-                )
-        chosen = {
-            name: value if _is_sentences(value) else _numbers(name, value)
-            for name, value in values.items()
-        }
+            _require_known(name, known, "fault")
+        chosen = {name: _numbers(name, value) for name, value in values.items()}
         if not (refusal := self._link.set_parameters("aircraft", chosen)):
             self._faults |= chosen
         return refusal
@@ -441,11 +431,10 @@ class Control:
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = request.get("axis")
         # ROS has no name for half a surrogate pair
-        if not isinstance(axis, str) or not axis.isidentifier():
-            raise RefusedError(
-                HTTPStatus.BAD_REQUEST,
-                f"axis: found {short_repr(axis)}, expected the name of an axis",
-            )
+        _require(
+            isinstance(axis, str) and axis.isidentifier(),
+            f"axis: found {short_repr(axis)}, expected the name of an axis",
+        )
         speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS
@@ -461,38 +450,27 @@ class Control:
     def _send_target(self, request: Mapping[str, Any]) -> str:
         values = _mapping(request, "values")
         for name in values:
-            if name not in TARGETS:
-                raise RefusedError(
-                    HTTPStatus.BAD_REQUEST,
-                    f"{short_repr(name)}: no target, expected one of {', '.join(TARGETS)}",
-                )
+            _require_known(name, TARGETS, "target")
         return self._link.send_target(
             {name: _number(name, value) for name, value in values.items()}
         )
 
     def _send_route(self, request: Mapping[str, Any]) -> str:
         points = request.get("points")
+        expected = f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude"
         if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
-            raise RefusedError(
-                HTTPStatus.BAD_REQUEST,
-                f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude",
-            )
-        if any(
-            not isinstance(point, list) or len(point) != len(("north", "east", "altitude"))
-            for point in points
-        ):
-            raise RefusedError(
-                HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each"
-            )
+            raise RefusedError(HTTPStatus.BAD_REQUEST, expected)
+        for point in points:
+            _require(isinstance(point, list) and len(point) == len(AXES), expected)
         coordinate = partial(_number, "points")
         return self._link.send_route([[*map(coordinate, point)] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
-        if request.get("map") != (name := self._map()):
-            raise RefusedError(
-                HTTPStatus.BAD_REQUEST,
-                f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge",
-            )
+        name = self._map()
+        _require(
+            request.get("map") == name,
+            f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge",
+        )
         return self._link.engage()
 
 
@@ -521,6 +499,16 @@ def _faults_of(scenario: Scenario) -> list[str]:
     )
 
 
+def _require(holds: bool, sentence: str) -> None:
+    """Refuse a request that is not well formed."""
+    if not holds:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, sentence)
+
+
+def _require_known(name: str, known: Collection[str], kind: str) -> None:
+    _require(name in known, f"{short_repr(name)}: no {kind}, expected one of {', '.join(known)}")
+
+
 def _plain(key: str) -> bytes:
     return key.replace("-", "").strip().upper().encode()
 
@@ -536,22 +524,18 @@ def _range(value: float) -> list[float]:
 def _require_range(name: str, value: Any, base: Any) -> None:
     for number, middle in zip(_as_list(value), _as_list(base), strict=True):
         low, high = _range(middle)
-        if not low <= number <= high:
-            raise RefusedError(
-                HTTPStatus.BAD_REQUEST,
-                f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to "
-                f"{RANGE[1]:g} times the scenario's",
-            )
+        _require(
+            low <= number <= high,
+            f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to "
+            f"{RANGE[1]:g} times the scenario's",
+        )
 
 
 def _like(name: str, base: Any, value: Any) -> Any:
     """A value as a float or a list, by the type of the parameter."""
     values = _as_list(_numbers(name, value))
     expected = len(_as_list(base))
-    if len(values) != expected:
-        raise RefusedError(
-            HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}"
-        )
+    _require(len(values) == expected, f"{name}: found {len(values)} values, expected {expected}")
     return values if isinstance(base, tuple) else values[0]
 
 
@@ -571,11 +555,9 @@ def _number(name: str, value: Any) -> float:
         )
     except OverflowError:  # an integer of hundreds of digits
         number = math.inf
-    if not math.isfinite(number):
-        raise RefusedError(
-            HTTPStatus.BAD_REQUEST,
-            f"{short_repr(name)}: found {short_repr(value)}, expected a number",
-        )
+    _require(
+        math.isfinite(number), f"{short_repr(name)}: found {short_repr(value)}, expected a number"
+    )
     return number
 
 
