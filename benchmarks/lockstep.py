@@ -88,9 +88,7 @@ def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
     interleaved.
     """
     aircraft, model = {"rate": RATE, "step": 1.0 / RATE}, {"rate": RATE}
-    scenario = find_scenario("osprey_gust").vary(
-        flight={"duration": duration}, aircraft=aircraft, reference_model=model
-    )
+    scenario = find_scenario("osprey_gust", duration).vary(aircraft=aircraft, reference_model=model)
     scenario = written(scenario, folder / "at_100_hz.yaml")
     measurements: dict[str, Callable[[Path], float]] = {
         FLOOR: lambda run: echo_steps_per_second(),

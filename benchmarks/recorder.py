@@ -35,7 +35,7 @@ def publish(rate: float, duration: float) -> None:
     """Publish on each topic for the duration or until SIGTERM. Print "matched" first and the number
     sent at the end.
     """
-    tape = simulate(find_scenario("osprey_servo").vary(flight={"duration": 5.0}))
+    tape = simulate(find_scenario("osprey_servo", 5.0))
     ended, sent, missed = termination(), 0, 0
     with open_node("publisher") as node:
         publishers = [node.create_publisher(topic.type, topic.name, PUBLISH) for topic in TOPICS]

@@ -378,7 +378,7 @@ def full_load() -> Iterator[None]:
 
 def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
     """CPU and memory of each process of a flight in real time."""
-    scenario = find_scenario(SCENARIO).vary(flight={"duration": seconds})
+    scenario = find_scenario(SCENARIO, seconds)
     run = folder / "flight"
     run.mkdir()
     with Child("idle") as child:

@@ -72,7 +72,7 @@ def write_long_log(run: Path, hours: float) -> None:
     """Repeat a flight of PIECE s with moved stamps, with a chunk each 0.1 s as the recorder writes
     them.
     """
-    scenario = find_scenario(SCENARIO).vary(flight={"duration": PIECE})
+    scenario = find_scenario(SCENARIO, PIECE)
     with tempfile.TemporaryDirectory() as folder:
         write_run(simulate(scenario), Path(folder), attachments_for(scenario, Path(folder)))
         messages = [

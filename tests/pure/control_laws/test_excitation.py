@@ -61,10 +61,8 @@ def excited(params: ExcitationConfig) -> FloatArray:
 
 
 def flight(**changes: Any) -> Scenario:
-    calm = find_scenario("osprey_servo").vary(
-        aircraft={"gusts": {}},
-        reference_model={"pulses": {}, "coordinated_turn": None},
-        flight={"duration": 12.0},
+    calm = find_scenario("osprey_servo", 12.0).vary(
+        aircraft={"gusts": {}}, reference_model={"pulses": {}, "coordinated_turn": None}
     )
     return replace(calm, controller=controller(**changes))
 

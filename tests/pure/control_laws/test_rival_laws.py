@@ -54,7 +54,7 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 @pytest.fixture(scope="module")
 def osprey() -> NominalModel:
     """The osprey without actuators or limits."""
-    return tuning.build_benchmark(find_scenario("osprey_gust").vary(flight={"duration": 0.1})).model
+    return tuning.build_benchmark(find_scenario("osprey_gust", 0.1)).model
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:

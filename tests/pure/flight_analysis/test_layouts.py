@@ -47,7 +47,7 @@ TABS = {
 @pytest.fixture(scope="module", params=["osprey_gust", "osprey_servo"])
 def tape(request: pytest.FixtureRequest) -> Tape:
     """A run; the layout of osprey_gust fits both scenarios."""
-    return simulate(find_scenario(request.param).vary(flight={"duration": 0.1}))
+    return simulate(find_scenario(request.param, 0.1))
 
 
 def leaves(tree: Any) -> Iterator[str]:

@@ -45,11 +45,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 pytestmark = pytest.mark.slow
 
 app = application([*COMMANDS])
-GUST = find_scenario("osprey_gust").vary(
-    flight={"duration": 4.0},
-    aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}},
+GUST = find_scenario("osprey_gust", 4.0).vary(
+    aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
 )
-SERVO = find_scenario("osprey_servo").vary(flight={"duration": 4.0})
+SERVO = find_scenario("osprey_servo", 4.0)
 LEADING = with_feedforward(SERVO.controller, load_airframe("osprey"))
 LOST = {
     "rate": 100.0,

@@ -37,7 +37,7 @@ def servo() -> RecordedFlight:
     """Seven seconds with noise and commands from 2 s on: more samples than are drawn before a
     zoom.
     """
-    scenario = find_scenario("osprey_servo").vary(flight={"duration": 7.0})
+    scenario = find_scenario("osprey_servo", 7.0)
     return recorded("servo", scenario, simulate(scenario))
 
 

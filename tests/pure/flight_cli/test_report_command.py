@@ -26,7 +26,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two flights of two seconds, of different scenarios."""
     folder, runs = tmp_path_factory.mktemp("runs"), []
     for name in ("osprey_gust", "osprey_servo"):
-        scenario = find_scenario(name).vary(flight={"duration": 2.0})
+        scenario = find_scenario(name, 2.0)
         run = new_run(scenario, folder)
         write_report(run, fly_in_process(scenario, run, lambda t, output: None))
         runs.append(run)

@@ -154,9 +154,8 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     of q do not wind up.
     """
     stop = [0.01, 0.5, 0.3, 0.3]
-    scenario = find_scenario("osprey_servo").vary(
-        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0]),
-        flight={"duration": 10.0},
+    scenario = find_scenario("osprey_servo", 10.0).vary(
+        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0])
     )
     tape = simulate(scenario)
     assert tape.outcome == "completed"
@@ -202,7 +201,7 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
     """
     monkeypatch.chdir(REPOSITORY)  # the scenario names its airframe from there
     path = "examples/hexarotor/hexarotor_flight.yaml"
-    scenario = find_scenario(path).vary(flight={"duration": 3.0})
+    scenario = find_scenario(path, 3.0)
     tape = simulate(scenario)
     assert tape.outcome == "completed"
     assert max(np.abs(tape["internals"][f"e.{name}"]).max() for name in "pq") < 0.5 / 6.0
