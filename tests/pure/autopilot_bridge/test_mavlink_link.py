@@ -81,6 +81,13 @@ class Ends(NamedTuple):
     link: Callable[..., tuple[Link, int]]
     peer: Callable[..., Peer]
 
+    def started(self, *names: str, **options: Any) -> Any:
+        """A link that receives, its port, and the queues of the messages of some names."""
+        made, port = self.link(**options)
+        queues = [made.listen(name) for name in names]
+        made.start()
+        return made, port, *queues
+
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
@@ -115,6 +122,13 @@ def ends() -> Iterator[Ends]:
         end.connection.close()
 
 
+@pytest.fixture
+def phrase(tmp_path: Path) -> str:
+    """The file of a passphrase."""
+    (tmp_path / "passphrase").write_text("a phrase\n")
+    return str(tmp_path / "passphrase")
+
+
 BEAT = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4, 3)
 
 
@@ -146,8 +160,7 @@ def until(condition: Callable[[], object], each: Callable[[], object]) -> None:
 
 
 def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) -> None:
-    made, port = ends.link(ATTITUDE=50.0, VFR_HUD=20.0)
-    made.start()
+    made, port = ends.started(ATTITUDE=50.0, VFR_HUD=20.0)
     peer = ends.peer(port)
     peer.beat()
     until(lambda: made.problem("ATTITUDE") and len(peer.requested) == 2, peer.answer)
@@ -165,9 +178,7 @@ def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) ->
 def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others_do_not(
     ends: Ends,
 ) -> None:
-    made, port = ends.link()
-    queue = made.listen("ATTITUDE")
-    made.start()
+    made, port, queue = ends.started("ATTITUDE")
     before = time.time_ns()
     ends.peer(port, system=2).connection.mav.attitude_send(1, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9)
     peer = ends.peer(port)
@@ -183,8 +194,7 @@ def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others
 
 
 def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) -> None:
-    made, port = ends.link()
-    made.start()
+    made, port = ends.started()
     peer = ends.peer(port)
     peer.beat()
     message = message_type("RC_CHANNELS_OVERRIDE")()
@@ -217,9 +227,7 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of
     this host.
     """
-    made, port = ends.link()
-    queue = made.listen("ATTITUDE")
-    made.start()
+    made, port, queue = ends.started("ATTITUDE")
     autopilot, second = ends.peer(port), ends.peer(port)
     autopilot.attitude(0.1, since_boot=50.0)
     until(lambda: queue, autopilot.received)
@@ -252,8 +260,7 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
-    made, port = ends.link(HEARTBEAT=5.0)
-    made.start()
+    made, port = ends.started(HEARTBEAT=5.0)
     first, second = ends.peer(port), ends.peer(port)
     until(first.received, first.beat)
     until(second.received, second.beat)
@@ -272,8 +279,7 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
 def test_conflict_of_second_sender_ends_after_its_last_message(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, port = ends.link()
-    made.start()
+    made, port = ends.started()
     autopilot, second = ends.peer(port), ends.peer(port)
     autopilot.beat()
     until(lambda: made.conflict, second.beat)
@@ -286,9 +292,7 @@ def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends
     """Two autopilots with one number behind a router have one address, and times since boot of
     their own.
     """
-    made, port = ends.link()
-    queue = made.listen("ATTITUDE")
-    made.start()
+    made, port, queue = ends.started("ATTITUDE")
     router = ends.peer(port)
     for pitchspeed, since_boot in (
         (0.1, 100.0),
@@ -307,9 +311,7 @@ def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) ->
     """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves,
     on the link or beside it.
     """
-    made, port = ends.link()
-    queue = made.listen("ATTITUDE")
-    made.start()
+    made, port, queue = ends.started("ATTITUDE")
     autopilot = ends.peer(port)
     autopilot.attitude(0.1, since_boot=50.0)
     for component in (154, 191, 0):
@@ -343,8 +345,7 @@ def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
 
 
 def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:
-    made, port = ends.link()
-    made.start()
+    made, port = ends.started()
     other = ends.peer(port, system=255)
     until(lambda: made.conflict, other.beat)
     assert "another sender" in made.conflict
@@ -378,8 +379,7 @@ def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(
 
 
 def test_other_bridge_is_conflict(ends: Ends) -> None:
-    made, port = ends.link()
-    made.start()
+    made, port = ends.started()
     second = ends.peer(port, system=1)
     second.connection.mav.srcComponent = COMPANION
     until(lambda: made.conflict, second.beat)
@@ -390,13 +390,12 @@ def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) 
     """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none
     of the map, has none.
     """
-    made, port = ends.link(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
-    made.start()
+    made, port = ends.started(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
     peer, messages = ends.peer(port), list[Any]()
 
     def take() -> None:
         peer.beat()
-        messages.extend(message for message in [peer.answer()] if message is not None)
+        messages.extend(filter(None, [peer.answer()]))
 
     until(
         lambda: (
@@ -514,8 +513,7 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
 
 
 def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:
-    made, port = ends.link()
-    made.start()
+    made, port = ends.started()
     station = ends.peer(port, system=254)
     until(
         lambda: made.stations,
@@ -526,12 +524,9 @@ def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: E
 
 
 def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(
-    ends: Ends, tmp_path: Path
+    ends: Ends, phrase: str
 ) -> None:
-    (tmp_path / "passphrase").write_text("a phrase\n")
-    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
-    queue = made.listen("HEARTBEAT")
-    made.start()
+    made, port, queue = ends.started("HEARTBEAT", passphrase_file=phrase)
     other = ends.peer(port, phrase="another")
     until(lambda: made._refused, other.beat)
     assert not queue
@@ -541,7 +536,7 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(
 
     def take() -> None:
         peer.beat()
-        taken.extend(message for message in [peer.answer()] if message is not None)
+        taken.extend(filter(None, [peer.answer()]))
 
     until(lambda: taken, take)
     assert taken[0].get_signed()
@@ -556,12 +551,9 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(
 
 
 def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphrase(
-    ends: Ends, tmp_path: Path
+    ends: Ends, phrase: str
 ) -> None:
-    (tmp_path / "passphrase").write_text("a phrase\n")
-    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
-    queue = made.listen("HEARTBEAT")
-    made.start()
+    made, port, queue = ends.started("HEARTBEAT", passphrase_file=phrase)
     peer = ends.peer(port, phrase="a phrase")
     until(lambda: queue, peer.beat)
     signing = peer.connection.mav.signing
@@ -577,16 +569,13 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
 
 
 def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
-    ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ends: Ends, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier
     one has set this variable.
     """
     monkeypatch.delenv("MAVLINK20", raising=False)
-    (tmp_path / "passphrase").write_text("a phrase\n")
-    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
-    queue = made.listen("HEARTBEAT")
-    made.start()
+    made, port, queue = ends.started("HEARTBEAT", passphrase_file=phrase)
     until(lambda: made._refused, ends.peer(port).beat)
     assert not queue
 
