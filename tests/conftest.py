@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of all tests: the default scenario and the log of a flight."""
 
+import asyncio
 import os
 import shutil
 import subprocess
 import tempfile
 from contextlib import AbstractContextManager
+from inspect import iscoroutinefunction, signature
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,17 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
         config.add_cleanup(folder.cleanup)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a coroutine, for at most a minute."""
+    if not iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = signature(pyfuncitem.obj).parameters
+    test = pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names})
+    asyncio.run(asyncio.wait_for(test, 60.0))
+    return True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

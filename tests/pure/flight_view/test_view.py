@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -389,19 +389,6 @@ async def serving(*runs: Path) -> AsyncIterator[Server]:
         await server.close()
 
 
-def against(*runs: Path) -> Callable[[Callable[[Server], Coroutine[Any, Any, None]]], None]:
-    """Run a coroutine against a server of these runs."""
-
-    def start(client: Callable[[Server], Coroutine[Any, Any, None]]) -> None:
-        async def both() -> None:
-            async with serving(*runs) as server:
-                await asyncio.wait_for(client(server), 60.0)
-
-        asyncio.run(both())
-
-    return start
-
-
 async def get(
     server: Server, path: str, method: str = "GET", token: str = TOKEN, **headers: str
 ) -> HTTPResponse:
@@ -417,10 +404,9 @@ async def get(
     )
 
 
-def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
+async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     """The page asks no other host."""
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         page = await get(
             server, "/", token=""
         )  # a browser sends no header with the address of a page
@@ -441,7 +427,6 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
         )  # more digits than Python converts
         assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
-    against(recorded)(client)
     for file in FILES.values():
         text = file.read_text()
         assert "://" not in text
@@ -460,13 +445,11 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
         ("/", "OPTIONS", {}, 405),
     ],
 )
-def test_foreign_host_another_path_and_another_method_refused(
+async def test_foreign_host_another_path_and_another_method_refused(
     path: str, method: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         assert (await get(server, path, method, **headers)).code == expected
-
-    against(recorded)(client)
 
 
 @pytest.mark.parametrize("path", ["/data/0", "/nothing", "/data/0?token=" + TOKEN])
@@ -474,16 +457,15 @@ def test_foreign_host_another_path_and_another_method_refused(
     "headers",
     [{}, {"Cookie": f"token={TOKEN}"}, {http.TOKEN_HEADER: "another"}, {http.TOKEN_HEADER: "\xff"}],
 )
-def test_no_sample_served_without_token(path: str, headers: dict[str, str], recorded: Path) -> None:
+async def test_no_sample_served_without_token(
+    path: str, headers: dict[str, str], recorded: Path
+) -> None:
     """Neither the query, which a log of addresses may keep, nor a cookie, which goes to all ports
     of a host, has the token.
     """
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         response = await get(server, path, token="", **headers)
         assert (response.code, response.body) == (401, f"401: {http.NO_TOKEN}\n".encode())
-
-    against(recorded)(client)
 
 
 Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -506,12 +488,11 @@ def end(*connections: Connection) -> None:
         writer.close()
 
 
-def test_connections_without_token_leave_place(recorded: Path) -> None:
+async def test_connections_without_token_leave_place(recorded: Path) -> None:
     """A new connection takes the place of the oldest connection without the token; the page is
     served throughout.
     """
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         idle = await connect(server, count=1000)
         assert (await get(server, "/data/0")).code == 200
         limit = http.MAX_CONNECTIONS + http.RESERVED
@@ -519,8 +500,6 @@ def test_connections_without_token_leave_place(recorded: Path) -> None:
             assert await rest_of(reader) == b""  # closed
         assert not any(reader.at_eof() for reader, _ in idle[2 - limit :])
         end(*idle)
-
-    against(recorded)(client)
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
@@ -533,10 +512,10 @@ async def rest_of(reader: asyncio.StreamReader) -> bytes:
         return b""
 
 
-def test_slow_or_long_request_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_slow_or_long_request_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
 
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
 
         async def drip() -> None:
@@ -553,17 +532,15 @@ def test_slow_or_long_request_closed(recorded: Path, monkeypatch: pytest.MonkeyP
         assert (await rest_of(reader))[:12] in {b"", b"HTTP/1.1 400"}
         writer.close()
 
-    against(recorded)(client)
 
-
-def test_browser_waits_for_next_samples(
+async def test_browser_waits_for_next_samples(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A browser that knows all rows gets the next samples as the answer."""
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
 
-    async def client(server: Server) -> None:
+    async with serving(tmp_path) as server:
         rows: dict[str, int] = {}
         head: dict[str, Any] = {}
         while head.get("state") != "ended":
@@ -574,8 +551,6 @@ def test_browser_waits_for_next_samples(
                 rows[name] = rows.get(name, 0) + len(t)
             path.write_bytes(content)
         assert rows == {name: samples.count for name, samples in server.flights[0].samples.items()}
-
-    against(tmp_path)(client)
 
 
 async def stream(server: Server, token: str | bytes = TOKEN) -> WebSocketClientConnection:
@@ -608,10 +583,9 @@ UPGRADE = {
 UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
 
 
-def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
+async def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
     """A message is answered as a request by HTTP."""
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         await whole_log(server)  # else the second answer may have more rows than the first
         socket = await stream(server)
         await socket.write_message("")
@@ -630,8 +604,6 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
         assert (columns, head["events"], "flight" in head) == ({}, [], False)
         socket.close()
 
-    against(recorded)(client)
-
 
 @pytest.mark.parametrize(
     "path, headers, expected",
@@ -643,38 +615,34 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
         ("/news/1", {}, 404),
     ],
 )
-def test_foreign_websocket_refused(
+async def test_foreign_websocket_refused(
     path: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
     """A WebSocket of a foreign page or host is refused, and of an unknown flight."""
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
         assert (
             await get(server, path, **{name: text for name, text in given.items() if text})
         ).code == expected
 
-    against(recorded)(client)
-
 
 @pytest.mark.parametrize("token", ["", b"another", "epoch=&y=0"])
-def test_websocket_whose_first_message_is_not_the_token_closed(
+async def test_websocket_whose_first_message_is_not_the_token_closed(
     token: str | bytes, recorded: Path
 ) -> None:
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         socket = await stream(server, token)
         await socket.write_message("")
         assert await socket.read_message() is None
         assert (socket.close_code, socket.close_reason) == (1008, http.NO_TOKEN)
         socket.close()
 
-    against(recorded)(client)
 
-
-def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_idle_or_surplus_websockets_closed(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """WebSockets without a request are closed, and WebSockets beyond the limit."""
-
-    async def client(server: Server) -> None:
+    async with serving(recorded) as server:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
         surplus = await stream(server)
         assert await surplus.read_message() is None
@@ -689,10 +657,8 @@ def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.M
         await left(server)
         silent.close()
 
-    against(recorded)(client)
 
-
-def test_websocket_without_reader_gets_few_answers(
+async def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A WebSocket asks and reads no answer: the server makes few answers, ends the WebSocket, and
@@ -706,7 +672,8 @@ def test_websocket_without_reader_gets_few_answers(
 
     monkeypatch.setattr(http, "answer", big)
 
-    async def client(server: Server) -> None:
+    browser = socket.socket()
+    async with serving(recorded) as server:
         browser.connect(("127.0.0.1", server.port))
         address = f"127.0.0.1:{server.port}"
         head = {"Host": address, "Origin": f"http://{address}"} | UPGRADE
@@ -729,20 +696,17 @@ def test_websocket_without_reader_gets_few_answers(
         monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
         await left(server)
 
-    with socket.socket() as browser:
-        against(recorded)(client)
+    browser.close()
     assert caplog.records == []
 
 
-def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
-    async def client(server: Server) -> None:
+async def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
+    async with serving(recorded) as server:
         with socket.socket() as other:
             other.settimeout(5.0)
             assert other.connect_ex(("127.0.0.2", server.port)) != 0
         with pytest.raises(OSError, match="in use"):
             Server([], TOKEN).listen(server.port)
-
-    against(recorded)(client)
 
 
 # Which run

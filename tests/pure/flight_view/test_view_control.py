@@ -7,7 +7,7 @@ lease.
 import asyncio
 import json
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,167 +72,138 @@ def with_desk(desk: Desk, steps: Callable[[Desk], Coroutine[Any, Any, None]]) ->
 
 
 @pytest.fixture
-def desk(recorded: Path, osprey_gust: Scenario) -> Desk:
-    return Desk(recorded, osprey_gust)
+def desk(recorded: Path, osprey_gust: Scenario) -> Iterator[Desk]:
+    made = Desk(recorded, osprey_gust)
+    yield made
+    made.control.close()
 
 
-def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scenario) -> None:
+async def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scenario) -> None:
     base = osprey_gust.controller
 
-    async def steps(desk: Desk) -> None:
-        state = await desk.ask("state")
-        assert {gain["name"]: tuple(gain["values"]) for gain in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
-        assert {gain["name"]: gain["ranges"] for gain in state["gains"]}["k_g"] == [
-            [0.5 * base.k_g, 2.0 * base.k_g]  # type: ignore[attr-defined]
-        ]
-        assert state["digest"] == state["logged"] == f"{base.digest():012x}"
-        changed = await desk.ask(
-            "gains",
-            digest=state["digest"],
-            values={"k_g": [1.2 * base.k_g], "softening": [2.0]},  # type: ignore[attr-defined]
-        )
-        assert (changed["undo"], changed["logged"]) == (
-            1,
-            state["digest"],
-        )  # the log is that of before
-        assert changed["digest"] != state["digest"]
-        assert desk.nodes.values["controller"]["k_g"] == 1.2 * base.k_g  # type: ignore[attr-defined]
-        assert desk.nodes.notes[-1].startswith("control: ")
-        assert "k_g" in desk.nodes.notes[-1]
-        undone = await desk.ask("undo", digest=changed["digest"])
-        assert (undone["undo"], undone["digest"]) == (0, state["digest"])
-        assert await desk.refused("undo", digest=undone["digest"]) == (
-            422,
-            "there is nothing to undo",
-        )
-
-    with_desk(desk, steps)
+    state = await desk.ask("state")
+    assert {gain["name"]: tuple(gain["values"]) for gain in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
+    assert {gain["name"]: gain["ranges"] for gain in state["gains"]}["k_g"] == [
+        [0.5 * base.k_g, 2.0 * base.k_g]  # type: ignore[attr-defined]
+    ]
+    assert state["digest"] == state["logged"] == f"{base.digest():012x}"
+    changed = await desk.ask(
+        "gains",
+        digest=state["digest"],
+        values={"k_g": [1.2 * base.k_g], "softening": [2.0]},  # type: ignore[attr-defined]
+    )
+    assert (changed["undo"], changed["logged"]) == (1, state["digest"])  # the log is that of before
+    assert changed["digest"] != state["digest"]
+    assert desk.nodes.values["controller"]["k_g"] == 1.2 * base.k_g  # type: ignore[attr-defined]
+    assert desk.nodes.notes[-1].startswith("control: ")
+    assert "k_g" in desk.nodes.notes[-1]
+    undone = await desk.ask("undo", digest=changed["digest"])
+    assert (undone["undo"], undone["digest"]) == (0, state["digest"])
+    assert await desk.refused("undo", digest=undone["digest"]) == (422, "there is nothing to undo")
 
 
-def test_set_after_foreign_change_refused(desk: Desk) -> None:
+async def test_set_after_foreign_change_refused(desk: Desk) -> None:
     """A set after a change by a different program is refused."""
-
-    async def steps(desk: Desk) -> None:
-        digest = (await desk.ask("state"))["digest"]
-        desk.nodes.values["controller"]["k_g"] *= 1.1
-        status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
-        assert (status, sentence) == (
-            409,
-            "the parameters have been changed meanwhile: look at them, then apply again",
-        )
-        assert desk.nodes.notes == [
-            f"control: {{'do': 'gains', 'values': {{'k_g': [1.0]}}}} refused: {sentence}"
-        ]
-
-    with_desk(desk, steps)
+    digest = (await desk.ask("state"))["digest"]
+    desk.nodes.values["controller"]["k_g"] *= 1.1
+    status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
+    assert (status, sentence) == (
+        409,
+        "the parameters have been changed meanwhile: look at them, then apply again",
+    )
+    assert desk.nodes.notes == [
+        f"control: {{'do': 'gains', 'values': {{'k_g': [1.0]}}}} refused: {sentence}"
+    ]
 
 
-def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
+async def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
     """A gain beyond the range is refused, an unknown name, and a value that is no number."""
     k_g = gains_of(osprey_gust.controller)["k_g"]
 
-    async def steps(desk: Desk) -> None:
-        digest, before = (await desk.ask("state"))["digest"], dict(desk.nodes.values["controller"])
-        for values, expected in (
-            (
-                {"k_g": [2.1 * k_g]},
-                f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}",
-            ),
-            ({"k_g": [-1.0]}, "k_g: found -1, expected"),
-            ({"k_g": [True]}, "'k_g': found True, expected a number"),
-            ({"k_g": [k_g, k_g]}, "k_g: found 2 values, expected 1"),
-            ({"D": [1, 1, 1, 1]}, "'D': no gain, expected one of"),
-            ({}, "values: expected values by name"),
-        ):
-            status, sentence = await desk.refused("gains", digest=digest, values=values)
-            assert status == 400
-            assert sentence.startswith(expected)
-        assert desk.nodes.values["controller"] == before
-
-    with_desk(desk, steps)
+    digest, before = (await desk.ask("state"))["digest"], dict(desk.nodes.values["controller"])
+    for values, expected in (
+        ({"k_g": [2.1 * k_g]}, f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}"),
+        ({"k_g": [-1.0]}, "k_g: found -1, expected"),
+        ({"k_g": [True]}, "'k_g': found True, expected a number"),
+        ({"k_g": [k_g, k_g]}, "k_g: found 2 values, expected 1"),
+        ({"D": [1, 1, 1, 1]}, "'D': no gain, expected one of"),
+        ({}, "values: expected values by name"),
+    ):
+        status, sentence = await desk.refused("gains", digest=digest, values=values)
+        assert status == 400
+        assert sentence.startswith(expected)
+    assert desk.nodes.values["controller"] == before
 
 
-def test_wrong_key_refused_and_delays_next_one(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        assert (await desk.refused("deactivate", key="ABCD-EFGX"))[0] == 403
-        assert desk.nodes.notes == []  # who lacks the key does not fill the log
-        desk.time -= 1.0  # the next request comes at the same time
-        assert (await desk.refused("state"))[0] == 429
-        assert await desk.ask("state", key="abcdefgh")  # as typed
-        assert (await desk.refused("state", key="ABCD-EFGX", lease="another"))[0] == 403
-        desk.time -= 1.0
-        assert await desk.ask("state")  # the page that has control is not delayed
-
-    with_desk(desk, steps)
+async def test_wrong_key_refused_and_delays_next_one(desk: Desk) -> None:
+    assert (await desk.refused("deactivate", key="ABCD-EFGX"))[0] == 403
+    assert desk.nodes.notes == []  # who lacks the key does not fill the log
+    desk.time -= 1.0  # the next request comes at the same time
+    assert (await desk.refused("state"))[0] == 429
+    assert await desk.ask("state", key="abcdefgh")  # as typed
+    assert (await desk.refused("state", key="ABCD-EFGX", lease="another"))[0] == 403
+    desk.time -= 1.0
+    assert await desk.ask("state")  # the page that has control is not delayed
     assert len({new_key() for _ in range(100)}) == 100
 
 
-def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        first = (await desk.ask("state"))["lease"]
-        assert (await desk.refused("state", lease="another"))[0] == 423
-        assert (await desk.ask("hold"))["lease"] == first
-        desk.time += LEASE
-        assert (await desk.ask("state", lease="another"))["lease"] != first
-
-    with_desk(desk, steps)
+async def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
+    first = (await desk.ask("state"))["lease"]
+    assert (await desk.refused("state", lease="another"))[0] == 423
+    assert (await desk.ask("hold"))["lease"] == first
+    desk.time += LEASE
+    assert (await desk.ask("state", lease="another"))["lease"] != first
 
 
-def test_commands_reach_guidance(desk: Desk) -> None:
+async def test_commands_reach_guidance(desk: Desk) -> None:
     """Targets, routes and services reach guidance, and refusals come back."""
-
-    async def steps(desk: Desk) -> None:
-        await desk.ask("target", values={"heading": 1.5, "altitude": 60})
-        await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
-        await desk.ask("hold")
-        assert desk.nodes.done == [
-            ("target", {"heading": 1.5, "altitude": 60.0}),
-            ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
-        ]  # fmt: skip
-        assert await desk.refused("skip") == (422, "no route with a further leg is flown")
-        assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
-        for points in (
-            [[0, 0, 0]],
-            [[0, 0], [1, 1]],
-            "north",
-            [["a", 0, 0], [0, 0, 0]],
-            [[0, 0, None], [0, 0, 0]],
-        ):
-            assert (await desk.refused("route", points=points))[0] == 400
-        assert (await desk.refused("fly"))[0] == 400
-
-    with_desk(desk, steps)
+    await desk.ask("target", values={"heading": 1.5, "altitude": 60})
+    await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
+    await desk.ask("hold")
+    assert desk.nodes.done == [
+        ("target", {"heading": 1.5, "altitude": 60.0}),
+        ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
+    ]  # fmt: skip
+    assert await desk.refused("skip") == (422, "no route with a further leg is flown")
+    assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
+    for points in (
+        [[0, 0, 0]],
+        [[0, 0], [1, 1]],
+        "north",
+        [["a", 0, 0], [0, 0, 0]],
+        [[0, 0, None], [0, 0, 0]],
+    ):
+        assert (await desk.refused("route", points=points))[0] == 400
+    assert (await desk.refused("fly"))[0] == 400
 
 
-def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        state = await desk.ask("state")
-        assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
-        stuck = ["elevator stuck 0"]
-        changed = await desk.ask(
-            "fault", values={"actuators.faults": stuck, "sensors.dropout": 0.2}
-        )
-        assert changed["faults"]["sensors.dropout"] == 0.2
-        assert desk.nodes.values["aircraft"]["actuators.faults"] == stuck
-        await desk.ask("fault", values={"actuators.faults": []})
-        assert desk.nodes.values["aircraft"]["actuators.faults"] == []
-        assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
-        desk.nodes.values["aircraft"]["sensors.bias"] = [0.0, 0.0, 0.0, 0.3]  # by another program
-        assert (await desk.ask("state"))["faults"]["sensors.bias"] == [0.0, 0.0, 0.0, 0.3]
-        await desk.ask("gust", axis="lateral", speed=3, length=20)
-        assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(
-            desk.flight.end + 0.2
-        )
-        for do, request, expected in (
-            ("fault", {"values": {"sensors.dropout": 2.0}}, 422),
-            ("fault", {"values": {"rate": 100.0}}, 400),
-            ("gust", {"axis": "sideways", "speed": 3, "length": 20}, 422),
-            ("gust", {"axis": "\ud800", "speed": 3, "length": 20}, 400),
-            ("gust", {"axis": "lateral", "speed": None, "length": 20}, 400),
-        ):
-            assert (await desk.refused(do, **request))[0] == expected
-
-    with_desk(desk, steps)
+async def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
+    state = await desk.ask("state")
+    assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
+    stuck: list[float | None] = [0, None, None, None]
+    changed = await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+    assert changed["faults"]["sensors.dropout"] == 0.2
+    assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [
+        0.0,
+        math.inf,
+        math.inf,
+        math.inf,
+    ]
+    assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
+    desk.nodes.values["aircraft"]["sensors.bias"] = [0.0, 0.0, 0.0, 0.3]  # by another program
+    assert (await desk.ask("state"))["faults"]["sensors.bias"] == [0.0, 0.0, 0.0, 0.3]
+    await desk.ask("gust", axis="lateral", speed=3, length=20)
+    assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(
+        desk.flight.end + 0.2
+    )
+    for do, request, expected in (
+        ("fault", {"values": {"sensors.dropout": 2.0}}, 422),
+        ("fault", {"values": {"rate": 100.0}}, 400),
+        ("gust", {"axis": "sideways", "speed": 3, "length": 20}, 422),
+        ("gust", {"axis": "\ud800", "speed": 3, "length": 20}, 400),
+        ("gust", {"axis": "lateral", "speed": None, "length": 20}, 400),
+    ):
+        assert (await desk.refused(do, **request))[0] == expected
 
 
 def test_gains_of_bridge_that_sends_need_further_option(
@@ -277,24 +248,21 @@ def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> No
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
-def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
+async def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
     begun, end = threading.Event(), threading.Event()
 
     def assess(scenario: Scenario, params: ControllerConfig) -> dict[str, Any]:
         begun.set()
         return {"in time": end.wait(20.0)}
 
-    async def steps(desk: Desk) -> None:
-        desk.control = Control(desk.flight, desk.nodes, KEY, assess=assess, now=lambda: desk.time)
-        await desk.ask("state")
-        margins = asyncio.ensure_future(desk.ask("check", values={"k_g": [1.0]}))
-        await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
-        await desk.ask("deactivate")
-        end.set()
-        assert await margins == {"in time": True}
-        assert desk.nodes.done == [("activate", False)]
-
-    with_desk(desk, steps)
+    desk.control = Control(desk.flight, desk.nodes, KEY, assess=assess, now=lambda: desk.time)
+    await desk.ask("state")
+    margins = asyncio.ensure_future(desk.ask("check", values={"k_g": [1.0]}))
+    await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
+    await desk.ask("deactivate")
+    end.set()
+    assert await margins == {"in time": True}
+    assert desk.nodes.done == [("activate", False)]
 
 
 # Actions by state
@@ -325,7 +293,7 @@ NOTHING_TO_DO = ("undo", "skip")  # 422: no change to undo, no further leg
 
 @pytest.mark.parametrize("action", REQUESTS)
 @pytest.mark.parametrize("state", ["reading", "recording", *OVER])
-def test_action_by_key_lease_rate_and_state(
+async def test_action_by_key_lease_rate_and_state(
     state: str, action: str, recorded: Path, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each cell of the table: who asks for which action in which state of the flight."""
@@ -350,24 +318,21 @@ def test_action_by_key_lease_rate_and_state(
             return int(error.status)
         return 200
 
-    async def steps(desk: Desk) -> None:
-        nonlocal digest
-        digest = (await desk.ask("state"))["digest"]
-        refused = 409 if state in OVER and action not in ALLOWED_AFTER_END else 0
-        assert await status(key="ABCD-EFGX") == 403
-        desk.time += 5.0 * KEY_PERIOD
-        desk.lease = (await desk.ask("state"))["lease"]
-        assert await status(lease="another") == (refused or 423)
-        assert desk.nodes.done == []
-        desk.time += BURST
-        for _ in range(int(BURST)):
-            await desk.ask("state")
-            desk.time -= 1.0
-        assert await status() == (200 if action in {"deactivate", "disengage"} else 429)
-        desk.time += 2.0
-        assert await status() == (refused or (422 if action in NOTHING_TO_DO else 200))
-
-    with_desk(desk, steps)
+    digest = (await desk.ask("state"))["digest"]
+    refused = 409 if state in OVER and action not in ALLOWED_AFTER_END else 0
+    assert await status(key="ABCD-EFGX") == 403
+    desk.time += 5.0 * KEY_PERIOD
+    desk.lease = (await desk.ask("state"))["lease"]
+    assert await status(lease="another") == (refused or 423)
+    assert desk.nodes.done == []
+    desk.time += BURST
+    for _ in range(int(BURST)):
+        await desk.ask("state")
+        desk.time -= 1.0
+    assert await status() == (200 if action in {"deactivate", "disengage"} else 429)
+    desk.time += 2.0
+    assert await status() == (refused or (422 if action in NOTHING_TO_DO else 200))
+    desk.control.close()
 
 
 # Over HTTP
@@ -392,38 +357,35 @@ async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
     )
 
 
-def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        server = Server([desk.flight], TOKEN, desk.control)
-        server.listen(0)
-        port, state = server.port, {"do": "state"}
-        try:
-            for body, headers, expected in (
-                (state, {TOKEN_HEADER: ""}, 401),
-                (state, {"Origin": ""}, 403),
-                (state, {"Origin": "null"}, 403),
-                (state, {"Origin": f"http://127.0.0.1.evil.example:{port}"}, 403),
-                (state, {"Origin": f"http://127.0.0.1:{port + 1}"}, 403),
-                (state, {"Origin": f"https://127.0.0.1:{port}"}, 403),
-                (state, {"Origin": f"http://localhost:{port}"}, 403),  # the page has the other name
-                (state, {"Content-Type": "text/plain"}, 415),
-                (state, {"Content-Type": "application/x-www-form-urlencoded"}, 415),
-                ("{", {}, 400),
-                ("[" * 5000, {}, 400),
-                ('{"do": NaN}', {}, 400),
-                ([], {}, 400),
-                (state, {"X-Control-Key": ""}, 403),
-            ):
-                assert (await post(server, body, **headers)).code == expected, (body, headers)
-            desk.time += 10.0
-            good = await post(server, state)
-            assert (good.code, json.loads(good.body)["nodes"]) == (200, list(ALL))
-            held = await post(server, state)
-            assert (held.code, "another page" in json.loads(held.body)["refused"]) == (423, True)
-            assert (
-                await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})
-            ).code == 200
-        finally:
-            await server.close()
-
-    with_desk(desk, steps)
+async def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
+    server = Server([desk.flight], TOKEN, desk.control)
+    server.listen(0)
+    port, state = server.port, {"do": "state"}
+    try:
+        for body, headers, expected in (
+            (state, {TOKEN_HEADER: ""}, 401),
+            (state, {"Origin": ""}, 403),
+            (state, {"Origin": "null"}, 403),
+            (state, {"Origin": f"http://127.0.0.1.evil.example:{port}"}, 403),
+            (state, {"Origin": f"http://127.0.0.1:{port + 1}"}, 403),
+            (state, {"Origin": f"https://127.0.0.1:{port}"}, 403),
+            (state, {"Origin": f"http://localhost:{port}"}, 403),  # the page has the other name
+            (state, {"Content-Type": "text/plain"}, 415),
+            (state, {"Content-Type": "application/x-www-form-urlencoded"}, 415),
+            ("{", {}, 400),
+            ("[" * 5000, {}, 400),
+            ('{"do": NaN}', {}, 400),
+            ([], {}, 400),
+            (state, {"X-Control-Key": ""}, 403),
+        ):
+            assert (await post(server, body, **headers)).code == expected, (body, headers)
+        desk.time += 10.0
+        good = await post(server, state)
+        assert (good.code, json.loads(good.body)["nodes"]) == (200, list(ALL))
+        held = await post(server, state)
+        assert (held.code, "another page" in json.loads(held.body)["refused"]) == (423, True)
+        assert (
+            await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})
+        ).code == 200
+    finally:
+        await server.close()

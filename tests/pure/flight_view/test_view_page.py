@@ -31,10 +31,7 @@ from flight_view.control import Control
 from flight_view.flight import Flight
 from flight_view.server import Server
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 TOKEN = "a-token"  # noqa: S105 - of a test
 STATE = "document.getElementById('state')?.textContent"
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
