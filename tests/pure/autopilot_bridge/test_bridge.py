@@ -69,9 +69,13 @@ def ready_bridge(
     return bridge
 
 
+def engage(bridge: Bridge, t: float = 0.0, *, blind: bool = False) -> None:
+    assert bridge.engage(at(t), blind=blind) == ""
+
+
 def engaged_bridge(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
     bridge = ready_bridge(channel_map=channel_map)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     return bridge
 
 
@@ -91,7 +95,7 @@ def test_only_service_engages_and_only_with_fresh_y_and_u() -> None:
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
         receive(bridge, 0.0)
     assert bridge.step(at(0.0)) is Phase.DISENGAGED
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     assert bridge.step(at(0.0)) is Phase.ENGAGED
 
 
@@ -158,7 +162,7 @@ def test_bridge_does_not_re_engage_by_itself() -> None:
     assert bridge.step(at(0.3)) is Phase.NEUTRAL
     receive_u(bridge, 0.31)
     assert bridge.step(at(0.32)) is Phase.NEUTRAL
-    assert bridge.engage(at(0.33)) == ""  # a request re-engages at any time
+    engage(bridge, 0.33)  # a request re-engages at any time
     assert bridge.step(at(0.33)) is Phase.ENGAGED
 
 
@@ -178,7 +182,7 @@ def test_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
     assert bridge.phase is Phase.RELEASE
     assert bridge.engage(at(0.03)) == "pilot override active: gamepad"
     bridge.take_override("gamepad", 0.0, at(0.04))
-    assert bridge.engage(at(0.05)) == ""
+    engage(bridge, 0.05)
 
 
 def test_times_of_zero_skip_neutral_and_release_values() -> None:
@@ -216,7 +220,7 @@ def test_second_publisher_of_topic_of_autopilot_ends_engagement_and_blocks_anoth
     assert bridge.step(at(0.01)) is Phase.RELEASE
     assert bridge.reason == bridge.engage(at(0.02)) == "/ap/twist/filtered has 2 publishers"
     bridge.conflict = ""
-    assert bridge.engage(at(0.03)) == ""
+    engage(bridge, 0.03)
 
 
 def test_engagement_says_which_pilot_override_has_no_effect() -> None:
@@ -340,7 +344,7 @@ def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: s
     content["silence"] = {"max_age": 0.2, "neutral": 5.0, "release": 0.5}
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
     refresh(bridge, 0.0, offboard=14.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     receive_outputs(bridge, 0.25, tuple(bridge.outputs), 21.0)
     assert bridge.step(at(0.25)) is Phase.NEUTRAL
     assert bridge.step(at(0.5)) is Phase.NEUTRAL
@@ -357,7 +361,7 @@ def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_
     assert (
         sent(bridge, 0.0) == set()
     )  # no heartbeat before the request: without it PX4 leaves offboard
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     assert bridge.phase is Phase.ENGAGING
     assert bridge.reason == "the mode is not offboard (nav_state is 4)"
     assert sent(bridge, 0.0) == {"offboard", "enter"}  # no setpoint beside those of PX4's own law
@@ -373,7 +377,7 @@ def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_
 
 def test_engagement_without_awaited_mode_ends_after_time_with_reason() -> None:
     bridge = px4_bridge()
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     refresh(bridge, 4.9)
     assert bridge.step(at(4.9)) is Phase.ENGAGING
     refresh(bridge, 5.1)
@@ -405,7 +409,7 @@ def test_lost_condition_ends_engagement_with_sentence(
     status: dict[str, float], reason: str
 ) -> None:
     bridge = px4_bridge(offboard=14.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     assert bridge.phase is Phase.ENGAGED
     refresh(bridge, 0.1, **({"offboard": 14.0} | status))
     assert bridge.step(at(0.1)) is Phase.RELEASE
@@ -414,7 +418,7 @@ def test_lost_condition_ends_engagement_with_sentence(
 
 def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
     bridge = px4_bridge(offboard=14.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     for t in np.arange(0.1, 1.7, 0.1).tolist():
         receive_outputs(bridge, t, tuple(bridge.outputs))
         receive_u(bridge, t)
@@ -446,7 +450,7 @@ def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
 )
 def test_lost_transmitter_releases_within_a_second(valid: float, reason: str) -> None:
     bridge = px4_bridge(offboard=14.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     assert fly(bridge, 0.05, 3.0) is Phase.ENGAGED
     assert "the loss of the transmitter" not in bridge.reason
     assert fly(bridge, 3.05, 3.96, transmitter=valid) in {Phase.RELEASE, Phase.DISENGAGED}
@@ -456,7 +460,7 @@ def test_lost_transmitter_releases_within_a_second(valid: float, reason: str) ->
 def test_blind_engagement_ignores_the_transmitter() -> None:
     bridge = px4_bridge(offboard=14.0, transmitter=0.0)
     assert bridge.engage(at(0.0)) == "the transmitter is lost (valid is 0)"
-    assert bridge.engage(at(0.0), blind=True) == ""
+    engage(bridge, blind=True)
     assert fly(bridge, 0.05, 3.0, transmitter=0.0) is Phase.ENGAGED
     assert bridge.reason.endswith(
         "the loss of the transmitter is not watched (--blind), and the override by pilot has no "
@@ -475,7 +479,7 @@ def test_unwatched_transmitter_needs_a_bound() -> None:
         "the map, or engage with --blind"
     )
     assert bridge.engage(at(0.0)) == refusal
-    assert bridge.engage(at(0.0), blind=True) == ""
+    engage(bridge, blind=True)
     assert bridge.phase is Phase.ENGAGED
 
 
@@ -490,7 +494,7 @@ def test_max_engaged_releases_after_a_warning() -> None:
     assert "max_engaged releases" not in bridge.reason
     assert fly(bridge, 20.05, 29.96) is Phase.ENGAGED
     assert bridge.reason.startswith("max_engaged releases in 10 s, unless engaged again; ")
-    assert bridge.engage(at(30.0)) == ""
+    engage(bridge, 30.0)
     assert fly(bridge, 30.05, 49.96) is Phase.ENGAGED
     assert bridge.reason.endswith(blind)
     assert fly(bridge, 50.05, 60.06) is Phase.RELEASE
@@ -499,8 +503,8 @@ def test_max_engaged_releases_after_a_warning() -> None:
 
 def test_blind_engagement_has_no_bound() -> None:
     bridge = ready_bridge(channel_map=CHANNEL_MAP.model_copy(update={"max_engaged": 5.0}))
-    assert bridge.engage(at(0.0)) == ""
-    assert bridge.engage(at(0.0), blind=True) == ""
+    engage(bridge)
+    engage(bridge, blind=True)
     assert fly(bridge, 0.05, 20.0) is Phase.ENGAGED
     assert "max_engaged" not in bridge.reason
 
@@ -508,7 +512,7 @@ def test_blind_engagement_has_no_bound() -> None:
 def test_captured_output_is_zero_until_engagement_and_then_change() -> None:
     bridge = px4_bridge(offboard=14.0)
     samples = [bridge.y(at(0.0))]
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     refresh(bridge, 0.1, offboard=14.0)  # V from 20 to 21 m/s
     samples.append(bridge.y(at(0.1)))
     place = bridge.outputs.index("V")
@@ -533,7 +537,7 @@ def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridg
 def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
     """-1 to 1 over 1000 to 2000 us, 30 deg and half of the throttle at 1."""
     bridge = ardupilot_bridge()
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     for name in STICKS:
         receive_outputs(
             bridge, 0.05, (trim_key(name),), 1900.0
@@ -592,7 +596,7 @@ def receive_mavlink(bridge: Bridge, t: float) -> None:
 
 def engaged_mavlink_bridge(max_engaged: float = 120.0) -> Bridge:
     bridge = mavlink_bridge(max_engaged=max_engaged)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     assert sent(bridge, 0.0) == {"override"}
     return bridge
 
@@ -671,7 +675,7 @@ def with_failsafe() -> Bridge:
 def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_begin() -> None:
     bridge = with_failsafe()
     refresh(bridge, 0.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     bridge.disengage("the controller ended", at(0.1))
     assert bridge.phase is Phase.RELEASE
     bridge.take_condition("offboard", 14.0, at(0.1))
@@ -690,7 +694,7 @@ def test_lost_transmitter_asks_for_the_mode() -> None:
     """
     bridge = with_failsafe()
     refresh(bridge, 0.0, offboard=14.0)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     bridge.take_condition("transmitter", 0.0, at(0.1))
     assert bridge.step(at(0.1)) is Phase.RELEASE
     assert sent(bridge, 0.1) == {"leave"}
@@ -712,7 +716,7 @@ def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
         == f"RC_OVERRIDE_TIME is {seconds:g}, expected 0.2 to 1: {OVERRIDE_TIME}"
     )
     bridge.take_parameter("RC_OVERRIDE_TIME", 0.5)
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     bridge.take_parameter("RC_OVERRIDE_TIME", seconds)
     assert bridge.step(at(0.0)) is Phase.ENGAGED  # a parameter refuses, and does not end
 
@@ -731,7 +735,7 @@ def test_problem_of_the_link_refuses_an_engagement_and_stands_beside_what_ends_i
     bridge.problem = "ATTITUDE comes at 4 Hz"
     assert bridge.engage(at(0.0)) == "ATTITUDE comes at 4 Hz"
     bridge.problem = ""
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     bridge.problem = "ATTITUDE comes at 4 Hz"
     assert bridge.step(at(0.1)) is Phase.ENGAGED
     assert bridge.reason.startswith("ATTITUDE comes at 4 Hz; ")
@@ -764,7 +768,7 @@ def test_u_that_times_out_sends_captured_trim_where_map_says_so() -> None:
     content["silence"] = {"max_age": 0.2, "neutral": 0.3, "release": 0.5}
     bridge = ardupilot_bridge()
     bridge.channel_map = ChannelMap.validate_mapping(content, "map")
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     receive_outputs(bridge, 0.19, tuple(bridge.outputs))
     assert bridge.step(at(0.21)) is Phase.NEUTRAL
     assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
@@ -776,7 +780,7 @@ def test_override_by_stick_counts_way_since_engagement(earlier: float) -> None:
     content["overrides"]["gamepad"] |= {"above": None, "moved": 0.2}
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
     bridge.take_override("gamepad", earlier, at(0.0 if earlier == 0.7 else -60.0))
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     bridge.take_override("gamepad", 0.7, at(0.005))
     bridge.take_override("gamepad", 0.55, at(0.01))
     assert bridge.step(at(0.01)) is Phase.ENGAGED
@@ -802,7 +806,7 @@ def test_override_whose_topic_has_ended_does_not_block_engagement() -> None:
     receive_outputs(bridge, 0.9)
     receive_u(bridge, 0.9)
     assert bridge.engage(at(0.9)) == "pilot override active: gamepad"
-    assert bridge.engage(at(1.05)) == ""
+    engage(bridge, 1.05)
 
 
 ENVELOPE = {"phi": [-0.8, 0.8], "theta": [-0.4, 0.5], "V": [-5.0, 8.0]}
@@ -819,7 +823,7 @@ def enveloped_bridge() -> Bridge:
     receive_outputs(bridge, 0.0, ("phi", "theta"))
     assert bridge.engage(at(0.0)) == "V is -25, outside the envelope [-5, 8]"
     receive_outputs(bridge, 0.01, ("V",), raw=25.0)
-    assert bridge.engage(at(0.01)) == ""
+    engage(bridge, 0.01)
     return bridge
 
 
@@ -849,7 +853,7 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     receive_outputs(bridge, 0.0, (*OUTPUTS, "climb"), raw=2.1)
     assert bridge.engage(at(0.0)) == "climb is 2.1, outside engage_if [-2, 2]"
     receive_outputs(bridge, 0.01, ("climb",), raw=1.9)
-    assert bridge.engage(at(0.01)) == ""
+    engage(bridge, 0.01)
     receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
     assert bridge.step(at(0.02)) is Phase.ENGAGED
     receive_outputs(
@@ -864,7 +868,7 @@ def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not
     for name in ("elevator", "aileron", "rudder"):
         content["inputs"][name]["at_limit"] = 0.1
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
     lower, upper = (
         np.array([content["inputs"][name][key] for name in content["inputs"]])
         for key in ("lower", "upper")
@@ -892,7 +896,7 @@ def test_large_u_that_rests_is_at_a_limit_of_the_law_narrower_than_that_of_the_m
     for name in set(content["inputs"]) - {"rudder"}:
         content["inputs"][name]["at_limit"] = None
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
-    assert bridge.engage(at(0.0)) == ""
+    engage(bridge)
 
     def fly(t: float, part: float) -> Phase:
         receive_outputs(bridge, t)
