@@ -14,6 +14,7 @@ import scipy.io
 import scipy.signal
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 from tests.conftest import REPOSITORY, refusing
 from typer.testing import CliRunner
 
@@ -110,7 +111,7 @@ def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
     assert_allclose(
         frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0
     )  # g of 32.2 ft/s^2 in the thrust
-    assert frame.speed == pytest.approx(library.speed)
+    assert frame.speed == approx(library.speed)
     assert_allclose(
         frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12
     )  # alpha_0 is 0 in stability axes
@@ -145,7 +146,7 @@ def test_body_axes_give_the_airspeed_along_the_path() -> None:
         thrust=True,
     )
     u, w, *_ = frame.matrix_c()[1]
-    assert np.degrees(np.arctan2(w, u)) == pytest.approx(9.4, abs=0.05)
+    assert np.degrees(np.arctan2(w, u)) == approx(9.4, abs=0.05)
 
 
 def test_names_of_python_control_are_taken() -> None:
@@ -204,13 +205,11 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
     ]
     assert_allclose(lateral, printed, rtol=0.03, atol=1e-9)
     entry = {(row, column): matrix[x.index(row), x.index(column)] for row in x for column in x}
-    assert entry["V", "V"] == pytest.approx(-0.045, rel=0.02)
-    assert entry["alpha", "V"] * 176.0 * 0.3048 == pytest.approx(
-        -0.369, rel=0.02
-    )  # Z_u of w = V0 alpha
-    assert entry["alpha", "alpha"] == pytest.approx(-2.02, rel=0.02)
-    assert entry["q", "alpha"] == pytest.approx(-8.8, rel=0.02)  # M_alpha, p. 153
-    assert entry["q", "q"] == pytest.approx(-2.05, rel=0.03)
+    assert entry["V", "V"] == approx(-0.045, rel=0.02)
+    assert entry["alpha", "V"] * 176.0 * 0.3048 == approx(-0.369, rel=0.02)  # Z_u of w = V0 alpha
+    assert entry["alpha", "alpha"] == approx(-2.02, rel=0.02)
+    assert entry["q", "alpha"] == approx(-8.8, rel=0.02)  # M_alpha, p. 153
+    assert entry["q", "q"] == approx(-2.05, rel=0.03)
     assert_allclose(
         frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005
     )  # by hand: q S c C_m / I_y
@@ -307,7 +306,7 @@ def test_xflr5_log_gives_both_motions(tmp_path: Path) -> None:
         ]
     )  # fmt: skip
     frame, note = import_airframe(tool_file(tmp_path, "plane.log", log))
-    assert frame.speed == pytest.approx(25.0, rel=1e-4)
+    assert frame.speed == approx(25.0, rel=1e-4)
     assert_allclose(frame.matrix_a()[4:, 4:], lateral, rtol=1e-5)
     assert_allclose(frame.matrix_b()[4:, 1], b747.matrix_b()[:, 1], rtol=1e-5)
     assert list(frame.inputs) == ["elevator", "rudder"]
@@ -448,6 +447,6 @@ def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
     A = np.array(page["A"])
     assert_allclose(A[:3, :4], np.linalg.solve(mass, forces), rtol=0.01, atol=1e-4)
     assert_allclose(A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4)
-    assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == pytest.approx(
+    assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == approx(
         [np.cos(theta), np.sin(theta)], abs=1e-4
     )

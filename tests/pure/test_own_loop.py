@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import ArrayLike
+from pytest import approx
 
 import rise_di
 from aircraft_sim.simulator import Simulator
@@ -166,7 +167,7 @@ def test_environment_under_law_flies_as_simulation(flown: Tape) -> None:
     y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
     assert np.array_equal([*flight, observed], np.concatenate([y, y_m], axis=1))
     units = np.array([{"p": 0.02, "V": 0.1}.get(name, 0.01) for name in CONTROLLER.outputs])
-    assert reward == pytest.approx(-np.sum(np.abs(y - y_m)[1:] / units) / CONTROLLER.rate)
+    assert reward == approx(-np.sum(np.abs(y - y_m)[1:] / units) / CONTROLLER.rate)
 
 
 def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,7 +182,7 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(Simulator, "sample", diverge)
     _, reward, terminated, truncated, info = env.step(u)
     assert (terminated, truncated, info) == (True, False, {"outcome": "diverged at t = 0.02 s"})
-    assert reward == pytest.approx(
+    assert reward == approx(
         -10.0 * (3.0 - 0.01)
     )  # the score of a loss of track for the seconds from the last tick on
     with pytest.raises(rise_di.ParameterError, match="expected reset"):
@@ -211,7 +212,7 @@ def test_environments_draw_entries_of_scenario() -> None:
         one_by_one.append([alone.step(u)[0][place] for _ in range(50)][-1])
     for V in (together, np.array(one_by_one)):
         assert len(np.unique(V.round(6))) == 2
-        assert V.max() == pytest.approx(19.0 * V.min(), rel=0.1)
+        assert V.max() == approx(19.0 * V.min(), rel=0.1)
 
 
 def test_vector_environment_flies_as_environments_one_by_one() -> None:
@@ -227,16 +228,16 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
     assert flights.observation_space.contains(observed)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        assert observed == pytest.approx(
+        assert observed == approx(
             np.tile(expected, (3, 1)), abs=1e-6
         )  # rad/s and m/s; y is of the order of 1e-2
         u = 0.01 * generator.standard_normal(M)
         observed, rewards, terminated, truncated, _ = flights.step(np.tile(u, (3, 1)))
         expected, reward, *_ = alone.step(u)
-        assert rewards == pytest.approx(np.full(3, reward), rel=1e-3, abs=1e-6)
+        assert rewards == approx(np.full(3, reward), rel=1e-3, abs=1e-6)
         assert not terminated.any()
         assert not truncated.any()
-    assert flights.t == pytest.approx(alone.t)
+    assert flights.t == approx(alone.t)
 
 
 def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() -> None:
@@ -257,7 +258,7 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
             assert rewards[1] == 0.0
         still = observed[1, :M] if terminated[1] else None
         if terminated[1]:
-            assert rewards[1] == pytest.approx(-10.0 * (3.0 - (k - 1) / CONTROLLER.rate))
+            assert rewards[1] == approx(-10.0 * (3.0 - (k - 1) / CONTROLLER.rate))
         terminations += terminated.sum()
         assert not terminated[0]
     assert terminations > 1

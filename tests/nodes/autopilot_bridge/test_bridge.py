@@ -20,6 +20,7 @@ from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from pytest import approx
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import FluidPressure, Imu, Joy
@@ -223,7 +224,7 @@ def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channe
     setup.run(2.0)
     finite, released = setup.sent_since(killed)
     assert max(finite) <= released_at - killed
-    assert released[-1] - released[0] == pytest.approx(RELEASE, abs=JOY + TICK)
+    assert released[-1] - released[0] == approx(RELEASE, abs=JOY + TICK)
     assert np.diff(released).max() <= JOY + TICK
     assert any(
         "-> INACTIVE" in line for line in restarted.log.lines
@@ -260,7 +261,7 @@ def test_silent_autopilot_releases_and_bridge_does_not_engage_again_by_itself(se
     setup.run(1.0)
     finite, released = setup.sent_since(silent)
     assert max(finite) <= 0.2 + JOY + TICK  # max_age of y in the map
-    assert released[-1] - released[0] == pytest.approx(RELEASE, abs=JOY + TICK)
+    assert released[-1] - released[0] == approx(RELEASE, abs=JOY + TICK)
     assert setup.engage() == ""
 
 
@@ -445,7 +446,7 @@ def test_max_engaged_is_announced_and_then_releases(setup: Setup) -> None:
     (begin, _), *_ = setup.joys
     setup.until_logged("ENGAGED: max_engaged releases in 10 s")
     setup.until_logged("ENGAGED -> RELEASE: engaged for 11 s, max_engaged of the map")
-    assert setup.t - begin == pytest.approx(11.0, abs=JOY + TICK)
+    assert setup.t - begin == approx(11.0, abs=JOY + TICK)
 
 
 def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(
@@ -463,14 +464,14 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_tim
     setup.until_logged("RELEASE -> DISENGAGED: u is")
     setup.run(1.0)
     since = [sent for sent in setup.joys if sent.t > stale]
-    u = [sent.t for sent in since if sent.axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
+    u = [sent.t for sent in since if sent.axes[1] == approx(commanded / FULL, abs=1e-6)]
     neutral_values = [sent.t for sent in since if sent.axes == [0.0] * 4]
     released = [sent.t for sent in since if sent.released]
     assert len(u) + len(neutral_values) + len(released) == len(since)  # nothing else is sent
     late = JOY + 2 * TICK
-    assert max(u) - stale == pytest.approx(MAX_AGE, abs=late)
-    assert max(neutral_values) - stale == pytest.approx(MAX_AGE + neutral, abs=late)
-    assert max(released) - stale == pytest.approx(MAX_AGE + neutral + RELEASE, abs=late)
+    assert max(u) - stale == approx(MAX_AGE, abs=late)
+    assert max(neutral_values) - stale == approx(MAX_AGE + neutral, abs=late)
+    assert max(released) - stale == approx(MAX_AGE + neutral + RELEASE, abs=late)
     setup.joys.clear()
     setup.u = (commanded, 0.0, 0.0, 0.0)
     setup.run(0.5)
@@ -486,7 +487,7 @@ def test_messages_of_autopilot_become_y_to_the_last_bit_and_dry_run_publishes_wh
         setup.run(1.0)
         would = setup.world.vectors("/bridge/would_send")[-1].channels
         assert list(would) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
-        assert [*would.values()] == pytest.approx(
+        assert [*would.values()] == approx(
             [0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5
         )  # aileron at its limit
         twists = setup.world.messages("/ap/twist/filtered")
@@ -632,9 +633,7 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
 
         world.run(0.5, publish)
         y, pose = world.last("/uav1/y"), world.last("/uav1/pose")
-    assert y == pytest.approx(
-        {"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1}
-    )  # V is captured at an engagement
+    assert y == approx({"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1})  # V is captured at an engagement
     expected = {
         "phi": phi,
         "theta": theta,
@@ -643,7 +642,7 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
         "east": 30.0,
         "altitude": 20.0,
     }
-    assert pose == pytest.approx(expected | {"v_north": 4.0, "v_east": 3.0, "climb": 2.0}, abs=1e-6)
+    assert pose == approx(expected | {"v_north": 4.0, "v_east": 3.0, "climb": 2.0}, abs=1e-6)
 
 
 def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Path) -> None:
@@ -709,14 +708,12 @@ def test_outputs_are_read_from_real_messages(
     for channel, value in expected.items():
         row = named_map(name).outputs[channel]
         assert message_type(row.type) is type(message)
-        assert to_channel(read_raw(message, row.field, row.function), row.line) == pytest.approx(
-            value
-        )
+        assert to_channel(read_raw(message, row.field, row.function), row.line) == approx(value)
 
 
 def test_a_real_pressure_gives_the_speed() -> None:
     message = serialised(FluidPressure(fluid_pressure=0.5 * 1.225 * 30.0**2))
-    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(30.0)
+    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == approx(30.0)
 
 
 def test_inputs_are_written_into_a_real_joy() -> None:
@@ -726,6 +723,6 @@ def test_inputs_are_written_into_a_real_joy() -> None:
         set_field(message, path, value)
     for row, u in zip(channel_map.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
         set_field(message, row.field, to_raw(row.trim + u, row.line))
-    assert list(serialised(message).axes) == pytest.approx(
+    assert list(serialised(message).axes) == approx(
         [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5
     )  # RC1 to 4

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pytest import approx
 from rclpy.serialization import deserialize_message, serialize_message
 from std_srvs.srv import SetBool
 from tests.maps import named_map
@@ -89,9 +90,7 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str) -> None:
         message = fill(message_type(row.type)(), AIRSPEED[name] if channel == "V" else RATES[name])
         message = deserialize_message(serialize_message(message), type(message))
         value = to_channel(read_raw(message, row.field, row.function), row.line)
-        assert value == pytest.approx(
-            2.0 if channel == "V" else MOTION[channel], abs=1e-6
-        )  # float32
+        assert value == approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32
 
 
 @pytest.mark.parametrize("name", ROS_MAPS)
@@ -104,7 +103,7 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
             set_field(message, field, value)
         set_field(message, row.field, to_raw(row.trim + 0.1, row.line))
         message = deserialize_message(serialize_message(message), type(message))
-        assert get_field(message, row.field) == pytest.approx(expected, abs=1e-3), path
+        assert get_field(message, row.field) == approx(expected, abs=1e-3), path
 
 
 class Px4:
@@ -175,7 +174,7 @@ def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
         world.start(BridgeNode)
         px4 = Px4(world)
         world.run(1.0, px4.publish)
-        assert world.last("/y") == pytest.approx(
+        assert world.last("/y") == approx(
             {**MOTION, "V": 0.0}, abs=1e-6
         )  # V is captured: 0 until the engagement
         assert not any(
@@ -185,10 +184,10 @@ def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
         world.run(1.0, px4.publish)
         assert px4.mode == Px4.OFFBOARD
         assert px4.received["OffboardControlMode"][-1].thrust_and_torque
-        assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx(
+        assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == approx(
             [0.0, 0.02 / 0.523599, 0.0], abs=1e-6
         )
-        assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx(
+        assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == approx(
             [0.5, 0.0, 0.0], abs=1e-6
         )
         assert world.call("/bridge/engage", SetBool.Request(data=False)).success

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from tests.builders import MS, aircraft_parameters
@@ -48,7 +49,7 @@ def test_without_f_plant_follows_matrix_exponential() -> None:
     x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
     block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
     exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
-    assert final_state(x_0, u, NANOSECONDS, 2 * MS, aircraft) == pytest.approx(exact, abs=1e-8)
+    assert final_state(x_0, u, NANOSECONDS, 2 * MS, aircraft) == approx(exact, abs=1e-8)
 
 
 def test_halving_step_divides_integration_error_by_sixteen() -> None:
@@ -59,7 +60,7 @@ def test_halving_step_divides_integration_error_by_sixteen() -> None:
         np.abs(final_state(x_0, u, NANOSECONDS, step, aircraft) - finest).max()
         for step in (20 * MS, 10 * MS)
     ]
-    assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
+    assert errors[0] / errors[1] == approx(16.0, rel=0.15)  # fourth order
 
 
 def test_plant_agrees_with_adaptive_integrator_through_gust() -> None:
@@ -76,7 +77,7 @@ def test_plant_agrees_with_adaptive_integrator_through_gust() -> None:
     )
     end = final_state(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
     # The gust's second derivative jumps at its ends: Runge-Kutta loses an order there.
-    assert end == pytest.approx(reference.y[:, -1], abs=1e-6)
+    assert end == approx(reference.y[:, -1], abs=1e-6)
 
 
 @pytest.mark.equation("Assumption 2")
@@ -103,17 +104,15 @@ def test_gravity_and_lateral_coupling_enter_as_published() -> None:
     x[3], x[7] = 0.1, -0.2  # theta, phi
     f = dynamics.f(0.0, x, osprey())
     # V_dot gets -9.81 sin(theta), beta_dot +0.39 sin(phi): MacKunis et al. 2010
-    assert f == pytest.approx(
-        [-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15
-    )
+    assert f == approx([-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15)
 
 
 def test_inputs_of_airframe_converted_to_si_once() -> None:
     airframe = load_airframe("osprey")
     B = airframe.matrix_b()
     # 0.98 rad/s^2 per degree of elevator; 0.06 m/s^2 per percent of thrust
-    assert B[2, 0] == pytest.approx(0.98 * 180 / math.pi)
-    assert B[0, 1] == pytest.approx(6.0)
+    assert B[2, 0] == approx(0.98 * 180 / math.pi)
+    assert B[0, 1] == approx(6.0)
 
 
 def test_truth_holds_state_disturbance_and_actuators() -> None:
@@ -127,12 +126,12 @@ def test_truth_holds_state_disturbance_and_actuators() -> None:
         zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True)
     )
     assert true["x.phi"] == 0.07
-    assert true["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
+    assert true["gust.vertical"] == approx(2.0)  # s = 25 0.4 = H
     assert (
         true["gust.lateral"] == true["gust.longitudinal"] == 0.0
     )  # every axis of the airframe's gusts
     assert true["actuator.thrust"] == 0.2
-    assert true["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
+    assert true["f.V"] == approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
 
 
 EVERYTHING = {
@@ -173,7 +172,7 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
         x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, filters))
         x = rk4(x_dot, t, x, mean, params.aircraft, 0.002)
         z = turbulence.step(z, normal, filters)
-    assert end.x == pytest.approx(x, rel=1e-13, abs=1e-15)
+    assert end.x == approx(x, rel=1e-13, abs=1e-15)
     assert (end.position == position).all()
     assert np.asarray(end.turbulence).tobytes() == np.asarray(z).tobytes()
 
@@ -186,11 +185,11 @@ def test_equation_1_is_sum_of_parts() -> None:
         np.array([0.5, -1.0, 2.0]),
     )
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
-    assert x_dot == pytest.approx(
+    assert x_dot == approx(
         aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14
     )
     difference = dynamics.f(0.3, x, aircraft, turbulent) - dynamics.f(0.3, x, aircraft)
-    assert difference == pytest.approx(aircraft.gust_direction @ turbulent, abs=1e-14)
+    assert difference == approx(aircraft.gust_direction @ turbulent, abs=1e-14)
 
 
 def test_f_of_states_in_columns_is_f_of_each_state() -> None:
@@ -200,7 +199,7 @@ def test_f_of_states_in_columns_is_f_of_each_state() -> None:
     columns = np.random.default_rng(1).uniform(-1.0, 1.0, (8, 5))
     f = dynamics.f(0.3, columns, batched)
     for k in range(5):
-        assert f[:, k] == pytest.approx(dynamics.f(0.3, columns[:, k], single), abs=1e-14)
+        assert f[:, k] == approx(dynamics.f(0.3, columns[:, k], single), abs=1e-14)
 
 
 def test_step_that_does_not_divide_time_refused() -> None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_core.units import si_per_unit
@@ -118,7 +119,7 @@ def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(airframe: Air
 def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> None:
     tolerance = 0.05 if airframe.name.startswith("aerosonde_first") else 0.006
     found = coupling(airframe.matrix_c() @ np.array(airframe.B))
-    assert found == pytest.approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
+    assert found == approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
 
 
 @pytest.mark.parametrize(
@@ -127,10 +128,8 @@ def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> No
 def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: float) -> None:
     # F-16: U_12 = 0.1737 / 0.17555 (ft/s) / (rad/s), times 0.3048 in SI.
     airframe = load_airframe(name)
-    assert coupling(airframe.matrix_c() @ np.array(airframe.B)) == pytest.approx(
-        published, abs=1e-3
-    )
-    assert airframe_facts(airframe).coupling == pytest.approx(si, abs=1e-3)
+    assert coupling(airframe.matrix_c() @ np.array(airframe.B)) == approx(published, abs=1e-3)
+    assert airframe_facts(airframe).coupling == approx(si, abs=1e-3)
 
 
 def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bounds(
@@ -184,7 +183,7 @@ def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
     airframe = load_airframe("x8_elevons")
     A, rows = airframe.matrix_a(), [airframe.index("alpha"), airframe.index("q")]
     assert_allclose(A[rows, rows], [Z_alpha, M_q], rtol=0.01)
-    assert A[airframe.index("q"), airframe.index("alpha")] == pytest.approx(M_alpha, rel=0.01)
+    assert A[airframe.index("q"), airframe.index("alpha")] == approx(M_alpha, rel=0.01)
 
 
 def test_zeros_of_the_osprey() -> None:

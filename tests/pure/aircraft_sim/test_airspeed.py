@@ -6,6 +6,7 @@ there.
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
@@ -35,14 +36,14 @@ def x_dot(x: FloatArray, u: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("ratio", [0.7, 1.0, 1.4])
 def test_small_motion_about_level_flight_is_that_of_the_airframe_of_the_speed(ratio: float) -> None:
     x, u = level_flight(OSPREY, ratio, "thrust")
-    assert x_dot(x, u) == pytest.approx(np.zeros(8), abs=1e-9)
+    assert x_dot(x, u) == approx(np.zeros(8), abs=1e-9)
     near = 1e-4
     of_x = np.array(
         [x_dot(x + near * unit, u) - x_dot(x - near * unit, u) for unit in np.eye(8)]
     ).T / (2.0 * near)
     moved = at_speed(OSPREY, ratio, "thrust")
     # the trims are 0.05 V0 apart and integrated in 20 steps: 1e-3 of the largest entry of V
-    assert of_x == pytest.approx(moved.matrix_a() + moved.matrix_gravity() * np.cos(x), abs=2e-3)
+    assert of_x == approx(moved.matrix_a() + moved.matrix_gravity() * np.cos(x), abs=2e-3)
 
 
 def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
@@ -57,9 +58,7 @@ def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
         -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
     )  # that of the trim, of rad
     for x, ratio in ((slow, 0.8), (fast, 1.25)):
-        assert x[alpha] == pytest.approx(
-            lift * (ratio**-2.0 - 1.0), rel=0.1
-        )  # the elevator has lift too
+        assert x[alpha] == approx(lift * (ratio**-2.0 - 1.0), rel=0.1)  # the elevator has lift too
     thrust = list(OSPREY.inputs).index("thrust")
     assert at_slow[thrust] < 0.0 < at_fast[thrust]
 
@@ -76,8 +75,8 @@ def test_flight_to_another_speed_ends_in_its_trim() -> None:
         for name in ("x.V", "x.alpha", "x.theta", "x.q", "actuator.thrust")
     }
     x, _ = level_flight(OSPREY, 1.16, "thrust")
-    assert last["x.V"] == pytest.approx(4.0, abs=0.02)
-    assert last["x.alpha"] == pytest.approx(
+    assert last["x.V"] == approx(4.0, abs=0.02)
+    assert last["x.alpha"] == approx(
         x[OSPREY.index("alpha")], abs=2e-3
     )  # q is held at 0, and theta where it is
     assert last["actuator.thrust"] > 0.1
@@ -96,4 +95,4 @@ def test_what_the_trim_speed_alone_has_is_refused() -> None:
         r"^aircraft\.over_airspeed: found thrust, expected none: the aircraft of a campaign"
     ):
         build_course(SCENARIO)
-    assert initial_state(PLANT).x == pytest.approx(np.zeros(8))
+    assert initial_state(PLANT).x == approx(np.zeros(8))

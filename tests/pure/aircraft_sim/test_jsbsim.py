@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.builders import aircraft_parameters, truth_of
 from tests.conftest import REPOSITORY, refusing
 
@@ -127,8 +128,8 @@ def test_wind_acts_along_the_axes_of_trim(axis: str, state: str, scale: float) -
     # about 4 1/s: a fifth).
     truth = fly(cessna(one_gust(axis, 2.0, 46.3 * 0.05)), command(), 0.05)
     peak = truth[f"gust.{axis}"][-1]
-    assert peak == pytest.approx(2.0, rel=0.01)
-    assert truth[f"x.{state}"][-1] == pytest.approx(scale * peak, rel=0.2)
+    assert peak == approx(2.0, rel=0.01)
+    assert truth[f"x.{state}"][-1] == approx(scale * peak, rel=0.2)
     assert not any(truth[f"gust.{name}"].any() for name in AXES if name != axis)
 
 
@@ -141,9 +142,7 @@ def test_turbulence_acts_from_the_first_sample_on() -> None:
     # Airspeed is the norm of ground velocity less wind; the ground velocity is 46.3 m/s along the
     # first axis.
     wind = np.array([truth[f"gust.{axis}"] for axis in AXES])
-    assert 46.3 + truth["x.V"] == pytest.approx(
-        float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3
-    )
+    assert 46.3 + truth["x.V"] == approx(float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3)
 
 
 def test_actuators_act_before_the_aircraft() -> None:
@@ -153,7 +152,7 @@ def test_actuators_act_before_the_aircraft() -> None:
     )
     assert np.max(np.abs(fly(stuck, command(aileron=0.1), 0.5)["x.p"])) < 1e-4
     slow = JsbsimModel(CESSNA, Actuators(lag=np.full(4, 0.1)), NO_WIND)
-    assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(
+    assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == approx(
         0.1 * (1.0 - math.exp(-1.0))
     )
 

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from tests.builders import aircraft_parameters
@@ -32,7 +33,7 @@ QUIET: dict[str, Any] = {"gusts": {}, "sensors": {}}
 def test_heading_wrapped_to_half_turn_either_way(angle: float) -> None:
     wrapped = pose.wrapped(angle)
     assert -math.pi < wrapped <= math.pi
-    assert (math.sin(wrapped), math.cos(wrapped)) == pytest.approx(
+    assert (math.sin(wrapped), math.cos(wrapped)) == approx(
         (math.sin(angle), math.cos(angle)), abs=1e-12
     )
 
@@ -45,7 +46,7 @@ def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_do
     north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(
         body
     )  # scipy's intrinsic rotations
-    assert pose.velocity(speed, alpha, beta, phi, theta, psi) == pytest.approx(
+    assert pose.velocity(speed, alpha, beta, phi, theta, psi) == approx(
         (north, east, -down), rel=1e-14
     )
 
@@ -63,9 +64,9 @@ def test_a_start_elsewhere_turns_and_moves_the_flight() -> None:
     )
     found = dict(zip(POSE, moved.tolist(), strict=True))
     # A quarter turn to the right: what was ahead is east, what was to the right is south.
-    assert (found["north"], found["east"]) == pytest.approx((100.0 - 2.0, -50.0 + 10.0))
-    assert (found["v_north"], found["v_east"]) == pytest.approx((1.0, 5.0))
-    assert found["psi"] == pytest.approx(3.0 + math.pi / 2.0 - 2.0 * math.pi)
+    assert (found["north"], found["east"]) == approx((100.0 - 2.0, -50.0 + 10.0))
+    assert (found["v_north"], found["v_east"]) == approx((1.0, 5.0))
+    assert found["psi"] == approx(3.0 + math.pi / 2.0 - 2.0 * math.pi)
 
 
 def euler_rates(x: dict[str, float]) -> dict[str, float]:
@@ -89,9 +90,9 @@ def test_euler_kinematics_turn_body_rates_as_attitude_turns() -> None:
         np.array([p, q, r]) * dt
     )
     psi_after, theta_after, phi_after = after.as_euler("ZYX")
-    assert rates["phi"] == pytest.approx((phi_after - phi) / dt, abs=1e-6)
-    assert rates["theta"] == pytest.approx((theta_after - theta) / dt, abs=1e-6)
-    assert heading_rate(phi, theta, q, r) == pytest.approx(psi_after / dt, abs=1e-6)
+    assert rates["phi"] == approx((phi_after - phi) / dt, abs=1e-6)
+    assert rates["theta"] == approx((theta_after - theta) / dt, abs=1e-6)
+    assert heading_rate(phi, theta, q, r) == approx(psi_after / dt, abs=1e-6)
 
 
 def test_level_turn_keeps_attitude_and_costs_lift() -> None:
@@ -102,7 +103,7 @@ def test_level_turn_keeps_attitude_and_costs_lift() -> None:
     assert abs(rates["phi"]) < 1e-15
     assert abs(rates["theta"]) < 1e-15
     lift = euler_rates({"phi": phi})["alpha"] - euler_rates({})["alpha"]
-    assert lift == pytest.approx(GRAVITY / 25.0 * (math.cos(phi) - 1.0), rel=1e-12)
+    assert lift == approx(GRAVITY / 25.0 * (math.cos(phi) - 1.0), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +151,7 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     }
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
-        assert found[name] == pytest.approx(value, abs=2e-3), (
+        assert found[name] == approx(value, abs=2e-3), (
             name
         )  # m and rad: the trapezoidal rule at 100 Hz
 
@@ -173,9 +174,9 @@ def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
         ("v_east", 3.0),
         ("altitude", 0.0),
     ):
-        assert after[name] - before[name] == pytest.approx(
-            np.broadcast_to(moved, t.shape), abs=1e-10
-        ), name
+        assert after[name] - before[name] == approx(np.broadcast_to(moved, t.shape), abs=1e-10), (
+            name
+        )
 
 
 def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
@@ -183,19 +184,19 @@ def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     found, t, truth = tape["pose"], tape.time("pose"), tape["truth"].group("x")
     speed, altitude = C172P.aircraft.speed, C172P.aircraft.altitude
     assert (found["v_north"][0], found["altitude"][0]) == (
-        pytest.approx(speed, rel=1e-3),
-        pytest.approx(altitude, rel=1e-6),
+        approx(speed, rel=1e-3),
+        approx(altitude, rel=1e-6),
     )
     at = np.isin(tape["truth"].stamp_ns, found.stamp_ns)
     for name in ("theta", "altitude", "phi"):  # truth holds deviations from trim
-        assert found[name] - found[name][0] == pytest.approx(
-            truth[name][at] - truth[name][0], abs=1e-9
-        ), name
+        assert found[name] - found[name][0] == approx(truth[name][at] - truth[name][0], abs=1e-9), (
+            name
+        )
     # JSBSim integrates the altitude, the model the place from JSBSim's velocities: the derivatives
     # of both are the velocities.
     for position, velocity in (("altitude", "climb"), ("north", "v_north"), ("east", "v_east")):
         slope = np.gradient(found[position], t)
-        assert slope[1:-1] == pytest.approx(found[velocity][1:-1], abs=0.05), position
+        assert slope[1:-1] == approx(found[velocity][1:-1], abs=0.05), position
     assert np.abs(found["phi"]).max() > 0.1  # the scenario banks
 
 
@@ -215,10 +216,7 @@ def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
         radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True)
     )
     assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude
-    assert (found["north"], found["east"]) == (
-        pytest.approx(north, rel=0.01),
-        pytest.approx(east, rel=0.01),
-    )
+    assert (found["north"], found["east"]) == (approx(north, rel=0.01), approx(east, rel=0.01))
     assert east > 300.0  # m: it has turned
 
 
@@ -246,16 +244,12 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
     assert {now - sample.stamp_ns for now, sample in arrived} == {100_000_000}
     assert [sample.stamp_ns for _, sample in arrived[:3]] == [0, 200_000_000, 400_000_000]
     off = np.array([sample.value - truth[sample.stamp_ns] for _, sample in arrived])
-    assert off[:, POSE.index("north")].std() == pytest.approx(
-        2.0, rel=4.0 / math.sqrt(2.0 * len(off))
-    )
-    assert off[:, POSE.index("psi")].mean() == pytest.approx(
-        0.1, abs=4.0 * 0.02 / math.sqrt(len(off))
-    )
+    assert off[:, POSE.index("north")].std() == approx(2.0, rel=4.0 / math.sqrt(2.0 * len(off)))
+    assert off[:, POSE.index("psi")].mean() == approx(0.1, abs=4.0 * 0.02 / math.sqrt(len(off)))
     steps = np.diff(off[:, POSE.index("altitude")])
-    assert steps.std() == pytest.approx(0.3 * math.sqrt(0.2), rel=4.0 / math.sqrt(2.0 * len(steps)))
+    assert steps.std() == approx(0.3 * math.sqrt(0.2), rel=4.0 / math.sqrt(2.0 * len(steps)))
     assert not off[:, POSE.index("phi")].any()
-    assert errors["noise.pose.psi"] == pytest.approx(0.1, abs=0.1)
+    assert errors["noise.pose.psi"] == approx(0.1, abs=0.1)
 
 
 @pytest.mark.parametrize(

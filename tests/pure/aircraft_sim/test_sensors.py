@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.builders import MS, aircraft_parameters
 from tests.closed_loop import PROTOTYPE_SERVO
 
@@ -74,9 +75,9 @@ def test_fraction_of_dropped_samples_is_specified_one(dropout: float) -> None:
     tolerance = 4.0 * np.sqrt(
         dropout * (1.0 - dropout) / COUNT
     )  # four standard deviations of a fraction
-    assert lost.mean() == pytest.approx(dropout, abs=tolerance)
+    assert lost.mean() == approx(dropout, abs=tolerance)
     # Dropouts are independent: the fraction of two in a row is dropout^2.
-    assert (lost[1:] & lost[:-1]).mean() == pytest.approx(dropout**2, abs=tolerance)
+    assert (lost[1:] & lost[:-1]).mean() == approx(dropout**2, abs=tolerance)
 
 
 def test_delay_shifts_arrival_by_whole_samples_and_keeps_stamp() -> None:
@@ -135,12 +136,12 @@ def test_errors_add_up_and_quantisation_comes_last() -> None:
     drift = walk(6, initial_drift(params), params)
     measured = measure(7, y, drift, params)
     analog = y + params.bias + walk(7, drift, params).value + noise(7, params)
-    assert measured.y[0] == pytest.approx(analog[0], abs=1e-15)
-    assert measured.y[1:] == pytest.approx(
+    assert measured.y[0] == approx(analog[0], abs=1e-15)
+    assert measured.y[1:] == approx(
         [0.05, 0.05, 0.5] * np.round(analog[1:] / [0.05, 0.05, 0.5]), abs=1e-15
     )
     assert np.abs(measured.y - analog).max() <= 0.25  # half a step
-    assert measured.error == pytest.approx(measured.y - y, abs=1e-15)
+    assert measured.error == approx(measured.y - y, abs=1e-15)
 
 
 def test_quantisation_rounds_to_nearest_step_and_halves_to_even() -> None:
@@ -170,7 +171,7 @@ def test_variance_of_drift_grows_with_time_at_any_rate() -> None:
             ]
         )
         variance = np.mean(ends**2, axis=0)
-        assert variance[[0, 2]] == pytest.approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
+        assert variance[[0, 2]] == approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
         assert (variance[[1, 3]] == 0.0).all()
 
 
@@ -201,12 +202,10 @@ def test_truth_holds_whole_error_of_sensors_with_every_fault(servo: Scenario) ->
     y, truth = tape["y"], tape["truth"]
     at = np.searchsorted(truth.stamp_ns, y.stamp_ns)
     for name in y.names:
-        assert y[name] == pytest.approx(
-            truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15
-        )
-    assert np.mean(truth["noise.V"]) == pytest.approx(
+        assert y[name] == approx(truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15)
+    assert np.mean(truth["noise.V"]) == approx(
         0.5, abs=0.01
     )  # the bias; the noise is 0.03 over 200 samples
-    assert y["q"] / 1e-3 == pytest.approx(np.round(y["q"] / 1e-3), abs=1e-9)
+    assert y["q"] / 1e-3 == approx(np.round(y["q"] / 1e-3), abs=1e-9)
     again = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
     assert again["truth"].values.tobytes() == truth.values.tobytes()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy.stats import kstest
 
 from aircraft_sim.airframe import LIBRARY, load_airframe
@@ -51,7 +52,7 @@ def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
     A, _ = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3, spread=Spread(distribution="normal"))
     q = OSPREY.index("q")
     d = A[1:, q, q] / A[0, q, q] - 1.0
-    assert np.std(d) == pytest.approx(0.1, rel=0.065)
+    assert np.std(d) == approx(0.1, rel=0.065)
     assert np.abs(d).max() <= 0.3 + 1e-12
     assert kstest(d, "norm", args=(0.0, 0.1)).pvalue > 0.01
 
@@ -86,7 +87,7 @@ def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
             A[:, OSPREY.index(state)] * drift,
             effect[:, list(OSPREY.gusts).index(axis)],
         )
-        assert by_wind == pytest.approx(-by_state, rel=5e-3, abs=0.0), axis
+        assert by_wind == approx(-by_state, rel=5e-3, abs=0.0), axis
         published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
         assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), (
             axis
@@ -108,10 +109,10 @@ def test_a_seed_determines_the_aircraft() -> None:
     sampled, again, other = (sample_airframe(OSPREY, 0.3, 0.3, seed) for seed in (7, 7, 8))
     assert sampled == again != other
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    assert sampled.matrix_a() == pytest.approx(
+    assert sampled.matrix_a() == approx(
         A[1], rel=1e-15
     )  # rounding of the conversion to the file's units
-    assert sampled.matrix_b() == pytest.approx(B[1], rel=1e-15)
+    assert sampled.matrix_b() == approx(B[1], rel=1e-15)
 
 
 @pytest.mark.parametrize("name", sorted(file.stem for file in LIBRARY.glob("*.yaml")))

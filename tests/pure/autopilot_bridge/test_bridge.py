@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.maps import MAP_FILES, named_map
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
@@ -112,7 +113,7 @@ def test_dry_run_computes_but_never_sends_or_engages() -> None:
     bridge = ready_bridge(0.1, dry_run=True)
     assert bridge.engage(at(0.0)).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
-    assert bridge.raw_u()[0] == pytest.approx(0.1 / 0.523599)
+    assert bridge.raw_u()[0] == approx(0.1 / 0.523599)
 
 
 def test_dry_run_says_what_else_would_refuse_engagement() -> None:
@@ -133,7 +134,7 @@ def test_u_stays_inside_its_limits_around_trim() -> None:
     for u, limit in ((9.0, "upper"), (-9.0, "lower")):
         receive_u(bridge, 0.01, u)
         rows = CHANNEL_MAP.inputs.values()
-        assert bridge.raw() == pytest.approx(
+        assert bridge.raw() == approx(
             [to_raw(row.trim + getattr(row, limit), row.line) for row in rows]
         )
 
@@ -146,7 +147,7 @@ def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
         phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
     expected = {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}
     starts = {phase: next(t for reached, t, *_ in phases if reached is phase) for phase in expected}
-    assert starts == pytest.approx(expected, abs=0.011)  # a tick
+    assert starts == approx(expected, abs=0.011)  # a tick
     for phase, _, raw, sent in phases:
         assert sent == (phase is not Phase.DISENGAGED)
         if phase is Phase.NEUTRAL:
@@ -265,7 +266,7 @@ def test_held_channel_of_vane_is_repeated_and_ends_no_y() -> None:
         receive_outputs(bridge, t + 0.1)
         y = bridge.y(at(t + 0.1))
         assert y is not None
-        assert abs(y.value[-1]) == pytest.approx(0.1)
+        assert abs(y.value[-1]) == approx(0.1)
 
 
 def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -> None:
@@ -280,7 +281,7 @@ def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -
         step = np.abs(
             sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]]
         )  # the row of q has sign -1, that of p no filter
-        assert step == pytest.approx([1.0 - np.exp(-t / 0.05), 1.0])
+        assert step == approx([1.0 - np.exp(-t / 0.05), 1.0])
 
 
 @pytest.mark.parametrize("name", MAP_FILES)
@@ -542,8 +543,8 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
         receive_outputs(
             bridge, 0.05, (trim_key(name),), 1900.0
         )  # while overridden, ArduPilot reports what it is sent
-    assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
-    assert [bridge.trim(name) for name in STICKS] == pytest.approx(
+    assert bridge.raw() == approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
+    assert [bridge.trim(name) for name in STICKS] == approx(
         [-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6
     )
 
@@ -771,7 +772,7 @@ def test_u_that_times_out_sends_captured_trim_where_map_says_so() -> None:
     engage(bridge)
     receive_outputs(bridge, 0.19, tuple(bridge.outputs))
     assert bridge.step(at(0.21)) is Phase.NEUTRAL
-    assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
+    assert bridge.raw() == approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
 
 
 @pytest.mark.parametrize("earlier", [0.7, 0.1], ids=["where it is", "elsewhere a minute ago"])
@@ -998,7 +999,7 @@ def test_flight_ends_once_log_holds_it(
         followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins)
         == outcome
     )
-    assert now[0] == pytest.approx(end, abs=0.1)
+    assert now[0] == approx(end, abs=0.1)
 
 
 def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from scipy.spatial.transform import Rotation
 from tests.conftest import invoke, refusing
 from tests.maps import MAP_FILES, named_map
@@ -99,7 +100,7 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
     row = named_map(name).outputs[channel]
     message = AIRSPEED[name] if channel == "V" else RATES[name]
     value = to_channel(read_raw(message, row.field, row.function), row.line)
-    assert value == pytest.approx(
+    assert value == approx(
         2.0 if channel == "V" else MOTION[channel], abs=1e-6
     )  # float32 in a message of PX4
 
@@ -110,7 +111,7 @@ def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
         SENT[name].items(), named_map(name).inputs.values(), strict=True
     ):
         assert path in (row.field, f"{row.message}.{row.field}")
-        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(
+        assert to_raw(row.trim + 0.1, row.line) == approx(
             expected, abs=1e-3
         )  # the fields in us are integers
 
@@ -148,7 +149,7 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
                 continue
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
-            assert get_field(message, input_row.field) == pytest.approx(
+            assert get_field(message, input_row.field) == approx(
                 raw, rel=0.0, abs=error, nan_ok=True
             )
     readers: dict[str, MeasuredRow | OverrideRow] = {
@@ -391,7 +392,7 @@ def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(
     for channel, expected in (("v_north", 4.0), ("v_east", 3.0), ("climb", 2.0)):
         row = shipped("odometry").pose[channel]
         raw = read_raw(odometry, row.field, row.function, row.turned_by)
-        assert to_channel(raw, row.line) == pytest.approx(expected, abs=1e-12)
+        assert to_channel(raw, row.line) == approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("quaternion", [[0.0] * 4, [math.nan, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -405,15 +406,13 @@ def test_a_quaternion_without_an_attitude_is_refused(quaternion: list[float]) ->
 
 @given(LINES, st.floats(-1e4, 1e4))
 def test_sending_value_and_reading_it_back_gives_value(line: Line, channel: float) -> None:
-    assert to_channel(to_raw(channel, line), line) == pytest.approx(channel, rel=1e-12, abs=1e-9)
+    assert to_channel(to_raw(channel, line), line) == approx(channel, rel=1e-12, abs=1e-9)
 
 
 @given(st.floats(0.0, 300.0))
 def test_speed_of_dynamic_pressure_is_one_that_makes_it(speed: float) -> None:
     message = Message(fluid_pressure=0.5 * 1.225 * speed**2)
-    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(
-        speed, abs=1e-6
-    )
+    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == approx(speed, abs=1e-6)
 
 
 def test_fields_are_reached_by_their_paths() -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pytest import approx
 from tests.conftest import refusing
 from tests.maps import named_map
 
@@ -165,8 +166,8 @@ def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) ->
     peer.beat()
     until(lambda: made.problem("ATTITUDE") and len(peer.requested) == 2, peer.answer)
     assert peer.requested == {
-        mavlink.MAVLINK_MSG_ID_ATTITUDE: pytest.approx(50.0),
-        mavlink.MAVLINK_MSG_ID_VFR_HUD: pytest.approx(20.0),
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: approx(50.0),
+        mavlink.MAVLINK_MSG_ID_VFR_HUD: approx(20.0),
     }
     assert made.problem() == (
         "the autopilot denied 50 Hz of ATTITUDE (MAV_RESULT 2): ArduPilot grants 0.8 "
@@ -188,7 +189,7 @@ def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others
         peer.connection.mav.attitude_send(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 
     until(lambda: queue, send)
-    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.5)] * len(queue)
+    assert [received.message.pitchspeed for received in queue] == [approx(0.5)] * len(queue)
     assert before <= queue[0].received_ns <= time.time_ns()
     assert made.conflict == ""
 
@@ -241,7 +242,7 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     assert made.conflict in made.problem()
     autopilot.attitude(0.1, since_boot=50.1)
     until(lambda: len(queue) == 2, autopilot.received)
-    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    assert [received.message.pitchspeed for received in queue] == [approx(0.1)] * 2
     overrides: list[Any] = []
 
     def send() -> None:
@@ -303,7 +304,7 @@ def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends
     ):
         router.attitude(pitchspeed, since_boot)
     until(lambda: len(queue) == 3, router.received)
-    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 3
+    assert [received.message.pitchspeed for received in queue] == [approx(0.1)] * 3
     assert made.conflict.endswith(" jumps: a second autopilot sends there, or it has started again")
 
 
@@ -322,7 +323,7 @@ def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) ->
         0.1, since_boot=50.1
     )  # of the packets to one socket the last one is read last
     until(lambda: len(queue) == 2, autopilot.received)
-    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    assert [received.message.pitchspeed for received in queue] == [approx(0.1)] * 2
     assert made.conflict == ""
 
 
@@ -334,7 +335,7 @@ def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
     autopilot.received()  # accepts the call
     autopilot.attitude(0.1, since_boot=50.0)
     until(lambda: queue, autopilot.received)
-    assert queue[0].message.pitchspeed == pytest.approx(0.1)
+    assert queue[0].message.pitchspeed == approx(0.1)
     received: list[Any] = []
 
     def send() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from control_laws import excitation
 from control_laws.excitation import ExcitationConfig, multisine
@@ -82,7 +83,7 @@ def test_inputs_are_excited_in_turn() -> None:
 def test_excitation_lasts_as_long_as_parameters_say() -> None:
     # a pause, then for each input 8 widths, a period and a pause: 1.5 + 3 (2 + 6 + 1.5) + 8 + 10 +
     # 1.5
-    assert controller().duration == pytest.approx(49.5)
+    assert controller().duration == approx(49.5)
 
 
 def test_doublets_and_multisine_have_no_mean() -> None:
@@ -91,18 +92,18 @@ def test_doublets_and_multisine_have_no_mean() -> None:
     u = excited(controller())[:, 0]
     assert abs(u.sum() * DT) < 2.0 * DT
     doublets = u[round(1.5 / DT) : round(3.5 / DT)]
-    assert np.cumsum(doublets).sum() * DT**2 == pytest.approx((1.0 - 4.0) * 0.25**2, rel=0.02)
+    assert np.cumsum(doublets).sum() * DT**2 == approx((1.0 - 4.0) * 0.25**2, rel=0.02)
 
 
 def test_multisine_has_band_alone_and_low_peak() -> None:
     # Schroeder's phases keep the crest factor of a flat band near 1.7; that of cosines in phase
     # would be sqrt(2 h) = 5.8.
     harmonic, phase, part = multisine(6.0, 0.3, 3.0)
-    assert harmonic[0] / 6.0 == pytest.approx(0.3, abs=1.0 / 12.0)
-    assert harmonic[-1] / 6.0 == pytest.approx(3.0, abs=1.0 / 6.0)
+    assert harmonic[0] / 6.0 == approx(0.3, abs=1.0 / 12.0)
+    assert harmonic[-1] / 6.0 == approx(3.0, abs=1.0 / 6.0)
     t = np.arange(6000) / 6000.0
     u = (part * np.sin(2.0 * np.pi * np.outer(t, harmonic) + phase)).sum(axis=1)
-    assert np.max(np.abs(u)) == pytest.approx(1.0, rel=0.02)
+    assert np.max(np.abs(u)) == approx(1.0, rel=0.02)
     assert 1.0 / np.sqrt(np.mean(u**2)) < 2.2
     spectrum = np.abs(np.fft.rfft(u)) / 3000.0
     outside = np.delete(spectrum, harmonic.astype(int))

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from pytest import approx
 from scipy.linalg import block_diag, solve_discrete_are
 from scipy.signal import lfilter
 
@@ -151,7 +152,7 @@ def test_integral_of_inversion_rejects_constant_disturbance() -> None:
     without = fly(*law_of("di", model, K=8.0), 2000, 0.0, 1.0, model)
     with_integral = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 2000, 0.0, 1.0, model)
     # without the integral K e = d at rest; sampling changes nothing, since y_dot is then 0
-    assert without.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
+    assert without.y[-1] == approx(1.0 / 8.0, rel=1e-9)
     assert abs(with_integral.y[-1]) < 1e-9
 
 
@@ -195,7 +196,7 @@ def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
     slow = np.sort(np.abs(np.linalg.eigvals(F - G @ found)))
     # two angles and four references decay with LEAK for any gain; all other modes of the loop are
     # faster than 0.3 1/s
-    assert np.all(slow[-6:] == pytest.approx(np.exp(-lqi.LEAK * osprey.period), abs=1e-6))
+    assert np.all(slow[-6:] == approx(np.exp(-lqi.LEAK * osprey.period), abs=1e-6))
     assert slow[-7] < np.exp(-0.3 * osprey.period)
 
 
@@ -208,10 +209,10 @@ def test_the_acceleration_based_law_by_hand() -> None:
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
     # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2
     # + 0.02) + 0.125) / 2
-    assert u.item() == pytest.approx(-(0.66 + 0.125) / 2.0, rel=1e-12)
+    assert u.item() == approx(-(0.66 + 0.125) / 2.0, rel=1e-12)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, 9.0)), np.array(0.1), params)
     # r far beyond eps: Pi = 0.125 + 0.5, integral = 0.03
-    assert u.item() == pytest.approx(-(3.0 * (0.2 + 0.06) + 0.625) / 2.0, rel=1e-12)
+    assert u.item() == approx(-(3.0 * (0.2 + 0.06) + 0.625) / 2.0, rel=1e-12)
 
 
 def test_filtered_difference_of_ramp_converges_to_slope() -> None:
@@ -223,7 +224,7 @@ def test_filtered_difference_of_ramp_converges_to_slope() -> None:
     for k in range(1, 301):
         state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
     # a filter of first order: 1 - exp(-12.6 3 s) of the slope
-    assert state.e_dot.item() == pytest.approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
+    assert state.e_dot.item() == approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
 
 
 def test_l1_estimates_disturbance_in_one_tick() -> None:
@@ -231,7 +232,7 @@ def test_l1_estimates_disturbance_in_one_tick() -> None:
     model = integrator()
     flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 3, 0.1, 0.7, model)
     x = l1.ADAPTATION_POLE * DT
-    assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
+    assert flight.state.sigma_hat.item() == approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
 def test_l1_rejects_constant_disturbance_with_wrong_input_gain() -> None:
@@ -247,7 +248,7 @@ def test_l1_rejects_constant_disturbance_with_wrong_input_gain() -> None:
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the
     # estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
-    assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
+    assert flight.u[-1] == approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
 
 
 def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
@@ -263,7 +264,7 @@ def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
         state = control_law.engage(measured, params) if state is None else state
         state, u = control_law.step(state, measured, np.array(DT), params)
         y += DT * (model.Omega[0, 0] * u.item() + d)
-    assert u.item() == pytest.approx(u_ff.item(), rel=1e-2)
+    assert u.item() == approx(u_ff.item(), rel=1e-2)
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
 
 
@@ -273,9 +274,7 @@ def test_weights_of_mrac_converge_to_model_error() -> None:
         *law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model
     )
     assert abs(flight.y[-1]) < 1e-6
-    assert flight.state.W[0, 1, 0] == pytest.approx(
-        0.7, rel=1e-4
-    )  # the weight of 1 is the disturbance
+    assert flight.state.W[0, 1, 0] == approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
 def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
@@ -392,7 +391,7 @@ def test_indi_needs_no_model_except_input_gain() -> None:
         assert abs(flight.y[-1]) < 1e-6, (
             Omega
         )  # exp(-2 15) of the start and the disturbance, were it first order
-        assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
+        assert flight.u[-1] == approx(-0.7 / Omega, rel=1e-5)
 
 
 def reaching(e_0: float) -> float:
@@ -407,7 +406,7 @@ def test_super_twisting_reaching_time() -> None:
     # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long
     # from anywhere. 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some
     # ten steps of 1 s
-    assert reaching(4.0) == pytest.approx(2.0 * reaching(1.0), rel=0.01)
+    assert reaching(4.0) == approx(2.0 * reaching(1.0), rel=0.01)
 
 
 def test_super_twisting_rejects_a_ramp_disturbance() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy.signal import welch
 from tests.recordings import EPOCH, MS, signal
 
@@ -118,7 +119,7 @@ def guided(**channels: Any) -> list[Any]:
 )
 def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expected: Any) -> None:
     assert guided(**channels) == [
-        (kind, pytest.approx(start), pytest.approx(stop)) for kind, start, stop in expected
+        (kind, approx(start), approx(stop)) for kind, start, stop in expected
     ]
 
 
@@ -126,7 +127,7 @@ def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() 
     flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
     table = metrics.errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
-    assert tuple(table["q"]["calm"]) == pytest.approx((math.sqrt(4.5), 3.0))
+    assert tuple(table["q"]["calm"]) == approx((math.sqrt(4.5), 3.0))
     assert table["q"]["whole"].max == 4.0
 
 
@@ -150,9 +151,9 @@ def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None
     stamps = [10.0 * k for k in range(100)]
     noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=10.0)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
-    assert metrics.settling_bands(tape(y=noisy, y_m=y_m)) == {"q": pytest.approx(4.0 * floor)}
+    assert metrics.settling_bands(tape(y=noisy, y_m=y_m)) == {"q": approx(4.0 * floor)}
     truth = signal(stamps, **{"x.q": 10.0})
-    assert metrics.settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": pytest.approx(0.1)}
+    assert metrics.settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": approx(0.1)}
 
 
 def test_settling_measured_up_to_next_transient_of_channel() -> None:
@@ -170,10 +171,10 @@ def test_settling_measured_up_to_next_transient_of_channel() -> None:
     ]
     first, other, gust = metrics.settling_times(flight, transients)
     assert first.until == {"q": 5.0}
-    assert first.time == {"q": pytest.approx(0.2)}
+    assert first.time == {"q": approx(0.2)}
     assert (other.transient.name, other.until, other.time) == ("p", {"p": 5.0}, {"p": 0.0})
     assert gust.until == {"q": 8.0, "p": 8.0}
-    assert gust.time == {"q": pytest.approx(0.2), "p": 0.0}
+    assert gust.time == {"q": approx(0.2), "p": 0.0}
 
 
 def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
@@ -181,13 +182,13 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     # sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
     whole = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
-    assert tuple(whole) == pytest.approx((math.sqrt(3.0), 2.0, 20.0))
+    assert tuple(whole) == approx((math.sqrt(3.0), 2.0, 20.0))
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
     parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)[
         "elevator"
     ]
-    assert tuple(parts["gust"]) == pytest.approx((2.0, 2.0, 20.0))
-    assert parts["calm"].rate == pytest.approx(20.0)  # 2 in 0.1 s
+    assert tuple(parts["gust"]) == approx((2.0, 2.0, 20.0))
+    assert parts["calm"].rate == approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
     assert math.isnan(parts["command"].rate)
     assert metrics.inputs_by_part(tape(), []) == {}
@@ -207,14 +208,14 @@ def test_sign_switches_counted_on_increments_of_pi() -> None:
     internals = signal(
         [10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]}
     )
-    assert metrics.sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
+    assert metrics.sign_switches(tape(internals=internals)) == {"q": approx(2 / 0.06)}
 
 
 def test_the_noise_floor_is_the_recorded_noise() -> None:
     flight = tape(
         y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]})
     )
-    assert metrics.noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
+    assert metrics.noise_floor(flight) == {"q": approx(math.sqrt(12.5))}
 
 
 def test_noise_floor_estimated_from_y_without_truth() -> None:
@@ -223,7 +224,7 @@ def test_noise_floor_estimated_from_y_without_truth() -> None:
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     flight = tape(y=Signal(EPOCH + k * 2 * MS, ("q",), y[:, None]))
-    assert metrics.noise_floor(flight)["q"] == pytest.approx(0.02, rel=0.05)
+    assert metrics.noise_floor(flight)["q"] == approx(0.02, rel=0.05)
 
 
 def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
@@ -233,10 +234,8 @@ def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
         EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None]
     )
     frequency, density = metrics.spectra(u, 10 * MS)
-    assert frequency[np.argmax(density["elevator"])] == pytest.approx(5.0, abs=0.1)
-    assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(
-        2.0, rel=0.01
-    )
+    assert frequency[np.argmax(density["elevator"])] == approx(5.0, abs=0.1)
+    assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == approx(2.0, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -248,9 +247,9 @@ def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
         Signal(EPOCH + np.arange(samples) * 10 * MS, ("a", "b"), values), 10 * MS
     )
     expected, power = welch(values, fs=100.0, nperseg=max(samples // 10, min(samples, 256)), axis=0)
-    assert frequency == pytest.approx(expected[1:], rel=1e-12)
+    assert frequency == approx(expected[1:], rel=1e-12)
     for name, column in zip(("a", "b"), power[1:].T, strict=True):
-        assert density[name] == pytest.approx(np.sqrt(column), rel=1e-9)  # rounding
+        assert density[name] == approx(np.sqrt(column), rel=1e-9)  # rounding
 
 
 def test_a_spectrum_bridges_missing_samples() -> None:
@@ -273,5 +272,5 @@ def test_periods_without_a_tick_are_counted() -> None:
         0.02,
         3e-4,
     )
-    assert result.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
+    assert result.period_mean == approx(0.04 / 3, abs=1e-9)
     assert result.jitter == 0.0  # the last took two whole periods

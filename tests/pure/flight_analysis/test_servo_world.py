@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.closed_loop import PROTOTYPE_SERVO, error
 from tests.pure.rise_di_controller.test_saturation import last_beyond, pulse, state, with_stops
 
@@ -62,7 +63,7 @@ def test_a_flight_agrees_with_the_prototype(
         unit * error_metrics(flown[name]).rms
         for unit, name in zip(units, ("q", "V", "p", "r"), strict=True)
     ]
-    assert measured[: len(rms)] == pytest.approx(rms, rel=0.1)
+    assert measured[: len(rms)] == approx(rms, rel=0.1)
 
 
 def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> None:
@@ -85,7 +86,7 @@ def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> N
             last_beyond(t, e, 0.1) - back,
             np.sqrt(np.mean(e**2)),
         ]
-    assert metrics[False] == pytest.approx([677, 1.42, 12.6, 0.96], rel=0.1)
-    assert metrics[True][0::2] == pytest.approx([60, 4.1], rel=0.1)
+    assert metrics[False] == approx([677, 1.42, 12.6, 0.96], rel=0.1)
+    assert metrics[True][0::2] == approx([60, 4.1], rel=0.1)
     assert metrics[True][1] < 0.005  # the prototype: 0.00
-    assert metrics[True][3] == pytest.approx(0.44, rel=0.1)
+    assert metrics[True][3] == approx(0.44, rel=0.1)

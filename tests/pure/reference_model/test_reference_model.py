@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from scipy.integrate import quad
 from scipy.signal import StateSpace, lsim
 from tests.closed_loop import reference_outputs
@@ -39,7 +40,7 @@ PULSES = {
 def test_pulse_rises_holds_and_falls_over_edges() -> None:
     profile = parameters(pulses=PULSES).profile()
     at = [float(command(t, profile)[0]) for t in (0.9, 1.0, 1.05, 1.1, 1.9, 2.05, 2.2, 3.5, 9.0)]
-    assert at == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1, 0.05, 0.0, -0.2, 0.0], abs=1e-12)
+    assert at == approx([0.0, 0.0, 0.05, 0.1, 0.1, 0.05, 0.0, -0.2, 0.0], abs=1e-12)
 
 
 @pytest.mark.equation(2)
@@ -60,9 +61,7 @@ def test_coordinated_turn_follows_integral_of_bank_rate() -> None:
         edges = [1.0, 1.1, 2.5, 2.6] if t > 2.6 else None
         bank, _ = quad(lambda s: float(command(s, profile)[1]), 0.0, t, points=edges, limit=200)
         # r = g / V0 sin(phi) is the turn rate without sideslip
-        assert float(command(t, profile)[2]) == pytest.approx(
-            9.81 / 25.0 * math.sin(bank), abs=1e-8
-        )
+        assert float(command(t, profile)[2]) == approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
 
 
 def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatArray:
@@ -76,7 +75,7 @@ def test_equation_2_agrees_with_exact_linear_simulation() -> None:
     t = np.arange(0, 3001) * 0.002
     u_m = command(t, profile)  # piecewise linear with knots on the grid: lsim is exact for it
     _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)  # type: ignore[call-overload]
-    assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
+    assert simulate(params, 6.0, 0.002) == approx(exact, abs=1e-9)
 
 
 def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
@@ -90,7 +89,7 @@ def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     # PULSES change u_m within this step; the two differ by rounding only.
     u_m = np.concatenate([command(1.0 + part * dt, profile) for part in (0.0, 0.5, 1.0)])
     one_step = rk4(x_dot, 1.0, x_m, None, matrices, dt)
-    assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(
+    assert model.step(x_m, u_m, model.stepper(dt, matrices)) == approx(
         one_step, rel=1e-14, abs=1e-15
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.closed_loop import PROTOTYPE_SERVO, error
 from tests.conftest import refusing
 
@@ -117,8 +118,8 @@ def test_one_tick_gives_the_hand_worked_numbers() -> None:
     state, added = feedforward.step(
         feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND
     )
-    assert state.x == pytest.approx([0.1, 0.0181414], abs=1e-5)
-    assert state.u == pytest.approx([0.5159293], abs=1e-5)
+    assert state.x == approx([0.1, 0.0181414], abs=1e-5)
+    assert state.u == approx([0.5159293], abs=1e-5)
     assert added.tolist() == [0.0]
 
 
@@ -130,13 +131,13 @@ def test_input_extrapolated_linearly_from_last_two() -> None:
         feedforward.initial_state(np.zeros(1), nominal), np.array([0.1]), np.array(0.1), nominal
     )
     second, _ = feedforward.step(first, np.array([0.5]), np.array(0.2), nominal)
-    assert second.u_0 == pytest.approx(second.u + 0.15 * (second.u - first.u) / 0.15)
+    assert second.u_0 == approx(second.u + 0.15 * (second.u - first.u) / 0.15)
 
 
 def test_zero_dynamics_are_zeros_of_model() -> None:
     # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
-    assert feedforward.zero_dynamics(BY_HAND) == pytest.approx([-3.0])
-    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == pytest.approx(
+    assert feedforward.zero_dynamics(BY_HAND) == approx([-3.0])
+    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == approx(
         [-2.0, 0.0]
     )
 
@@ -238,7 +239,7 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
     assert state.law is not None
     law = rise.retune(state.law, old.law_params(), new.law_params())
     retuned = state._replace(law=law)
-    assert rise.control(law, law, new.law_params()) == pytest.approx(
+    assert rise.control(law, law, new.law_params()) == approx(
         rise.control(state.law, state.law, old.law_params())
     )
     now = StampedVector(1500 * MS, reference(1.5))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -44,15 +45,15 @@ def test_reference_taken_at_stamp_of_y() -> None:
     def at(ms: float) -> FloatArray | None:
         return align(samples, round(ms * MS), 10 * MS)
 
-    assert at(10) == pytest.approx([1.0] * 4, rel=0.0, abs=0.0)  # a sample of that stamp
-    assert at(15) == pytest.approx([2.0] * 4)  # between two
-    assert at(25) == pytest.approx([4.0] * 4)  # extrapolated from the last two
+    assert at(10) == approx([1.0] * 4, rel=0.0, abs=0.0)  # a sample of that stamp
+    assert at(15) == approx([2.0] * 4)  # between two
+    assert at(25) == approx([4.0] * 4)  # extrapolated from the last two
     assert at(31) is None  # more than one period after the newest
     assert at(-1) is None  # before the oldest
 
 
 def test_single_sample_held_for_one_period() -> None:
-    assert align([sample(0, 7.0)], 10 * MS, 10 * MS) == pytest.approx([7.0] * 4, rel=0.0, abs=0.0)
+    assert align([sample(0, 7.0)], 10 * MS, 10 * MS) == approx([7.0] * 4, rel=0.0, abs=0.0)
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
 
@@ -62,16 +63,14 @@ def test_close_reference_samples_amplify_no_noise() -> None:
     # here the first and the last; otherwise the value is held.
     close = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
     first = StampedVector(0, np.array([0.0]))
-    assert align([first, *close], 10 * MS, 10 * MS) == pytest.approx(
-        [2.0 * 10.0 / 2.001], rel=1e-12
-    )
-    assert align(close, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
+    assert align([first, *close], 10 * MS, 10 * MS) == approx([2.0 * 10.0 / 2.001], rel=1e-12)
+    assert align(close, 10 * MS, 10 * MS) == approx([2.0], rel=0.0)
 
 
 @given(ms=st.floats(0, 20))
 def test_straight_line_reproduced_at_any_instant(ms: float) -> None:
     value = align([sample(t, t) for t in (0, 5, 10)], round(ms * MS), 10 * MS)
-    assert value == pytest.approx([round(ms * MS) / MS] * 4, abs=1e-9)
+    assert value == approx([round(ms * MS) / MS] * 4, abs=1e-9)
 
 
 def tick(
@@ -162,7 +161,7 @@ def test_measured_dt_clipped_between_fifth_and_ten_periods(gap_ms: int, dt_ms: i
     (engaged,) = run((0, sample(0, 1.0), [sample(0)]))
     _, inputs = tick(engaged, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
     assert inputs is not None
-    assert inputs.dt == pytest.approx(dt_ms / 1000)
+    assert inputs.dt == approx(dt_ms / 1000)
 
 
 def test_a_repeated_sample_changes_nothing() -> None:
@@ -196,7 +195,7 @@ def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
     assert (held != 0).all()
     assert (states[3].u == held).all()
     assert states[3].law is states[1].law  # nothing is integrated
-    assert states[4].u == pytest.approx(0.5 * held)
+    assert states[4].u == approx(0.5 * held)
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
     assert (states[5].u_trim == states[4].u).all()
     law_state = states[5].law
@@ -227,7 +226,7 @@ def test_deactivation_holds_or_ramps_input_as_configured(
     ]
     scales = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
     for state, expected in zip(states[2:5], scales, strict=True):
-        assert state.u == pytest.approx(expected * states[1].u)
+        assert state.u == approx(expected * states[1].u)
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 

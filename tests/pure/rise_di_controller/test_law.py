@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from tests.closed_loop import law_params
 
 from flight_core.vectors import FloatArray
@@ -45,24 +46,20 @@ def test_literal_sign_gives_the_hand_worked_inputs() -> None:
     # e_0 = 1; e = 1.2: integral 0.1 (1.2 + 1)/2 = 0.11, Pi applied 0: v = 2 (0.2 + 3 0.11) = 1.06
     # e = 0.9: integral 0.11 + 0.1 (0.9 + 1.2)/2 = 0.215, Pi applied 0.1 4 = 0.4: v = 2 (-0.1 + 3
     # 0.215) + 0.4 = 1.49 D = -1, so -D = +1; u = v / 2
-    assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx(
-        [0.53, 0.745], abs=1e-15
-    )
+    assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == approx([0.53, 0.745], abs=1e-15)
 
 
 def test_implicit_sign_applies_saturated_sign_in_same_tick() -> None:
     # e_hat = 1.2 + 0.2 - 0.1 2 (0.2 + 3 0.11) = 1.294, over dt^2 omega beta = 0.04 is above 1: s =
     # 1, Pi = 0.4 v = 1.06 + 0.4
-    assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
+    assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == approx([0.73], abs=1e-15)
 
 
 @pytest.mark.equation(21)
 def test_implicit_sign_zeroes_predicted_error() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
-    assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx(
-        [-0.1], abs=1e-15
-    )
+    assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == approx([-0.1], abs=1e-15)
 
 
 @pytest.mark.equation(21)
@@ -70,9 +67,9 @@ def test_softened_sign_is_saturated_line() -> None:
     """The softened sign is proportional inside the width and +-1 outside."""
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) +
     # 0.2 = 0.315
-    assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
+    assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == approx([0.1575], abs=1e-15)
     # e = 1.2 from 1: s = 1, as with the implicit sign
-    assert respond(one_channel(Sign.SOFT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
+    assert respond(one_channel(Sign.SOFT), [1.0, 1.2]) == approx([0.73], abs=1e-15)
 
 
 @pytest.mark.equation(3)
@@ -91,9 +88,9 @@ def test_constant_error_gives_a_ramp(sign: Sign) -> None:
     # (20), (21) with e = e_0 = 2: u = -D (K Lambda e + beta) t, so v grows by 2 3 2 0.1 + 4 0.1 =
     # 1.6 a tick, u by 0.8.
     inputs = np.array(respond(one_channel(sign), [2.0] * 50))
-    assert np.diff(inputs) == pytest.approx(0.8, rel=1e-12)
+    assert np.diff(inputs) == approx(0.8, rel=1e-12)
     # The literal sign uses Pi as it stands, one tick later than the implicit sign.
-    assert inputs[0] == pytest.approx(0.6 if sign is Sign.LITERAL else 0.8, rel=1e-12)
+    assert inputs[0] == approx(0.6 if sign is Sign.LITERAL else 0.8, rel=1e-12)
 
 
 @pytest.mark.parametrize("sign", list(Sign))
@@ -140,7 +137,7 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
         engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old
     )
     retuned = retune(state, old, new)
-    assert control(retuned, retuned, new) == pytest.approx(control(state, state, old), abs=1e-15)
+    assert control(retuned, retuned, new) == approx(control(state, state, old), abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -164,4 +161,4 @@ def test_outward_increment_is_reduced_by_what_is_beyond(
     """
     values = (np.array([value]) for value in (before, after, change, beyond))
     limited = limited_integral(*values)
-    assert limited[0] == (pytest.approx(expected, rel=1e-12) if change * beyond > 0 else expected)
+    assert limited[0] == (approx(expected, rel=1e-12) if change * beyond > 0 else expected)

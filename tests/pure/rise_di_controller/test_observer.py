@@ -5,7 +5,7 @@
 from typing import Any
 
 import numpy as np
-import pytest
+from pytest import approx
 
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
@@ -64,29 +64,27 @@ def test_contribution_fades_in_and_follows_the_estimate() -> None:
     # z = 1 at engagement. e = 1.4: z = 1 + 0.25 0.4 = 1.1, sigma = 0.2, u_o = -0.2 3 1.1 = -0.66,
     # z+ = 0.55 - 1.32 = -0.77 e = -0.5: z = -0.77 + 0.25 0.27 = -0.7025, sigma = 0.4, u_o = 0.4 3
     # 0.7025 = 0.843
-    assert respond([1.0, 1.4, -0.5], params()) == pytest.approx([-0.66, 0.843], abs=1e-14)
+    assert respond([1.0, 1.4, -0.5], params()) == approx([-0.66, 0.843], abs=1e-14)
 
 
 def test_contribution_is_full_after_its_fade_in() -> None:
     # without an effect of u (Gamma = 0) and for a constant e the corrected z = 0.75 (0.5 z) + 0.25
     # e tends to 0.25 e / 0.625
     steady = respond([1.0] * 60, params()._replace(Gamma=np.zeros((1, 1))))[-1]
-    assert steady == pytest.approx(-3.0 * 0.4, abs=1e-12)
+    assert steady == approx(-3.0 * 0.4, abs=1e-12)
 
 
 def test_contribution_keeps_its_limits_of_size_and_rate() -> None:
     # 3 per s reach 0.3 a tick; the estimate of a constant e = -10 asks for more in each tick
     responses = respond([-10.0] * 5, params(bound=0.5, rate=3.0)._replace(Gamma=np.zeros((1, 1))))
-    assert responses == pytest.approx([0.3, 0.5, 0.5, 0.5], abs=1e-14)
+    assert responses == approx([0.3, 0.5, 0.5, 0.5], abs=1e-14)
 
 
 def test_missed_tick_predicts_with_the_u_that_was_held() -> None:
     law, observer = with_observer(TRIM_LAW), params()
     state = law.engage(measured(1.0), observer)
     # z+ = 0.5 1 + 2 (10.5 - 10) = 1.5
-    assert law.missed(state, measured(0.0, u_before=10.5), observer).z == pytest.approx(
-        [1.5], abs=1e-15
-    )
+    assert law.missed(state, measured(0.0, u_before=10.5), observer).z == approx([1.5], abs=1e-15)
 
 
 def test_filter_over_the_record_is_that_of_each_tick() -> None:
@@ -97,7 +95,7 @@ def test_filter_over_the_record_is_that_of_each_tick() -> None:
     for e, of_tick in zip(np.sin(np.arange(47.0)), filters, strict=True):
         state, u = law.step(state, measured(e), DT, of_tick)
         record.append(PastTick(vector(e), u - TRIM, vector(7.0), DT))
-    assert estimates_after(tuple(record), vector(0.0), filters) == pytest.approx(state.z, abs=1e-14)
+    assert estimates_after(tuple(record), vector(0.0), filters) == approx(state.z, abs=1e-14)
 
 
 def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> None:
@@ -108,7 +106,7 @@ def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> Non
         PastTick(None, vector(0.2), vector(7.0), DT),
         PastTick(vector(2.0), vector(0.3), vector(7.0), DT),
     )
-    assert estimates_after(record, vector(0.1), [params()] * len(record)) == pytest.approx(
+    assert estimates_after(record, vector(0.1), [params()] * len(record)) == approx(
         [0.89], abs=1e-14
     )
 
@@ -126,6 +124,6 @@ def test_new_observer_without_record_starts_from_error_and_trim_keeps_contributi
         u_trim=vector(TRIM),
     )
     after = retune(state, TunedLaw(law, old), TunedLaw(law, old._replace(L=np.array([[0.5]]))))
-    assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == pytest.approx(
+    assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == approx(
         (TRIM + 0.7, 0.0, 0.5)
     )

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from benchmarks import counterexample
+from pytest import approx
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 from tests.closed_loop import law_params, reference_outputs
 
@@ -538,9 +539,7 @@ def test_40_has_counterexample() -> None:
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls
     # with T. For e = sin(t^2)/t, abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1,
     # gamma_2 exist.
-    assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx(
-        [7.3, 41.8, 283.8], rel=0.01
-    )
+    assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == approx([7.3, 41.8, 283.8], rel=0.01)
 
 
 @pytest.mark.equation(40)
@@ -592,10 +591,10 @@ def test_no_beta_serves_every_f() -> None:
     # large beta: 2.6 % at 2.
     for beta, tolerance in ((2.0, 0.03), (1000.0, 1e-3)):
         cycle = counterexample.limit_cycle(beta)
-        assert np.max(cycle.e) == pytest.approx(counterexample.formula(beta), rel=tolerance)
+        assert np.max(cycle.e) == approx(counterexample.formula(beta), rel=tolerance)
         # (29) with gamma_2 of this flight asks for bound + beta K / Lambda, more than any beta of
         # the flight
-        assert 1.0 + cycle.gamma_2 == pytest.approx(1.0 + 10.0 * beta, rel=0.06)
+        assert 1.0 + cycle.gamma_2 == approx(1.0 + 10.0 * beta, rel=0.06)
         # f as a function of time keeps the law on this flight: small deviations die out
         assert np.all(cycle.multipliers < 1.0)
 
@@ -604,7 +603,7 @@ def test_recorded_f_has_same_limit() -> None:
     """The recorded f as a function of time leads the sampled law to the same limit."""
     # From 10 % beside the cycle. Measured 2.9 % below it at 0.2 ms and 0.3 % at 0.05 ms.
     cycle = counterexample.limit_cycle(2.0)
-    assert replayed(cycle, 1.1 * cycle.e_dot[0]) == pytest.approx(np.max(cycle.e), rel=0.05)
+    assert replayed(cycle, 1.1 * cycle.e_dot[0]) == approx(np.max(cycle.e), rel=0.05)
     assert replayed(cycle, 1.1 * cycle.e_dot[0], acts=0.0) < 1e-9
 
 
@@ -734,7 +733,7 @@ def gravity_slope(q: float) -> float:
 @pytest.mark.equation("Assumption 2")
 def test_f_dot_grows_with_pitch_rate() -> None:
     """f_dot of gravity grows with q, so Assumption 2 presumes a bounded flight."""
-    assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == pytest.approx(
+    assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == approx(
         [-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY]
     )
 
@@ -763,7 +762,7 @@ def test_bound_7_fails_in_gust() -> None:
 
     x = solve_ivp(x_dot, (0.0, 2.0), np.zeros(8), max_step=0.005, rtol=1e-8, atol=1e-10).y
     assert np.max(np.abs(C @ x)) < 1e-9
-    assert np.degrees(np.max(np.abs(x[ALPHA]))) == pytest.approx(21.1, abs=0.1)
+    assert np.degrees(np.max(np.abs(x[ALPHA]))) == approx(21.1, abs=0.1)
 
 
 def largest_y_m_ddot(model: Model, rise: float) -> float:
@@ -783,7 +782,7 @@ def test_first_order_model_unbounds_N_d() -> None:
     # no beta suffices for a step.
     first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
     peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
-    assert peaks == pytest.approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
+    assert peaks == approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
 
 
 def test_second_order_model_bounds_N_d() -> None:

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.conftest import refusing
 
 from flight_analysis.closed_loop.replay import replay
@@ -74,7 +75,7 @@ def y_at(V: float) -> FloatArray:
 )
 def test_scale_is_ratio_of_dynamic_pressures_within_range(V: float, scale: float) -> None:
     assert SCALE_RANGE == (0.3, 3.0)
-    assert target_scale(y_at(V), law().params) == pytest.approx([scale, scale, scale, 1.0])
+    assert target_scale(y_at(V), law().params) == approx([scale, scale, scale, 1.0])
 
 
 def test_change_of_scale_leaves_u_as_it_is() -> None:
@@ -93,8 +94,8 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
         y, y_at(FASTER), zero, zero, zero
     )  # the reference moved too: the same error
     state, after = control_law.step(state, moved, instant, at_once)
-    assert state.scale[0] == pytest.approx((SPEED / (SPEED + y[3])) ** 2)
-    assert after == pytest.approx(u, rel=1e-6)
+    assert state.scale[0] == approx((SPEED / (SPEED + y[3])) ** 2)
+    assert after == approx(u, rel=1e-6)
 
 
 def rms(tape: Tape) -> dict[str, float]:
@@ -112,7 +113,7 @@ def test_schedule_keeps_delayed_loop_at_rest() -> None:
     assert rms(flown(False))["q"] > 10.0
     tape = flown(True)
     assert max(rms(tape).values()) < 0.1
-    assert tape["internals"]["scale.q"][-1] == pytest.approx((46.3 / 62.3) ** 2, rel=0.01)
+    assert tape["internals"]["scale.q"][-1] == approx((46.3 / 62.3) ** 2, rel=0.01)
     assert set(tape["internals"]["scale.V"]) == {1.0}
 
 
