@@ -18,6 +18,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, batch_allocation, batch_matrices
+from flight_campaign.batch_loop import FleetResult
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
@@ -56,7 +57,7 @@ def fly(
     late: Array = 0,
     control_law: ControlLaw = CONTROL_LAW,
     params: Any = PARAMS,
-) -> batch.FleetResult:
+) -> FleetResult:
     course = build_course(scenario)
     directions = gust_directions(
         load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind
@@ -69,7 +70,7 @@ def fly(
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     """One of them in the single-process simulation, evaluated at the ticks: figures of
-    `fleet.FleetResult`, (m,).
+    `FleetResult`, (m,).
     """
     effect = scenario.aircraft.uncertainty.wind
     uncertainty = {"A": 0.3, "B": 0.3, "wind": effect, "seed": 5, "number": number}

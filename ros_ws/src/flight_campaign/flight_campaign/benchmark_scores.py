@@ -18,7 +18,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
 from flight_campaign import batch, batch_matrices, missions
-from flight_campaign.batch import FleetResult, Stepper
+from flight_campaign.batch import Stepper
+from flight_campaign.batch_loop import FleetResult
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Step, Task, entered, stepped, task_of
 from flight_campaign.benchmark_sets import AFTER, BEFORE, SETS, UNCERTAINTY, VERSION, Sets, seed_of

@@ -44,7 +44,7 @@ from rise_di_controller.params import ControllerConfig
 if TYPE_CHECKING:
     import polars as pl
 
-    from flight_campaign.batch import Vehicle
+    from flight_campaign.batch_loop import Vehicle
     from flight_campaign.missions import Mission
 
 DEFINITION = "campaign.json"

@@ -21,7 +21,7 @@ from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import batch, batch_matrices, statistics
-from flight_campaign.batch import FleetResult, Vehicle
+from flight_campaign.batch_loop import FleetResult, Vehicle
 from flight_campaign.batch_matrices import Fleet
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.law_margins import has_margins, nominal_margins

@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How the loop over the ticks of a course is compiled: with branches, or in runs of known ticks.
+
+A GPU waits for the host at each branch. Phase, forcing and action of guidance are known before the
+flight, so each run of ticks has a loop without a branch. A CPU is faster with one loop.
+"""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_campaign.benchmark_course import ENGAGE, HOLD, Course
+
+RUN = 120
+"""Ticks of a run, a multiple of most periods of guidance. A run is forced if a tick of it is."""
+
+UNROLL = 4  # ticks of a step of the loop; on one H200 1,000,000 aircraft took 16.7 s with 1
+LONGEST = 20  # ticks of a pattern, which is compiled tick by tick
+
+
+class Kind(NamedTuple):
+    """What is known of a tick when the loop is compiled; None: a branch asks at the tick."""
+
+    phase: int | None
+    action: int | None  # of guidance
+    forced: bool | None  # whether biases, gusts or turbulence act
+
+
+ASKED = Kind(None, None, None)
+
+
+class Run(NamedTuple):
+    """Ticks in one loop: a pattern of kinds again and again. Hashable."""
+
+    length: int  # ticks, a multiple of the pattern
+    pattern: tuple[Kind, ...]
+    unroll: int  # patterns a step of the loop
+
+
+Schedule = Callable[[Course, NDArray[np.int32] | None], Iterator[Run]]
+"""The runs of a course, with the actions of guidance or None."""
+
+
+def with_branches(course: Course, action: NDArray[np.int32] | None) -> Iterator[Run]:
+    """One loop, whose branches ask at each tick."""
+    yield Run(len(course.segments.t), (ASKED,), 1)
+
+
+def without_branches(course: Course, action: NDArray[np.int32] | None) -> Iterator[Run]:
+    """Runs of at most RUN ticks, so that few loops are compiled, each used many times.
+
+    A run without a short pattern of phases, as one with dropouts, keeps the branch of the phase.
+    """
+    phase = course.segments.phase
+    ticks = len(phase)
+    actions = np.full(ticks, HOLD) if action is None else np.asarray(action)
+    blows = (course.segments.forcing != 0.0).any(axis=1)
+    engaging = np.flatnonzero((phase == ENGAGE) | (actions == ENGAGE))
+    cuts = np.unique([0, *engaging, *(engaging + 1), ticks])
+    for begin, end in pairwise(cuts.tolist()):
+        for first in range(begin, end, RUN):
+            run = slice(first, min(first + RUN, end))
+            forced = bool(blows[run].any())
+            kinds = [
+                Kind(int(of_law), int(of_guidance), forced)
+                for of_law, of_guidance in zip(phase[run], actions[run], strict=True)
+            ]
+            pattern = _pattern(kinds) or (Kind(None, None, forced),)
+            yield Run(len(kinds), pattern, max(UNROLL // len(pattern), 1))
+
+
+def _pattern(kinds: list[Kind]) -> tuple[Kind, ...] | None:
+    """The shortest pattern of which the kinds are repetitions, None for one above LONGEST."""
+    for length in range(1, min(len(kinds), LONGEST) + 1):
+        repeats, rest = divmod(len(kinds), length)
+        if not rest and kinds[:length] * repeats == kinds:
+            return tuple(kinds[:length])
+    return None
