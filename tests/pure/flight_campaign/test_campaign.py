@@ -6,6 +6,7 @@ kill and resume.
 
 import io
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -39,7 +40,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_campaign import engines, equipment
+from flight_campaign import campaign, device, engines, equipment
 from flight_campaign.campaign import (
     CHUNKS,
     Campaign,
@@ -654,16 +655,84 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
     "error",
     [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")],
 )
-def test_chunk_beyond_memory_is_one_sentence(
-    error: Exception, monkeypatch: pytest.MonkeyPatch
+def test_chunk_beyond_memory_flies_in_halves_with_the_same_draws(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The second is the text of an error of JAX."""
-    monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=error))
+    """The second is the text of an error of JAX. Figures may differ by the order of sums, which
+    depends on the vector width of the CPU.
+    """
+    part = define(SHORT.vary(flight={"duration": 0.5}), 30, 0.3, 7, 20).model_dump_json()
+    fits = campaign.fly_chunk_figures(part, (0, 0))
+    fly_at_once = campaign._fly_at_once
+
+    def small(text: str, case: int, first: int, count: int, size: int) -> Chunk:
+        if size > 5:
+            raise error
+        return fly_at_once(text, case, first, count, size)
+
+    monkeypatch.setattr(campaign, "_FITTING", {})
+    monkeypatch.setattr(campaign, "_fly_at_once", small)
+    halved = campaign.fly_chunk_figures(part, (0, 0))
+    assert [record.message for record in caplog.records] == [
+        f"chunk: {size} aircraft do not fit into memory: {size // 2} fly at once"
+        for size in (20, 10)
+    ]
+    assert len(campaign.fly_chunk_figures(part, (0, 1)).diverged) == 10
+    assert len(caplog.records) == 2  # the next chunk begins with the size that fits
+    for name, values in fits.entries.items():
+        assert (halved.entries[name] == values).all()
+    for name, values in fits.figures.items():
+        assert halved.figures[name] == pytest.approx(values, rel=1e-9)
+
+
+def test_aircraft_beyond_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaign, "_FITTING", {})
+    monkeypatch.setattr(campaign, "_fly_at_once", Mock(side_effect=MemoryError()))
     with pytest.raises(
-        ParameterError,
-        match=r"chunk: found 20 aircraft at once, which need more memory .* expected fewer",
+        ParameterError, match=r"^chunk: found an aircraft that needs more memory than there is"
     ):
         fly_chunk(definition().model_dump_json(), (0, 0))
+
+
+def device_of(job: engines.Job) -> str:
+    del job
+    return os.environ["CUDA_VISIBLE_DEVICES"]
+
+
+def test_each_worker_of_a_local_cluster_has_a_device_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def two_devices() -> list[dict[str, str]]:
+        return [{"CUDA_VISIBLE_DEVICES": name} for name in ("2", "5")]
+
+    monkeypatch.setattr(engines, "_separate_devices", two_devices)
+    flown = list(engines.dask()(device_of, [(k,) for k in range(12)]))
+    assert {name for _, name in flown} == {"2", "5"}
+
+
+def test_devices_of_a_process_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert device.separate_devices() == []  # of a CPU
+    client = SimpleNamespace(platform="cuda")
+    monkeypatch.setattr("jax.local_devices", lambda: 2 * [SimpleNamespace(client=client)])
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
+    assert device.separate_devices() == [
+        {"CUDA_VISIBLE_DEVICES": "2"},
+        {"CUDA_VISIBLE_DEVICES": "5"},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("gibibytes", "aircraft", "chunk"),
+    [(60, 1_000_000, 250_000), (60, 300_000, 150_000), (1, 100_000, 50_000), (60, 7, 7)],
+)
+def test_chunks_of_a_device_are_equal_and_fit_into_its_memory(
+    gibibytes: int, aircraft: int, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With 16 KiB an aircraft 1 GiB holds 65,536."""
+    holder = SimpleNamespace(memory_stats=lambda: {"bytes_limit": gibibytes * 2**30})
+    monkeypatch.setattr(device, "is_cpu", lambda: False)
+    monkeypatch.setattr("jax.devices", lambda: [holder])
+    assert device.chunk_of_device(aircraft) == chunk
 
 
 def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(

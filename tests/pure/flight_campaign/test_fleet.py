@@ -4,6 +4,7 @@
 others.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch, batch_allocation, batch_matrices
+from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule, missions
 from flight_campaign.batch_loop import FleetResult
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
@@ -234,6 +235,73 @@ def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
     assert not np.allclose(rms[:, 3], rms[:, 0], rtol=1e-3)
 
 
+LOSSY = SERVO.vary(aircraft={"rate": 100.0, "step": 0.002, "sensors": {"dropout": 0.02, "seed": 3}})
+
+
+@pytest.mark.parametrize(
+    ("scenario", "unroll"),  # each tick unrolled compiles for a second
+    [(SERVO.vary(aircraft={"sensors": {"delay": 0.02}}), 2), (LOSSY, 1)],
+    ids=["engagement and gusts", "dropouts"],
+)
+def test_loop_without_branches_gives_the_bits_of_the_loop_with_branches(
+    scenario: Scenario, unroll: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch_schedule, "UNROLL", unroll)
+    course = build_course(scenario)
+    A, B = sampled(0.3, 5, 6)
+    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
+    flown = [
+        batch.fly(aircraft, batch.vehicle(scenario), course, CONTROL_LAW, PARAMS, schedule=schedule)
+        for schedule in (batch_schedule.with_branches, batch_schedule.without_branches)
+    ]
+    for name in ("rms", "max", "slew", "diverged"):
+        with_branches, without = (np.asarray(getattr(result, name)) for result in flown)
+        assert (with_branches == without).all(), name
+
+
+def test_runs_of_a_course_cover_each_tick_once_with_its_phase_and_forcing() -> None:
+    course = build_course(LOSSY)
+    segments = course.segments
+    k = 0
+    kinds = set()
+    for run in batch_schedule.without_branches(course, None):
+        kinds.add(run)
+        for tick in range(k, k + run.length):
+            kind = run.pattern[(tick - k) % len(run.pattern)]
+            assert kind.phase in {None, segments.phase[tick]}
+            assert kind.forced or not segments.forcing[tick].any()
+        k += run.length
+    assert k == len(segments.t)
+    assert any(run.pattern[0].phase is None for run in kinds)  # a run with a dropout asks
+    assert len(kinds) <= 8  # each is compiled, a few seconds
+
+
+def test_actions_of_guidance_are_known_in_runs_of_a_route() -> None:
+    route = find_scenario("osprey_route", 20.0)
+    course = build_course(route)
+    action = np.asarray(missions.build(route, course).action)
+    runs = list(batch_schedule.without_branches(course, action))
+    known = [kind.action for run in runs for kind in run.pattern * (run.length // len(run.pattern))]
+    assert known == action.tolist()
+
+
+def test_matrices_compiled_for_a_device_are_those_of_numpy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scenario = SERVO.vary(aircraft={"drift": {"start": 1.0, "duration": 4.0, "A": 0.3, "B": 0.3}})
+    course = build_course(scenario)
+    plant = scenario.aircraft.plant()
+    A, B = sampled(0.3, 5, 3)
+    on_host = batch_matrices.assemble(A, B, plant, course)
+    monkeypatch.setattr(batch_matrices, "is_cpu", lambda: False)
+    on_device = batch_matrices.assemble(A, B, plant, course)
+    assert on_device.blocks == on_host.blocks
+    leaves = (jax.tree.leaves(fleet._replace(blocks=())) for fleet in (on_host, on_device))
+    for numpy_values, values in zip(*leaves, strict=True):
+        # a fused multiply-add rounds once where NumPy rounds twice
+        assert np.asarray(values) == pytest.approx(np.asarray(numpy_values), rel=1e-13, abs=1e-15)
+
+
 class Ticks(NamedTuple):
     """State of the pulse."""
 
@@ -290,11 +358,10 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
     course, vehicle = build_course(SERVO), batch.vehicle(SERVO)
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
-    vehicle = vehicle._replace(
-        actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None)
-    )
+    unlimited = vehicle.actuators._replace(lower=None, upper=None, rate=None)
+    vehicle = replace(vehicle, actuators=unlimited)
     infinite = np.full((4, 1), np.inf)
-    vehicle = vehicle._replace(limits=Limits(-infinite, infinite, infinite))
+    vehicle = replace(vehicle, limits=Limits(-infinite, infinite, infinite))
     aircraft = batch_matrices.assemble(A, B, SERVO.aircraft.plant(), course)
     both = batch.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS)
     assert np.asarray(both.diverged).tolist() == [False, True]

@@ -8,6 +8,7 @@ all of them.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -51,17 +52,23 @@ def vehicle(scenario: Scenario) -> Vehicle:
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
     quantum = None if errors.quantum is None else errors.quantum[order]
     guard = scenario.controller.guard()
+    states, remainder = _reduced(aircraft)
+    effectors = list(channels.inputs)
     return Vehicle(
-        np.argmax(aircraft.C[order], axis=1),
-        np.array([list(channels.inputs).index(name) for name in scenario.controller.effectors]),
-        *_reduced(aircraft),
-        Actuators(*(None if values is None else values[:, None] for values in plant.actuators)),
-        Limits(*(values[:, None] for values in guard.limits)),
-        None if quantum is None else quantum[:, None],
-        None,
-        seconds(plant.step_ns),
-        tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
-        None if guard.allocation is None else batch_allocation.with_column_limits(guard.allocation),
+        outputs=tuple(np.argmax(aircraft.C[order], axis=1).tolist()),
+        inputs=tuple(effectors.index(name) for name in scenario.controller.effectors),
+        remainder_states=tuple(states.tolist()),
+        vanes=tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
+        remainder=remainder,
+        actuators=Actuators(
+            *(None if values is None else values[:, None] for values in plant.actuators)
+        ),
+        limits=Limits(*(values[:, None] for values in guard.limits)),
+        quantum=None if quantum is None else quantum[:, None],
+        dt=seconds(plant.step_ns),
+        allocation=None
+        if guard.allocation is None
+        else batch_allocation.with_column_limits(guard.allocation),
     )
 
 
@@ -83,7 +90,7 @@ def with_equipment(
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
         lag = equipment.in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
-        vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lag=_rows(lag)))
+        vehicle = replace(vehicle, actuators=vehicle.actuators._replace(lag=_rows(lag)))
     if any(name.startswith("noise[") for name in values):
         noise = aircraft.sensors.noise
         drawn = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
@@ -92,9 +99,8 @@ def with_equipment(
             for value, published in zip(drawn, noise, strict=True)
         ]
         by_name = dict(zip(channels.outputs, more, strict=True))
-        vehicle = vehicle._replace(
-            noisier=_rows([by_name[name] for name in scenario.controller.outputs])
-        )
+        noisier = _rows([by_name[name] for name in scenario.controller.outputs])
+        vehicle = replace(vehicle, noisier=noisier)
     return vehicle
 
 
@@ -160,9 +166,16 @@ def fly(
     action = None if mission is None else np.asarray(mission.action)
     k = 0
     for run in (schedule or schedule_of_device())(course, action):
-        state = batch_loop.fly_run(state, constants, segments, k, run=run, **compiled)
+        # The branches of an allocation stay; unrolled they would compile for minutes.
+        looped = run if vehicle.allocation is None else run._replace(unroll=1)
+        state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
         k += run.length
     return figures(state, k, course.period, mission, timing)
+
+
+def on_host(result: FleetResult) -> FleetResult:
+    """The figures as arrays of NumPy, after the flights."""
+    return jax.tree.map(np.asarray, result)
 
 
 def _timing(fleet: Fleet, course: Course, windows: tuple[int, ...]) -> Timing:

@@ -7,6 +7,7 @@ integration are one matrix product.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax import numpy as jnp
+from numpy.typing import NDArray
 
 from aircraft_sim import actuators, dynamics, sensors
 from aircraft_sim.actuators import Actuators
@@ -32,23 +34,29 @@ from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits, saturate
 
 
-class Vehicle(NamedTuple):
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("remainder", "actuators", "limits", "quantum", "noisier", "dt", "allocation"),
+    meta_fields=("outputs", "inputs", "remainder_states", "vanes"),
+)
+@dataclass(frozen=True)
+class Vehicle:
     """Properties that all aircraft of a fleet share."""
 
-    outputs: Array  # (m,) indices of the outputs in the state, in the law's order
-    inputs: Array  # (p,) indices of the effectors in the airframe's order
-    remainder_states: Array  # (c,) indices of the states in the nonlinear remainder
+    # Constants of the compiled loop: a device then takes rows without looking up where they are.
+    outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
+    inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
+    remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
+    vanes: tuple[int, ...]  # indices in the state of what the vanes read
     # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
     remainder: Aircraft
     actuators: Actuators  # (p, 1), airframe's order
     limits: Limits  # (m, 1), law's order: of u, as the controller has them
     quantum: Array | None  # (m, 1), law's order
-    noisier: (
-        Array | None
-    )  # (m, N), law's order: noise in parts of the noise of the course, less 1; None: 0
     dt: float  # s, of a step of the integration
-    vanes: tuple[int, ...] = ()  # indices in the state of what the vanes read
-    allocation: Allocation | None = None  # None: the inputs of the law are the effectors
+    allocation: Allocation | None  # None: the inputs of the law are the effectors
+    # (m, N), law's order: noise in parts of the noise of the course, less 1; None: 0
+    noisier: Array | None = None
 
 
 class FleetResult(NamedTuple):
@@ -62,6 +70,13 @@ class FleetResult(NamedTuple):
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
     mission: dict[str, Array] | None = None  # of `missions.figures`; None without guidance
     windows: Array | None = None  # (W, m, N) rms by window
+
+
+def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
+    """The rows at known places, as slices, which the compiler of a GPU fuses with their use."""
+    if not len(places):
+        return array[:0]
+    return jnp.stack([jax.lax.index_in_dim(array, int(k), keepdims=False) for k in places])
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
@@ -231,7 +246,8 @@ def _measured(
 ) -> Measurements:
     """What a law takes at a tick."""
     y, y_m, y_m_dot = sample
-    x = now.x.at[vehicle.outputs].set(y)
+    measured = dict(zip(vehicle.outputs, y, strict=True))
+    x = jnp.stack([measured.get(k, row) for k, row in enumerate(now.x)])
     matrices = at(segment.t, fleet)
     acting = _product(
         matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)]
@@ -243,7 +259,7 @@ def _measured(
     if vehicle.vanes:
         vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
         vane_m = segment.vane_m[:, None] + 0.0 * vane
-    position = now.position[vehicle.inputs]
+    position = rows_of(now.position, vehicle.inputs)
     if vehicle.allocation is not None:
         position = product(vehicle.allocation.effect, position)
     return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
@@ -264,7 +280,7 @@ def sense(
     kind: Kind = ASKED,
 ) -> tuple[LoopState, Sample]:
     """The sample of a tick for the law; guidance steps, and the figures take the true error."""
-    true = now.x[vehicle.outputs]
+    true = rows_of(now.x, vehicle.outputs)
     flown = now.mission
     if mission is None:
         y_m, *reference = (
@@ -323,7 +339,7 @@ def advance(
             jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0
         )
     )
-    commanded = acting[jnp.argsort(vehicle.inputs)]
+    commanded = rows_of(acting, np.argsort(vehicle.inputs))
 
     def move(position: Array, t: Array) -> tuple[Array, Array]:
         return actuators.move(t, position, commanded, vehicle.dt, vehicle.actuators)
@@ -336,13 +352,13 @@ def advance(
         segment.t + np.arange(timing.steps) * vehicle.dt,
         unroll=kind is not ASKED,
     )
-    remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
+    remainder = remainder_of(rows_of(now.x, vehicle.remainder_states), vehicle.remainder)
     moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
     matrices = at(segment.t, fleet)
     parts = []
     for matrix, block in zip(matrices.tick, blocks, strict=True):
         parts.append(_product(matrix, [moves[j] for j in block.columns]))
-    x = jnp.concatenate(parts)[places]
+    x = rows_of(jnp.concatenate(parts), places)
     x = _chosen(
         kind.forced,
         jnp.any(segment.forcing != 0.0).astype(int),

@@ -7,8 +7,9 @@ The folder of a campaign holds its definition, a table for each completed chunk,
 figures and its report.
 """
 
+import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
@@ -31,8 +32,8 @@ from flight_campaign import equipment, learning_flights
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
-from flight_campaign.learning_flights import LearningOutcome, MakeLearner
-from flight_campaign.rows import Chunk, encode, tally_of
+from flight_campaign.learning_flights import MakeLearner
+from flight_campaign.rows import Chunk, encode, joined, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
 from flight_core.files import replacing, write_file, writing
@@ -50,7 +51,8 @@ if TYPE_CHECKING:
 DEFINITION = "campaign.json"
 CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
-CHUNK = 1000  # aircraft computed at once; those that learn fly one by one, each a chunk
+LOGGER = logging.getLogger(__name__)
+_FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk did not fit
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
 
 
@@ -253,7 +255,7 @@ def define(
     """The definition of a campaign over a scenario.
 
     `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units
-    of the score by output, SI. `chunk` None: CHUNK, or 1 with a learner.
+    of the score by output, SI. `chunk` None: what is fast on the device; 1 with a learner.
 
     Raises ParameterError if a campaign cannot fly it.
     """
@@ -294,7 +296,7 @@ def define(
         "uncertainty": uncertainty,
         "wind": scenario.aircraft.uncertainty.wind if wind is None else wind,
         "seed": seed,
-        "chunk": chunk or (1 if scenario.learns() else CHUNK),
+        "chunk": chunk or _default_chunk(scenario, aircraft),
         "sweep": sweep,
         "entries": dict(spread.entries),
         "distribution": spread.distribution,
@@ -306,56 +308,83 @@ def define(
     return definition
 
 
+def _default_chunk(scenario: Scenario, aircraft: int) -> int:
+    """How many aircraft fly at once; those that learn fly one by one."""
+    if scenario.learns() or aircraft < 1:
+        return 1
+    from flight_campaign.device import chunk_of_device  # noqa: PLC0415 - JAX, as above
+
+    return chunk_of_device(aircraft)
+
+
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no
     other inputs.
 
-    `learner` makes the learner of a scenario. Raises ParameterError for a chunk that does not fit
-    into memory.
+    `learner` makes the learner of a scenario. Raises ParameterError for an aircraft that does not
+    fit into memory.
     """
     definition = Definition.model_validate_json(text)
-    try:
-        if learner is not None and definition.scenario().learns():
-            figures = fly_learning(definition, job, learner)
-        else:
-            figures = fly_chunk_figures(text, job)
-    except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
-        if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
-            raise
-        demand = f"{definition.chunk} aircraft at once, which need more memory than there is"
-        raise ParameterError(
-            f"chunk: found {demand}, expected fewer, or shorter delays of the aircraft"
-        ) from None
+    if learner is not None and definition.scenario().learns():
+        figures = learning_flights.fly_chunk(definition, job, learner)
+    else:
+        figures = fly_chunk_figures(text, job)
     return encode(figures, definition.seed, definition.factor(job[0]))
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
-    """Fly a chunk of a campaign. One of a guided scenario flies missions."""
-    from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, which the command needs only for flights
-
+    """Fly a chunk of a campaign, in parts where the memory is too small for a chunk at once."""
     definition = Definition.model_validate_json(text)
     case, chunk = job
     first = chunk * definition.chunk
-    count = definition.size(job)
+    end = first + definition.size(job)
+    size = _FITTING.get(text, definition.chunk)
+    parts: list[Chunk] = []
+    while first < end:
+        # The last part has the size of the others, so that nothing is compiled again; surplus
+        # aircraft are dropped.
+        count = min(size, end - first)
+        try:
+            parts.append(_fly_at_once(text, case, first, count, size))
+        except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
+            if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
+                raise
+            if size == 1:
+                demand = "an aircraft that needs more memory than there is"
+                raise ParameterError(
+                    f"chunk: found {demand}, expected shorter delays of the aircraft"
+                ) from None
+            half = -(-size // 2)
+            LOGGER.warning(f"chunk: {size} aircraft do not fit into memory: {half} fly at once")
+            size = _FITTING[text] = half
+        else:
+            first += count
+    return joined(parts)
+
+
+def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
+    """The first `count` of the `size` aircraft from number `first`, which fly at once. Those of a
+    guided scenario fly missions.
+    """
+    from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign.device import turn  # noqa: PLC0415 - as above
+
+    definition = Definition.model_validate_json(text)
     part = definition.uncertainty
     scenario, course, vehicle, law, mission = _prepare(text, case)
-    # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft
-    # are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
-    A, B = sampled_matrices(
-        airframe, part, part, definition.seed, first, definition.chunk, definition.spread
-    )
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, size, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
-    equipped = definition.drawn_equipment(scenario, first, definition.chunk)
+    equipped = definition.drawn_equipment(scenario, first, size)
     late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
-    aircraft = batch_matrices.assemble(
-        A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
-    )
-    vehicle = batch.with_equipment(vehicle, scenario, equipped)
-    result = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
-    rms, largest, slew = (
-        np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew)
-    )
+    with turn():
+        aircraft = batch_matrices.assemble(
+            A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
+        )
+        vehicle = batch.with_equipment(vehicle, scenario, equipped)
+        flown = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
+        result = batch.on_host(flown)
+    rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
     outputs = scenario.controller.outputs
     inputs = scenario.controller.effectors
     if result.mission is None:
@@ -366,7 +395,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
             )
         }
     else:
-        figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
+        figures = {name: values[:count] for name, values in result.mission.items()}
     for kind, names, values in (
         ("rms", outputs, rms),
         ("max", outputs, largest),
@@ -376,45 +405,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     entries = drawn_entries(airframe, A[:count], B[:count]) | {
         name: value[:count] for name, value in equipped.items()
     }
-    return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
-
-
-def _by_channel(flights: Sequence[learning_flights.Flight], kind: str) -> dict[str, FloatArray]:
-    """A figure of the flights by channel, (N,) each."""
-    values = [getattr(flight, kind) for flight in flights]
-    by_channel = {}
-    for name in values[0]:
-        by_channel[name] = np.array([by_name[name] for by_name in values])
-    return by_channel
-
-
-def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chunk:
-    """Fly a chunk of a campaign with learners, one aircraft after another."""
-    case, chunk = job
-    first = chunk * definition.chunk
-    count = definition.size(job)
-    part = definition.uncertainty
-    scenario = definition.scenario(case)
-    airframe = load_airframe(scenario.aircraft.airframe)
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
-    entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
-    flown = [
-        learning_flights.fly(definition.aircraft_scenario(first + k, case), learner)
-        for k in range(count)
-    ]
-    outputs = scenario.controller.outputs
-    by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
-    rms = np.array([by_kind["rms"][name] for name in outputs])
-    figures = {
-        "score": score(
-            rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units)
-        )
-    }
-    for kind, by_channel in by_kind.items():
-        figures |= {f"{kind}.{name}": values for name, values in by_channel.items()}
-    for name in LearningOutcome._fields:
-        figures[name] = np.array([float(getattr(flight.learned, name)) for flight in flown])
-    return Chunk(first, np.array([flight.diverged for flight in flown]), figures, entries)
+    return Chunk(first, result.diverged[:count], figures, entries)
 
 
 class _Shared(NamedTuple):

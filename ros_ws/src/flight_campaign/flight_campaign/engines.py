@@ -6,7 +6,7 @@ results.
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice
@@ -33,11 +33,19 @@ Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
 """Runs jobs in any order: each job with its result, in the order of completion."""
 
 
-def require_jax() -> None:
+Devices = Sequence[Mapping[str, str]]
+"""Environments of processes that see one device each."""
+
+
+def require_jax(*, shared: bool = False) -> None:
     """Raise ParameterError where JAX is not installed or finds no device, as with JAX_PLATFORMS of
     another host.
+
+    With `shared` the process leaves the memory of its device to other processes.
     """
     require_package("jax")
+    if shared:
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax  # noqa: PLC0415 - takes a second, which few commands need
 
     try:
@@ -51,12 +59,14 @@ def require_jax() -> None:
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Threads of this process. The loop is compiled once and releases the interpreter lock, so
-    threads run in parallel.
+    """Threads of this process, None: as many as keep the device busy. The loop is compiled once
+    and releases the interpreter lock, so threads run in parallel.
     """
-    count = workers or os.cpu_count() or 1
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
+        from flight_campaign import device  # noqa: PLC0415 - JAX takes a second
+
+        count = workers or device.threads()
         waiting = iter(jobs)
         pool = ThreadPoolExecutor(count, thread_name_prefix="campaign")
         try:
@@ -78,11 +88,14 @@ def threads(workers: int | None = None) -> Engine:
     return fly
 
 
-def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
+def dask(
+    workers: int | None = None, scheduler: str | None = None, *, on_devices: bool = True
+) -> Engine:
     """Processes of this machine, or the workers of a scheduler. The chunks of a dead worker run
     again.
 
-    A scheduler gets the lost chunks again when the scheduler is back within RECONNECT.
+    A scheduler gets the lost chunks again when the scheduler is back within RECONNECT. On a host
+    with GPUs each process has a GPU of its own, unless `on_devices` is False: learners need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -90,7 +103,8 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
         from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
         waiting = iter(jobs)
-        count = workers or os.cpu_count() or 1
+        devices = _separate_devices() if on_devices and scheduler is None else []
+        count = workers or len(devices) or os.cpu_count() or 1
         patience = CONNECT
         for part in (
             "",
@@ -106,11 +120,15 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
             with ExitStack() as stack:
                 try:
                     if scheduler is None:
-                        cluster = stack.enter_context(_local_cluster(count))
+                        cluster = stack.enter_context(_local_cluster(count, devices))
                     client = stack.enter_context(
                         Client(scheduler or cluster, timeout=f"{patience:g}s")
                     )
-                    ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
+                    if devices:
+                        client.register_plugin(_one_device_each(devices))
+                    workers_known = client.scheduler_info()["workers"].values()
+                    threads_known = sum(worker["nthreads"] for worker in workers_known)
+                    ahead = AHEAD * max(count, threads_known)
                 except (OSError, ValueError) as error:  # ValueError: no address at all
                     if scheduler is None:
                         raise ParameterError(
@@ -149,14 +167,35 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
     return fly
 
 
+def _separate_devices() -> Devices:
+    from flight_campaign.device import separate_devices  # noqa: PLC0415 - JAX takes a second
+
+    return separate_devices()
+
+
+def _one_device_each(devices: Devices) -> Any:
+    """A plugin that gives each worker of a local cluster a device, before its first chunk."""
+    from distributed import WorkerPlugin  # noqa: PLC0415 - half a second
+
+    class OneDeviceEach(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            os.environ.update(devices[worker.name % len(devices)])
+
+    return OneDeviceEach()
+
+
 @contextmanager
-def _local_cluster(workers: int) -> Iterator[Any]:
-    """Processes of this machine."""
+def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
+    """Processes of this machine; on devices each has the threads that keep a device busy."""
     import dask  # noqa: PLC0415 - half a second
     from distributed import LocalCluster  # noqa: PLC0415 - as above
 
+    from flight_campaign.device import THREADS  # noqa: PLC0415 - JAX
+
     with dask.config.set(LOST_WORKER_TIMEOUT):
-        cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=THREADS if devices else 1, dashboard_address=None
+        )
         try:
             yield cluster
         finally:

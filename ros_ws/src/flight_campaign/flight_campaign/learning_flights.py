@@ -4,19 +4,28 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import drawn_entries, sampled_matrices
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, inputs_by_part, true_error
+from flight_campaign.engines import Job
+from flight_campaign.rows import Chunk
+from flight_campaign.statistics import score, score_units
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
 from rise_di_controller.proposals import Event, EventKind
+
+if TYPE_CHECKING:
+    from flight_campaign.campaign import Definition
 
 MakeLearner = Callable[[Scenario], Learn | None]
 """Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises
@@ -83,3 +92,38 @@ def require_flyable(scenario: Scenario) -> None:
         "a section beside controller.learn",
         "none: the aircraft of a mission do not learn",
     )
+
+
+def _by_channel(flights: Sequence[Flight], kind: str) -> dict[str, FloatArray]:
+    """A figure of the flights by channel, (N,) each."""
+    values = [getattr(flight, kind) for flight in flights]
+    by_channel = {}
+    for name in values[0]:
+        by_channel[name] = np.array([by_name[name] for by_name in values])
+    return by_channel
+
+
+def fly_chunk(definition: "Definition", job: Job, learner: MakeLearner) -> Chunk:
+    """Fly a chunk of a campaign with learners, one aircraft after another."""
+    case, chunk = job
+    first = chunk * definition.chunk
+    count = definition.size(job)
+    part = definition.uncertainty
+    scenario = definition.scenario(case)
+    airframe = load_airframe(scenario.aircraft.airframe)
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
+    entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
+    flown = [fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    outputs = scenario.controller.outputs
+    by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
+    rms = np.array([by_kind["rms"][name] for name in outputs])
+    figures = {
+        "score": score(
+            rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units)
+        )
+    }
+    for kind, by_channel in by_kind.items():
+        figures |= {f"{kind}.{name}": values for name, values in by_channel.items()}
+    for name in LearningOutcome._fields:
+        figures[name] = np.array([float(getattr(flight.learned, name)) for flight in flown])
+    return Chunk(first, np.array([flight.diverged for flight in flown]), figures, entries)

@@ -3,7 +3,10 @@
 """A campaign as a table: a row an aircraft with its figures, its outcome, and the drawn entries."""
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from flight_campaign.equipment import is_of_equipment
 from flight_campaign.statistics import Tally, lost_track
@@ -26,6 +29,19 @@ class Chunk(NamedTuple):
     entries: dict[
         str, FloatArray
     ]  # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
+
+
+def joined(parts: Sequence[Chunk]) -> Chunk:
+    """Consecutive parts of a chunk as one."""
+    first, *others = parts
+    if not others:
+        return first
+    tables = ([part.figures for part in parts], [part.entries for part in parts])
+    figures, entries = (
+        {name: np.concatenate([table[name] for table in several]) for name in several[0]}
+        for several in tables
+    )
+    return Chunk(first.first, np.concatenate([part.diverged for part in parts]), figures, entries)
 
 
 def encode(chunk: Chunk, seed: int, factor: float) -> bytes:

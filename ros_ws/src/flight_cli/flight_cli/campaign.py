@@ -22,7 +22,7 @@ from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_analysis.report.tables import Table
 from flight_campaign import engines
-from flight_campaign.campaign import CHUNK, Campaign, Definition, Sweep, define
+from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import (
     FIGURE_HEADINGS,
     WIND_EFFECTS,
@@ -127,7 +127,8 @@ def campaign(
         int | None,
         setting(
             "chunk",
-            f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU.",
+            "Aircraft computed at once, by default 1000, on a GPU what its memory holds, with a "
+            "learner 1.",
             min=1,
         ),
     ] = None,
@@ -160,7 +161,7 @@ def campaign(
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
-    engines.require_jax()
+    engines.require_jax(shared=engine is EngineName.DASK)
     require(
         scheduler is None or engine is EngineName.DASK,
         "scheduler",
@@ -192,16 +193,18 @@ def campaign(
         units = None if score is None else _named_numbers("score", score, "q=0.02")
         definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
+    learns = monte_carlo.definition.scenario().learns()
     if engine is None:
-        engine = (
-            EngineName.DASK if monte_carlo.definition.scenario().learns() else EngineName.THREADS
-        )
+        engine = EngineName.DASK if learns else EngineName.THREADS
     flies = (
         engines.threads(workers)
         if engine is EngineName.THREADS
-        else engines.dask(workers, scheduler)
+        else engines.dask(workers, scheduler, on_devices=not learns)
     )
-    speed = _fly_missing(monte_carlo, flies, quiet=as_json)
+    from flight_campaign.device import device_name  # noqa: PLC0415 - JAX takes a second
+
+    place = "" if learns or scheduler is not None else f" on {device_name()}"
+    speed = _fly_missing(monte_carlo, flies, place, quiet=as_json)
     figures, results = write_results(monte_carlo)
     if rows is not None:
         with writing("rows", rows, "the path of a file"):
@@ -222,7 +225,7 @@ def campaign(
             )
     _print(console, results, "figure")
     if speed is not None:
-        print(f"flown:   {speed:,.0f} aircraft-seconds per second")
+        print(f"flown:   {speed:,.0f} aircraft-seconds per second{place}")
     print(
         f"folder:  {display_path(monte_carlo.folder)}\nreport:  "
         f"{display_path(monte_carlo.folder / REPORT)}"
@@ -260,8 +263,12 @@ def _parse_sweep(text: str) -> Sweep:
     )
 
 
-def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
-    """Fly the chunks that are missing; aircraft-seconds per second, None if none is."""
+def _fly_missing(
+    monte_carlo: Campaign, engine: engines.Engine, place: str, *, quiet: bool
+) -> float | None:
+    """Fly the chunks that are missing; aircraft-seconds per second, None if none is. `place` says
+    where, as " on NVIDIA H200".
+    """
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases
     missing = monte_carlo.missing()
@@ -273,14 +280,14 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     flown = 0
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
-            task = bar.add_task("aircraft", total=total, completed=stored, shown="starting")
+            task = bar.add_task("aircraft", total=total, completed=stored, shown=f"starting{place}")
             for flights in monte_carlo.fly(engine, learner):
                 flown += flights
                 speed = flown * seconds / (time.monotonic() - begin)
                 bar.update(
                     task,
                     completed=stored + flown,
-                    shown=f"{speed:,.0f} aircraft-seconds per second",
+                    shown=f"{speed:,.0f} aircraft-seconds per second{place}",
                 )
     except KeyboardInterrupt:
         print(

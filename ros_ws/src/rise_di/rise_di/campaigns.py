@@ -87,7 +87,8 @@ def fly_campaign(
         sweep: A parameter of the controller, or its value in a channel, and its factors:
             {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
-        chunk: Aircraft computed at once; None: 1000, with a learner 1. More are faster on a GPU.
+        chunk: Aircraft computed at once; None: 1000, on a GPU what its memory holds, with a
+            learner 1.
         workers: Threads, with a learner processes; None: one a core. A script with a learner calls
             the function under `if __name__ == "__main__":`.
         runs: Folder that the folder of the campaign is made in.
@@ -104,6 +105,7 @@ def fly_campaign(
         >>> rise_di.fly_campaign(scenario, 2, workers=1).rows().height
         2
     """
+    engines.require_jax()
     chosen = find_scenario(scenario, duration)
     spread = chosen.aircraft.uncertainty.spread()
     if entries is not None:
@@ -143,14 +145,16 @@ def resume_campaign(
         >>> rise_di.resume_campaign(campaign.folder).figures == campaign.figures
         True
     """
+    engines.require_jax()
     campaign = Campaign.resume(as_path(folder, "folder", "the folder of a campaign"))
     return _fly(campaign, _engine(campaign.definition, workers), _progress(progress))
 
 
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
     """Threads of this process; with a learner, processes of this machine."""
-    make = engines.dask if definition.scenario().learns() else engines.threads
-    return make(None if workers is None else as_count(workers, "workers", 1))
+    count = None if workers is None else as_count(workers, "workers", 1)
+    learns = definition.scenario().learns()
+    return engines.dask(count, on_devices=False) if learns else engines.threads(count)
 
 
 def _progress(progress: Progress | None) -> Progress:
