@@ -1,59 +1,127 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: speed relative to the simulation in one process, integration error, memory.
+"""Monte Carlo campaign: seconds and their floor on the device of this host, ratio to its CPU and to
+the simulation in one process, integration error, memory.
 
 python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
+    # 1,000,000 on a GPU, and 10,000 on the CPU of its host
 python -m benchmarks.campaign --scenario osprey_route --aircraft 2000 --exact 1        # missions
+
+The rows of the device are written to docs/evidence/tables/campaign-devices.csv.
 """
 
+import csv
 import json
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import jax
 import numpy as np
 import psutil
 import typer
+from benchmarks.evidence import FOLDER, Origin, Row, origin
 from benchmarks.tables import new_table
+from jax import numpy as jnp
 from rich.console import Console
 
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_campaign import engines
-from flight_campaign.campaign import Campaign, define, fly_chunk_figures
+from flight_campaign import batch_matrices, device, engines
+from flight_campaign.batch_schedule import without_branches
+from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign import Campaign, define, fly_chunk, fly_chunk_figures
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, the reference for the integration error
 UNCERTAINTY, SEED = 0.3, 7
+DEVICES = FOLDER / "tables/campaign-devices.csv"
+MILLION = 1_000_000
+COPIED = 2**27  # numbers of 8 bytes, 1 GiB, more than any cache holds
 
 
 class Speed(NamedTuple):
     """Speed and memory of a campaign."""
 
-    whole: float  # aircraft-seconds per second, from the first job to the last, with compilation
-    flown: float  # the same after the first chunk of each worker
+    compiled: float  # s, of the first chunk, flown once before, with compilation
+    took: float  # s, of the campaign, its rows written
     memory_early: float  # MB resident, after a third of the chunks
     memory: float  # MB at its end
 
 
-def speed(scenario: Scenario, aircraft: int, chunk: int, workers: int) -> Speed:
+def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | None) -> Speed:
     """Fly a campaign in threads of this process."""
     with TemporaryDirectory() as folder:
         campaign = Campaign.begin(
             Path(folder), define(scenario, aircraft, UNCERTAINTY, SEED, chunk)
         )
-        begin, process = time.perf_counter(), psutil.Process()
-        done = [
-            (time.perf_counter() - begin, flights, process.memory_info().rss / 1e6)
-            for flights in campaign.fly(engines.threads(workers))
-        ]
-    seconds, end = scenario.flight.duration, done[-1]
-    first, later = done[workers - 1], sum(flights for _, flights, _ in done[workers:])
-    after_first = later * seconds / (end[0] - first[0]) if later else float("nan")
-    return Speed(aircraft * seconds / end[0], after_first, done[len(done) // 3][2], end[2])
+        process = psutil.Process()
+        before = time.perf_counter()
+        fly_chunk(campaign.definition.model_dump_json(), (0, 0))
+        begin = time.perf_counter()
+        memory = [process.memory_info().rss / 1e6 for _ in campaign.fly(engines.threads(workers))]
+        took = time.perf_counter() - begin
+    return Speed(begin - before, took, memory[len(memory) // 3], memory[-1])
+
+
+def floor(scenario: Scenario, aircraft: int) -> float:
+    """Least seconds of a campaign on the device: its matrices, which fit into no cache of a device,
+    are read at each tick, at the speed of a copy.
+    """
+    course = build_course(scenario)
+    airframe = load_airframe(scenario.aircraft.airframe)
+    A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, SEED, 0, 1)
+    fleet = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
+    tick = sum(matrix.nbytes for matrix in fleet.tick)
+    size = sum(
+        run.length * (tick + bool(run.pattern[0].forced) * fleet.forced.nbytes)
+        for run in without_branches(course, None)
+    )
+    copy = jax.jit(lambda numbers: numbers + 1.0)
+    numbers = jnp.zeros(COPIED)
+    times = []
+    for _ in range(6):
+        begin = time.perf_counter()
+        copy(numbers).block_until_ready()
+        times.append(time.perf_counter() - begin)
+    return float(aircraft * size * min(times) / (2 * numbers.nbytes))
+
+
+def on_cpu(scenario: str, aircraft: int) -> dict[str, Any]:
+    """The figures of this program on the CPU of the host of a device."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "cpu.json"
+        words = ["--scenario", scenario, "--aircraft", str(aircraft), "--exact", "0"]
+        subprocess.run(  # noqa: S603 - this program
+            [sys.executable, "-m", "benchmarks.campaign", *words, "--json", str(path)],
+            check=True,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+            stdout=subprocess.DEVNULL,
+        )
+        return dict(json.loads(path.read_text()))
+
+
+def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin) -> None:
+    """Write the rows of a device, value and unit by name, in place of its former rows."""
+    DEVICES.touch()
+    with DEVICES.open(newline="") as stream:
+        kept = [line for line in list(csv.reader(stream))[1:] if not line[0].startswith(label)]
+    new = [
+        [*Row(f"{label}{name}", f"{value:.4g}", unit), *begun]
+        for name, (value, unit) in figures.items()
+    ]
+    with DEVICES.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(Row._fields + Origin._fields)
+        writer.writerows(sorted(kept + new))
 
 
 def alone(scenario: Scenario) -> tuple[float, FloatArray]:
@@ -97,48 +165,56 @@ def main(
     scenario: Annotated[
         str, typer.Option(help="Name of a scenario; one with guidance flies missions.")
     ] = "osprey_servo",
-    aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of the campaign.")] = 10_000,
-    chunk: Annotated[int, typer.Option(min=1, help="How many fly at once.")] = 1000,
-    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = psutil.cpu_count() or 1,
-    exact: Annotated[int, typer.Option(min=1, help="Aircraft whose integration is checked.")] = 4,
+    aircraft: Annotated[
+        int | None,
+        typer.Option(min=1, help="Aircraft, by default 10,000, on a GPU 1,000,000."),
+    ] = None,
+    chunk: Annotated[int | None, typer.Option(min=1, help="How many fly at once.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads.")] = None,
+    exact: Annotated[int, typer.Option(min=0, help="Aircraft whose integration is checked.")] = 4,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the figures to a file.")
     ] = None,
 ) -> None:
-    """Print speed, ratio to the simulation in one process, memory, and integration error."""
+    """Print and write speed, floor, ratios, memory, and integration error."""
+    begun = origin("python -m benchmarks.campaign")
     chosen = find_scenario(scenario)
-    many = speed(chosen, aircraft, chunk, workers)
-    single_speed, errors = integration_error(chosen, exact)
-    table = new_table(
-        f"{scenario}, {chosen.flight.duration:g} s, +-{100 * UNCERTAINTY:g} %, {workers} "
-        f"threads, chunks of {chunk}",
-        ("figure", "value"),
-        texts=1,
-    )
-    shares = dict(zip(chosen.controller.outputs, errors.tolist(), strict=True))
+    seconds = chosen.flight.duration
+    count = aircraft or (10_000 if device.is_cpu() else MILLION)
+    many = speed(chosen, count, chunk, workers)
+    flown = count * seconds / many.took
     rows = {
-        f"{aircraft} aircraft, all in": f"{many.whole:,.0f} aircraft-s/s",
-        "after the first chunks": f"{many.flown:,.0f} aircraft-s/s",
-        "ratio to a simulation in one process": f"{many.flown / single_speed:,.0f} x",
-        "memory after a third, at the end": f"{many.memory_early:,.0f} and {many.memory:,.0f} MB",
-        "integration error, share of rms": ", ".join(
-            f"{name} {share:.1e}" for name, share in shares.items()
-        ),
+        "seconds": (many.took, "s"),
+        "first chunk, with compilation": (many.compiled, "s"),
+        "speed": (flown, "aircraft-s/s"),
     }
-    for row in rows.items():
-        table.add_row(*row)
+    figures: dict[str, Any] = {
+        **many._asdict(),
+        "flown": flown,
+        "whole": count * seconds / (many.took + many.compiled),
+        "memory_growth": many.memory / many.memory_early,
+        "aircraft": count,
+    }
+    if not device.is_cpu():
+        figures["of_cpu"] = flown / on_cpu(scenario, 10_000)["flown"]
+        rows["ratio to the CPU of its host"] = (figures["of_cpu"], "")
+        rows["floor"] = (floor(chosen, count), "s")
+    if exact:
+        plain, errors = integration_error(chosen, exact)
+        shares = dict(zip(chosen.controller.outputs, errors.tolist(), strict=True))
+        rows["ratio to a simulation in one process"] = (flown / plain, "")
+        rows |= {f"{name}: integration error": (share, "") for name, share in shares.items()}
+        figures |= {"plain": plain, "exact": exact, "integration": shares}
+    is_goal = not device.is_cpu() and (scenario, count) == ("osprey_servo", MILLION)
+    figures["1,000,000 aircraft of 60 s with gusts on a GPU"] = many.took if is_goal else None
+    label = f"{scenario}, {count:,} flights of {seconds:g} s on {device.device_name()}: "
+    table = new_table(label, ("figure", "value", "unit"), texts=1)
+    for name, (value, unit) in rows.items():
+        table.add_row(name, f"{value:,.4g}", unit)
     Console().print(table)
     if json_file is not None:
-        figures = {
-            **many._asdict(),
-            "aircraft": aircraft,
-            "plain": single_speed,
-            "exact": exact,
-            "integration": shares,
-        }
-        figures["memory_growth"] = many.memory / many.memory_early
-        figures["1,000,000 aircraft of 60 s with gusts on a GPU"] = None  # s; no host has had a GPU
         json_file.write_text(json.dumps(figures, indent=1))
+    write_rows(label, rows, begun)
 
 
 if __name__ == "__main__":
