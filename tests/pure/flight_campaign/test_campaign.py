@@ -712,7 +712,7 @@ def test_each_worker_of_a_local_cluster_has_a_device_of_its_own(
 
 def test_devices_of_a_process_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device.separate_devices() == []  # of a CPU
-    client = SimpleNamespace(platform="cuda")
+    client = SimpleNamespace(platform_version="PJRT C API\ncuda 13000")
     monkeypatch.setattr("jax.local_devices", lambda: 2 * [SimpleNamespace(client=client)])
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
     assert device.separate_devices() == [

@@ -16,7 +16,7 @@ BYTES = 16_384  # of memory an aircraft; osprey_servo needed 11,300 on one H200 
 THREADS = 3  # of a device: a chunk is drawn, one flies, one is written
 
 VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
-"""Variables of the environment that name the devices of a process, by platform of JAX."""
+"""Variables of the environment that name the devices of a process, by a word of the platform."""
 
 _TURN = Lock()
 
@@ -59,7 +59,8 @@ def chunk_of_device(aircraft: int) -> int:
 def separate_devices() -> list[dict[str, str]]:
     """Environments of processes, of which each sees one device of this host; [] for a CPU."""
     devices = jax.local_devices()
-    variable = VISIBLE.get(devices[0].client.platform)
+    platform = devices[0].client.platform_version
+    variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)
     if variable is None:
         return []
     every = ",".join(str(number) for number in range(len(devices)))
