@@ -27,6 +27,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario, with_rou
 from flight_analysis.closed_loop.simulate import simulate
 from flight_guidance import modes
 from flight_guidance.lateral import PathError, PathParams, bank_for
+from flight_guidance.legs import course_and_speed
 from flight_guidance.route_file import Waypoint
 from flight_guidance.vertical import path_angle
 
@@ -87,9 +88,8 @@ def _within(angle: float) -> float:
 def without_lead(
     error: PathError, entry: Any, entered: Any, slip: Any, pose: Any, speed: Any, params: Any
 ) -> Any:
-    """`modes.follow` without the lead and without the estimate of the slip."""
-    course, ground_speed = modes.course_and_speed(pose)
-    wanted = modes.path_acceleration(error, course, ground_speed, params.path)
+    """`modes.follow` with L1, without the lead and without the estimate of the slip."""
+    wanted = l1(error, *course_and_speed(pose), params.path)
     return bank_for(wanted, path_angle(pose["climb"], speed), modes.STEEPEST)
 
 
