@@ -166,7 +166,7 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
     end = advance(7 * 40 * MS, state, u, 40 * MS, params)
 
     x, position, z = state
-    for k, normal in enumerate(turbulence.normals(7 * T, T, filters.seed)):
+    for k, normal in enumerate(turbulence.normals(7 * T, T, filters)):
         t = 0.28 + 0.002 * k
         position, mean = actuators.move(t, position, u, 0.002, params.actuators)
         x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, filters))

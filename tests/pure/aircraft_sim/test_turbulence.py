@@ -17,14 +17,17 @@ from tests.builders import MS, aircraft_parameters, truth_of
 
 from aircraft_sim import plant, turbulence
 from aircraft_sim.disturbance import AXES
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
+from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.slow
 
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
+SPAN = 3.0  # m
 SMALL = Dryden(
     np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8])
 )  # about 60 ft above the ground in 15 kt
@@ -56,7 +59,7 @@ def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
     """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
     params = [filters(model, V0, dt, ALL, seed) for seed in range(seeds)]
     z = np.array([turbulence.initial_state(filter_params) for filter_params in params]).T
-    numbers = np.array([turbulence.normals(0, steps, seed) for seed in range(seeds)])
+    numbers = np.array([turbulence.normals(0, steps, each) for each in params])
     winds = np.empty((3, seeds, steps))
     for k in range(steps):
         winds[:, :, k] = turbulence.wind(z, params[0])
@@ -172,10 +175,89 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> N
 
 
 def test_numbers_of_step_k_do_not_depend_on_range() -> None:
-    whole = turbulence.normals(0, 300, 5)
-    for first, count in ((0, 1), (63, 2), (64, 64), (130, 99), (299, 1)):
-        assert (turbulence.normals(first, count, 5) == whole[first : first + count]).all()
-    assert (turbulence.normals(0, 300, 6) != whole).all()
+    plain, other = (filters(SMALL, V0, 0.01, ALL, seed) for seed in (5, 6))
+    turning = filters(SMALL, V0, 0.01, ALL, 5, SPAN)
+    for params in (plain, turning):
+        whole = turbulence.normals(0, 300, params)
+        for first, count in ((0, 1), (63, 2), (64, 64), (130, 99), (299, 1)):
+            assert (turbulence.normals(first, count, params) == whole[first : first + count]).all()
+    assert (turbulence.normals(0, 300, other) != turbulence.normals(0, 300, plain)).all()
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.002, 0.01])
+def test_rotary_gusts_have_the_published_intensities(dt: float) -> None:
+    # The integrals of the spectra of MIL-F-8785C, 3.7.4, written here again. A step holds the wind
+    # behind the lags of q_g and r_g, an error of dt / T of the variance: T_r is 0.11 s.
+    params = filters(SMALL, V0, dt, range(6), 1, SPAN)
+    (p, q, r), spread = params.output[3:], params.stationary
+    found = [float(np.sqrt(row @ spread @ spread.T @ row)) for row in (p, q, r)]
+
+    def phi_p(omega: float) -> float:
+        L, sigma = SMALL.length[2], SMALL.sigma[2]
+        share = 0.8 * (np.pi * L / (4.0 * SPAN)) ** (1.0 / 3.0)
+        lag = 4.0 * SPAN / np.pi * omega / V0
+        return float(sigma**2 / L / V0 * share / (1.0 + lag**2))
+
+    def phi(omega: float, axis: int, arms: float) -> float:
+        lag = arms * SPAN / np.pi * omega / V0
+        wind = float(spectrum(np.array(omega), axis, SMALL))
+        return float((omega / V0) ** 2 / (1.0 + lag**2) * wind)
+
+    published = [
+        quad(phi_p, 0.0, np.inf)[0],
+        quad(phi, 0.0, np.inf, args=(2, 4.0))[0],
+        quad(phi, 0.0, np.inf, args=(1, 3.0))[0],
+    ]
+    np.testing.assert_allclose(found, np.sqrt(published), rtol=dt / 0.1 + 1e-6)
+
+
+def test_the_air_turns_nose_up_where_the_wind_down_falls_along_the_flight() -> None:
+    # A slow linear change: q_g = -w_dot / V0, r_g = v_dot / V0, of the field w(x) with x = V0 t.
+    params = filters(SMALL, V0, 0.01, range(6), 1, SPAN)
+    z = np.zeros(8)
+    slope = 0.4  # of each state of the winds, 1/s
+    for k in range(400):
+        z[:5] = slope * 0.01 * k
+        z = np.append(z[:5], (params.transition @ z)[5:])
+    z[:5] = slope * 0.01 * 400
+    rate = params.output[:3, :5] @ np.full(5, slope)  # m/s^2
+    turning = turbulence.wind(z, params)[3:]
+    np.testing.assert_allclose(turning[1:], [-rate[2] / V0, rate[1] / V0], rtol=0.05)
+
+
+def test_winds_are_the_same_with_rotary_gusts() -> None:
+    plain = filters(SMALL, V0, 0.01, ALL, 5)
+    turning = filters(SMALL, V0, 0.01, range(6), 5, SPAN)
+    states = [turbulence.initial_state(params) for params in (plain, turning)]
+    for k in range(200):
+        np.testing.assert_allclose(states[1][:5], states[0], rtol=1e-9, atol=1e-12)
+        states = [
+            turbulence.step(z, turbulence.normals(k, 1, params)[0], params)
+            for z, params in zip(states, (plain, turning), strict=True)
+        ]
+
+
+def test_air_that_turns_moves_the_aircraft_as_its_own_rates_the_other_way() -> None:
+    chosen = aircraft_parameters(turbulence=TURBULENCE | {"rotary": True})
+    airframe, aircraft = chosen.load()
+    place = list(airframe.gusts).index("roll")
+    rows = [airframe.index(name) for name in ("p", "q", "r")]
+    column = airframe.matrix_a()[:, airframe.index("p")]
+    np.testing.assert_allclose(aircraft.gust_direction[rows, place], -column[rows], rtol=1e-12)
+    simulator = Simulator(chosen)
+    simulator.sample(0, np.zeros(4))
+    true = truth_of(simulator)
+    assert {"gust.roll", "gust.pitch", "gust.yaw"} <= set(true)
+    assert true["gust.roll"] != 0.0
+
+
+def test_rotary_gusts_need_a_span_and_matrices() -> None:
+    rotary = {"turbulence": TURBULENCE | {"rotary": True}}
+    with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*no span"):
+        aircraft_parameters(airframe="x8_elevons", **rotary)
+    jsbsim = {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 1000.0}
+    with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*JSBSim takes winds"):
+        AircraftConfig(rate=100.0, step=0.005, **jsbsim, **rotary)
 
 
 def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
@@ -210,7 +292,7 @@ def test_truth_holds_wind_that_acts_from_now_on_and_f_includes_it() -> None:
         assert true["gust.lateral"] == winds["lateral"] != 0.0
         assert true["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
         assert true["f.p"] == pytest.approx(3.13 / 25.0 * true["gust.lateral"], rel=1e-12)
-        for normal in turbulence.normals(5 * number, 5, 1):
+        for normal in turbulence.normals(5 * number, 5, air):
             z = turbulence.step(z, normal, air)
 
 

@@ -61,7 +61,7 @@ def fly(
 ) -> FleetResult:
     course = build_course(scenario)
     directions = gust_directions(
-        load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind
+        scenario.aircraft.nominal_airframe(), A, scenario.aircraft.uncertainty.wind
     )
     aircraft = batch_matrices.assemble(
         A, B, scenario.aircraft.plant(), course, wind, late, directions
@@ -98,6 +98,10 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     },
     "turbulence": {
         "aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7}},
+        "flight": {"duration": 6.0},
+    },
+    "air that turns": {
+        "aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7, "rotary": True}},
         "flight": {"duration": 6.0},
     },
     "bias, drift, coarse and late y": {

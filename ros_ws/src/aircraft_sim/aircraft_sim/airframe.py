@@ -17,12 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim import identities
-from aircraft_sim.disturbance import AXES
+from aircraft_sim.disturbance import AIR_STATE, AXES, ROTARY
 from aircraft_sim.dynamics import EulerKinematics
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
-from flight_core.parameters import Config, Name, Names, NonNegative, Number, Numbers, require
+from flight_core.parameters import (
+    Config,
+    Name,
+    Names,
+    NonNegative,
+    Number,
+    Numbers,
+    Positive,
+    require,
+)
 from flight_core.units import ANGLE, GRAVITY, quantity, si_per_unit
 from flight_core.vectors import FloatArray, selection_matrix
 
@@ -82,6 +91,9 @@ class Airframe(Config):
     name: str
     source: str = Field(description="where the figures come from")
     speed: NonNegative = Field(default=0.0, description="the trim speed V0, m/s; 0 in hover")
+    span: Positive | None = Field(
+        default=None, description="the wing span b, m, for rotary gusts; none: not known"
+    )
     states: dict[Name, Unit] = Field(description="units by state")
     inputs: dict[Name, Input] = Field(description="unit and sign by input")
     outputs: Names = Field(description="the outputs of y = C x: states, or the rows of C")
@@ -109,7 +121,7 @@ class Airframe(Config):
     gusts: dict[str, dict[str, Number]] = Field(
         default={},
         description="what wind w along each axis adds to each x_dot, per w / V0; axes: "
-        "longitudinal, lateral, vertical",
+        "longitudinal, lateral, vertical; roll, pitch, yaw of air that turns",
     )
 
     def _check(self) -> None:
@@ -154,10 +166,10 @@ class Airframe(Config):
         )
         for gust in self.gusts:
             require(
-                gust in AXES,
+                gust in AXES or gust in ROTARY,
                 f"gusts.{gust}",
                 f"{gust!r}",
-                f"an axis of the wind: {', '.join(AXES)}",
+                f"an axis of the wind: {', '.join((*AXES, *ROTARY))}",
             )
         for gust, direction in self.gusts.items():
             named |= {f"gusts.{gust}.{state}": state for state in direction}
@@ -329,6 +341,29 @@ class Airframe(Config):
         channels = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
         values = {"inputs": channels, "B": B.tolist(), "identities": False}
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
+
+    def with_rotary_gusts(self, axes: Sequence[str] = ROTARY) -> Self:
+        """A copy in which air that turns with p_g, q_g, r_g, rad/s, moves the aircraft.
+
+            x_dot_i -= A_ij w_j,  i and j in p, q, r
+
+        Forces by these rates are left out: A[alpha, q] and A[beta, r] hold kinematics, too. Effects
+        of the file stay.
+
+        Args:
+            axes: Axes of ROTARY; those of states that the airframe lacks are left out.
+
+        Returns:
+            The copy with further axes of `gusts`.
+        """
+        A = self.matrix_a()
+        rates = [AIR_STATE[axis] for axis in ROTARY if AIR_STATE[axis] in self.states]
+        gusts = {}
+        for axis in axes:
+            if (rate := AIR_STATE[axis]) in rates and axis not in self.gusts:
+                column = {name: -float(A[self.index(name), self.index(rate)]) for name in rates}
+                gusts[axis] = {name: self.speed * effect for name, effect in column.items()}
+        return self.model_copy(update={"gusts": self.gusts | gusts})
 
     def matrix_gusts(self) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""

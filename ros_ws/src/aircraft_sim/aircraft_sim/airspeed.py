@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import ROTARY
 from aircraft_sim.plant import OverAirspeed
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -43,7 +44,12 @@ OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
 OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
 """The same of B, by the kind of the row."""
 
-WIND_STATE = {"longitudinal": SPEED, "lateral": INCIDENCE, "vertical": INCIDENCE}
+WIND_STATE = {
+    "longitudinal": SPEED,
+    "lateral": INCIDENCE,
+    "vertical": INCIDENCE,
+    **dict.fromkeys(ROTARY, RATE),
+}
 """Kind of the state in which wind along an axis acts, relative to the air."""
 
 TRIM_STEPS = 20  # of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it

@@ -13,9 +13,19 @@ from flight_core.vectors import Array, array_namespace
 AXES = ("longitudinal", "lateral", "vertical")
 """Axes of the wind, FRD axes of trim. Positive: tail wind, wind to the right, wind down."""
 
-AIR_STATE = {"longitudinal": "V", "lateral": "beta", "vertical": "alpha"}
+ROTARY = ("roll", "pitch", "yaw")
+"""Axes of rotary gusts: the air about the aircraft turns with p_g, q_g, r_g, rad/s."""
+
+AIR_STATE = {
+    "longitudinal": "V",
+    "lateral": "beta",
+    "vertical": "alpha",
+    "roll": "p",
+    "pitch": "q",
+    "yaw": "r",
+}
 """State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w /
-V0, small angles."""
+V0, small angles; p - p_g, q - q_g, r - r_g."""
 
 # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division
 # by 0

@@ -136,9 +136,7 @@ class JsbsimModel:
         dt = seconds(step_ns)
         steps = divide(duration_ns, step_ns, "step", "the duration")
         filters = self._wind_model.turbulence
-        normals = (
-            () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
-        )
+        normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters)
         for k in range(steps):
             t = seconds(t_ns + k * step_ns)
             position = actuators.step(

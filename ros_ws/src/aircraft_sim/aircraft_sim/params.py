@@ -20,7 +20,7 @@ from aircraft_sim.airframe import (
     load_airframe,
 )
 from aircraft_sim.airspeed import over_airspeed
-from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
+from aircraft_sim.disturbance import AXES, ROTARY, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
@@ -283,6 +283,10 @@ class AircraftConfig(NodeConfig):
             "a section",
             f"none: {has_none} gusts",
         )
+        if self.has_rotary_gusts:
+            require(
+                airframe.span is not None, "turbulence.rotary", "true", f"false: {has_none} span"
+            )
         if self.over_airspeed is not None:
             over_airspeed(airframe, self.over_airspeed)
             require(
@@ -348,6 +352,8 @@ class AircraftConfig(NodeConfig):
             ("over_airspeed", self.over_airspeed),
         ):
             require(not value, key, "a value", f"none: {self.airframe} has no matrices to change")
+        takes_winds = "false: JSBSim takes winds, and no rates at which the air turns"
+        require(not self.has_rotary_gusts, "turbulence.rotary", "true", takes_winds)
 
     @property
     def is_jsbsim(self) -> bool:
@@ -377,13 +383,23 @@ class AircraftConfig(NodeConfig):
             airframe.units_of_outputs() | vanes, inputs, positive, airframe.speed
         )
 
+    @property
+    def has_rotary_gusts(self) -> bool:
+        """Whether the air turns."""
+        return self.turbulence is not None and self.turbulence.rotary
+
+    def nominal_airframe(self) -> Airframe:
+        """The named airframe, with the axes of the rotary gusts that act."""
+        airframe = load_airframe(self.airframe)
+        return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
+
     def sampled_airframe(self) -> Airframe:
         """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named
         airframe.
         """
         chosen = self.uncertainty
         return uncertainty.sample_airframe(
-            load_airframe(self.airframe),
+            self.nominal_airframe(),
             chosen.A,
             chosen.B,
             chosen.seed,
@@ -443,7 +459,8 @@ class AircraftConfig(NodeConfig):
     def plant(self) -> PlantParams:
         """The plant as arrays: equation (1), the actuators, the turbulence and the drift."""
         airframe, aircraft = self.load()
-        turbulence = self._turbulence(airframe.speed, list(airframe.gusts))
+        span = airframe.span if self.has_rotary_gusts else None
+        turbulence = self._turbulence(airframe.speed, list(airframe.gusts), span)
         over = None if self.over_airspeed is None else over_airspeed(airframe, self.over_airspeed)
         return PlantParams(
             aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors(), over
@@ -478,7 +495,7 @@ class AircraftConfig(NodeConfig):
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on every axis."""
-        turbulence = self._turbulence(self.flight_condition().speed, AXES)
+        turbulence = self._turbulence(self.flight_condition().speed, AXES, None)
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
     def relative_wind(self) -> RelativeWind | None:
@@ -496,16 +513,18 @@ class AircraftConfig(NodeConfig):
         every = np.array([gust.every for gust in gusts])
         return Gusts(start, speed, length, every if np.isfinite(every).any() else None)
 
-    def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
+    def _turbulence(
+        self, speed: float, axes: Sequence[str], span: float | None
+    ) -> Turbulence | None:
         section = self.turbulence
         if section is None or not (section.wind or section.sigma):  # off, or of intensity 0
             return None
         spectrum = dryden(
             section.altitude, section.wind or 0.0, section.sigma or 0.0
         )  # None where it has no effect
-        return filters(
-            spectrum, speed, self.step, [AXES.index(axis) for axis in axes], section.seed
-        )
+        every = (*AXES, *ROTARY)
+        places = [every.index(axis) for axis in axes]
+        return filters(spectrum, speed, self.step, places, section.seed, span)
 
     def sensor_arrays(self) -> Sensors:
         """The sensors as arrays."""

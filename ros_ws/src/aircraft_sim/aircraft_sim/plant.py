@@ -116,7 +116,7 @@ class AircraftState(NamedTuple):
 
     x: Array  # (n,)
     position: Array  # (m,) of the actuators
-    turbulence: Array | None = None  # (5,) of the turbulence filters; None without turbulence
+    turbulence: Array | None = None  # (s,) of the turbulence filters; None without turbulence
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
@@ -170,9 +170,7 @@ def advance(
     filters = plant.turbulence
     steps = divide(duration_ns, plant.step_ns, "step", "the duration")
     dt = seconds(plant.step_ns)
-    normals = (
-        () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
-    )
+    normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters)
 
     def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:
         return dynamics.x_dot_forced(x, forced[round(2.0 * since / dt)], params)

@@ -12,6 +12,7 @@ import numpy as np
 from flight_core.vectors import FloatArray
 
 NOISE, LOSS, DRIFT, TURBULENCE, TURBULENCE_START, AIRFRAME, VANE_LOSS, EQUIPMENT = range(8)
+ROTARY, ROTARY_START = range(8, 10)
 """Streams, one for each use. Under the same seed they are independent of each other."""
 
 

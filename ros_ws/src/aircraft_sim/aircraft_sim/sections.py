@@ -47,6 +47,11 @@ class TurbulenceConfig(Config):
     sigma: NonNegative | None = Field(
         default=None, description="the standard deviation at high altitude, m/s"
     )
+    rotary: bool = Field(
+        default=False,
+        description="whether the air turns, too: p_g, q_g, r_g of the specification, by the span "
+        "of the airframe",
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
     def _check(self) -> None:

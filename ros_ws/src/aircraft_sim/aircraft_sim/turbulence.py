@@ -7,11 +7,10 @@ Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bo
 Gaussian process has no bound, and none of the three winds has a derivative: the filters have a pole
 more than zeros.
 
-The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: the rates
-depend on the span and on the aerodynamic part of A's columns of p, q, r, unstated by the airframes
-of the library. The effect is not small everywhere: at 100 m, for a span of 3 m, the specification's
+The rotary gusts p_g, q_g, r_g act where a scenario has `turbulence.rotary`: they depend on the
+span, which not all airframe files state. Their effect is not small: at 100 m, for a span of 3 m,
 p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to the
-pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than
+pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights without these roll less than
 real ones.
 """
 
@@ -41,6 +40,7 @@ altitude, 10 ft/s."""
 MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # m above the ground, m/s
 
 STATES = 5  # one of the longitudinal filter, two of the lateral, two of the vertical one
+ROTARY_STATES = 3  # p_g over its intensity, and the vertical and the lateral wind behind lags
 BLOCK = 64  # steps that share a generator: creating one takes as long as hundreds of its numbers
 
 
@@ -52,14 +52,14 @@ class Dryden(NamedTuple):
 
 
 class Turbulence(NamedTuple):
-    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (5,), of
-    unit variance or less.
+    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (s,), s =
+    5, or 8 with rotary gusts; the first five are of unit variance or less.
     """
 
-    transition: Array  # (5, 5)
-    spread: Array  # (5, 5), lower triangular
-    stationary: Array  # (5, 5), lower triangular
-    output: Array  # (G, 5), m/s
+    transition: Array  # (s, s)
+    spread: Array  # (s, k), lower triangular: of k = 5 or 6 normal numbers
+    stationary: Array  # (s, s), lower triangular
+    output: Array  # (G, s), m/s, of rotary gusts rad/s
     seed: int
 
 
@@ -88,8 +88,26 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
     return Dryden(length, intensity)
 
 
+def roll_gust(spectrum: Dryden, airspeed: float, span: float) -> tuple[float, float]:
+    """Intensity, rad/s, and time constant, s, of p_g for a span b, m: of first order.
+
+        Phi_p = sigma_w^2 / (L_w V0) 0.8 (pi L_w / 4b)^(1/3) / (1 + (T omega)^2),  T = 4b / (pi V0)
+
+    Source: MIL-F-8785C, 3.7.1.2 and 3.7.4, one-sided in omega.
+    """
+    L = spectrum.length[2]
+    T = 4.0 * span / (np.pi * airspeed)
+    level = spectrum.sigma[2] ** 2 / (L * airspeed) * 0.8 * np.cbrt(np.pi * L / (4.0 * span))
+    return float(np.sqrt(level * np.pi / (2.0 * T))), T
+
+
 def filters(
-    spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], seed: int
+    spectrum: Dryden,
+    airspeed: float,
+    dt: float,
+    axes: Sequence[int],
+    seed: int,
+    span: float | None = None,
 ) -> Turbulence:
     """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in
     continuous time.
@@ -112,8 +130,8 @@ def filters(
     with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary
     stationary' belongs to h = inf.
 
-    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source:
-    MIL-F-8785C, 3.7.1.2.
+    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES, then
+    ROTARY; `span` b, m, of rotary gusts, which `_with_rotary` adds. Source: MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
     p = np.sqrt(1.5)
@@ -122,51 +140,100 @@ def filters(
         np.array([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, p, q, 0.0, 0.0], [0.0, 0.0, 0.0, p, q]])
         * spectrum.sigma[:, None]
     )
-    return Turbulence(
+    winds = Turbulence(
         _axes([np.exp(-h) * np.array([[1.0, 0.0], [h, 1.0]]) for h in steps]),
         _axes([_spread(h) for h in steps]),
         _axes([_spread(np.inf)] * len(steps)),
-        output[list(axes)],
+        np.vstack([output, np.zeros((ROTARY_STATES, STATES))]),  # no rotary gusts yet
         seed,
     )
+    every = winds if span is None else _with_rotary(winds, spectrum, airspeed, dt, span)
+    return every._replace(output=every.output[list(axes)])
+
+
+def _with_rotary(
+    winds: Turbulence, spectrum: Dryden, airspeed: float, dt: float, span: float
+) -> Turbulence:
+    """The filters of all axes with rotary gusts of a span b, m.
+
+        p_g of first order, `roll_gust`
+        q_g = -s / V0 / (1 + T_q s) w_g,  T_q = 4b / (pi V0)
+        r_g =  s / V0 / (1 + T_r s) v_g,  T_r = 3b / (pi V0)
+
+    The air turns nose up where w_g falls along the flight, and nose right where v_g rises. The lags
+    of q_g and r_g have the wind of a step held. Source: MIL-F-8785C, 3.7.1.2, for FRD axes.
+    """
+    from scipy.linalg import solve_discrete_lyapunov  # noqa: PLC0415 - slow to load, only for this
+
+    size = STATES + ROTARY_STATES
+    roll, vertical, lateral = range(STATES, size)
+    sigma, T = roll_gust(spectrum, airspeed, span)
+    lags = {vertical: (2, -1.0, T), lateral: (1, 1.0, 0.75 * T)}  # wind, sign, time constant
+    transition = np.zeros((size, size))
+    spread = np.zeros((size, STATES + 1))
+    output = np.zeros((len(winds.output), size))
+    transition[:STATES, :STATES] = winds.transition
+    spread[:STATES, :STATES] = winds.spread
+    output[:, :STATES] = winds.output
+    transition[roll, roll] = np.exp(-dt / T)
+    spread[roll, STATES] = np.sqrt(-np.expm1(-2.0 * dt / T))
+    first_row = len(output) - ROTARY_STATES
+    output[first_row, roll] = sigma
+    for row, (state, (wind, sign, constant)) in enumerate(lags.items(), first_row + 1):
+        decay = np.exp(-dt / constant)
+        transition[state, state] = decay
+        transition[state, :STATES] = (1.0 - decay) * winds.output[wind]
+        output[row, :STATES] = sign / (airspeed * constant) * winds.output[wind]
+        output[row, state] = -sign / (airspeed * constant)
+    covariance = solve_discrete_lyapunov(transition, spread @ spread.T)
+    return Turbulence(transition, spread, np.linalg.cholesky(covariance), output, winds.seed)
 
 
 def initial_state(params: Turbulence) -> FloatArray:
-    """State at t = 0, a sample of the stationary distribution, shape (5,)."""
-    normal = random_streams.generator(
-        0, random_streams.TURBULENCE_START, params.seed
-    ).standard_normal(STATES)
-    return np.asarray(params.stationary @ normal)
+    """State at t = 0, a sample of the stationary distribution, shape (s,)."""
+    streams = [(random_streams.TURBULENCE_START, STATES)]
+    if (more := len(params.stationary) - STATES) > 0:
+        streams.append((random_streams.ROTARY_START, more))
+    normal = [
+        random_streams.generator(0, stream, params.seed).standard_normal(count)
+        for stream, count in streams
+    ]
+    return np.asarray(params.stationary @ np.concatenate(normal))
 
 
-def normals(first: int, count: int, seed: int) -> FloatArray:
-    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, 5); step
-    k depends on seed and k.
+def normals(first: int, count: int, params: Turbulence) -> FloatArray:
+    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, k); step
+    k depends on seed and k. Those of the winds are the same with and without rotary gusts.
     """
     skipped = first % BLOCK
-    blocks = [
-        _block(block, seed) for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)
-    ]
-    return np.concatenate(blocks)[skipped : skipped + count]
+    streams = [(random_streams.TURBULENCE, STATES)]
+    if (more := params.spread.shape[1] - STATES) > 0:
+        streams.append((random_streams.ROTARY, more))
+    columns = []
+    for stream, width in streams:
+        blocks = [
+            _block(block, params.seed, stream, width)
+            for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)
+        ]
+        columns.append(np.concatenate(blocks)[skipped : skipped + count])
+    return columns[0] if len(columns) == 1 else np.hstack(columns)
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
-    """State a step later, shape (5,): transition z + spread n, with n standard normal, shape
-    (5,).
+    """State a step later, shape (s,): transition z + spread n, with n standard normal, shape
+    (k,).
     """
     return params.transition @ z + params.spread @ normal
 
 
 def wind(z: Array, params: Turbulence) -> Array:
-    """The winds of the G axes in m/s, shape (G,): output z."""
+    """The winds of the G axes in m/s, rotary gusts in rad/s, shape (G,): output z."""
     return params.output @ z
 
 
 @lru_cache(maxsize=64)
-def _block(block: int, seed: int) -> FloatArray:
-    numbers = random_streams.generator(block, random_streams.TURBULENCE, seed).standard_normal(
-        (BLOCK, STATES)
-    )
+def _block(block: int, seed: int, stream: int, width: int) -> FloatArray:
+    numbers = random_streams.generator(block, stream, seed).standard_normal((BLOCK, width))
     numbers.flags.writeable = False  # the cache returns it again
     return numbers
 

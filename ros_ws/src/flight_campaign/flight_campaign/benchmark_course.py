@@ -277,7 +277,7 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
     if (air := plant.turbulence) is not None:
         turbulent = np.zeros_like(wind.over_step)
         z = turbulence.initial_state(air)
-        normals = turbulence.normals(0, ticks * steps, air.seed)
+        normals = turbulence.normals(0, ticks * steps, air)
         for k in range(ticks * steps):
             turbulent[k] = turbulence.wind(z, air)
             z = turbulence.step(z, normals[k], air)
@@ -291,6 +291,6 @@ def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):
-        if axis != "longitudinal" and AIR_STATE[axis] in airframe.states:
+        if axis in {"lateral", "vertical"} and AIR_STATE[axis] in airframe.states:
             angles[:, airframe.index(AIR_STATE[axis])] = wind[:, place] / airframe.speed
     return angles

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -251,7 +250,7 @@ def _fly_fleet(
     scenario = prepared.scenario
     course = prepared.course
     assert course is not None  # noqa: S101 - for the type checker
-    airframe = load_airframe(scenario.aircraft.airframe)
+    airframe = scenario.aircraft.nominal_airframe()
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
     directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
     late = round(SETS[prepared.task.set].late / course.period)

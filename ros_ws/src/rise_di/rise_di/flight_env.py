@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.closed_loop.stations import AircraftStation, Loop, ReferenceStation, Topics
@@ -360,7 +359,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         """Draw N aircraft."""
         aircraft = self.scenario.aircraft
         part = self._uncertainty
-        airframe = load_airframe(aircraft.airframe)
+        airframe = aircraft.nominal_airframe()
         seed = int(self.np_random.integers(0, 2**31))
         A, B = sampled_matrices(
             airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread()
