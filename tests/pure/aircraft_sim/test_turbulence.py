@@ -17,7 +17,6 @@ from tests.builders import MS, aircraft_parameters, truth_of
 
 from aircraft_sim import plant, turbulence
 from aircraft_sim.disturbance import AXES
-from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
 from flight_core.parameters import ParameterError
@@ -252,12 +251,12 @@ def test_air_that_turns_moves_the_aircraft_as_its_own_rates_the_other_way() -> N
 
 
 def test_rotary_gusts_need_a_span_and_matrices() -> None:
-    rotary = {"turbulence": TURBULENCE | {"rotary": True}}
+    rotary: dict[str, Any] = {"turbulence": TURBULENCE | {"rotary": True}}
     with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*no span"):
         aircraft_parameters(airframe="x8_elevons", **rotary)
-    jsbsim = {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 1000.0}
+    jsbsim: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 1000.0}
     with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*JSBSim takes winds"):
-        AircraftConfig(rate=100.0, step=0.005, **jsbsim, **rotary)
+        aircraft_parameters(**jsbsim, **rotary)
 
 
 def test_turbulence_does_not_depend_on_how_flight_divided() -> None:

@@ -30,7 +30,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
 from flight_design.identification.innovation_filters import Actuation, Recording
 from flight_design.identification.model_identification import Identification, identify, model_yaml
-from flight_design.identification.model_quality import correlation, whiteness
+from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
@@ -50,8 +50,11 @@ AIR: dict[str, dict[str, Any]] = {
         }
     },
     "turbulence": {"gusts": {}, "turbulence": {"altitude": 100.0, "wind": 15.4}},
+    "turning": {"gusts": {}, "turbulence": {"altitude": 100.0, "wind": 15.4, "rotary": True}},
 }
-"""The air of a flight: none, the gusts of osprey_servo within the commands, moderate turbulence."""
+"""The air of a flight: none, the gusts of osprey_servo within the commands, moderate turbulence,
+and that with rotary gusts.
+"""
 
 
 def servo(air: str, uncertainty: float, duration: float = DURATION, **reference: Any) -> Scenario:
@@ -127,6 +130,19 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
         }
     for name, bound in largest.items():
         assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < bound, name
+
+
+def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
+    """Without a span the filter has no rotary gust: p and r are refused, four entries at a
+    bound.
+    """
+    found = identified("turning", 0.3)
+    true = true_errors(servo("turning", 0.3).aircraft.sampled_airframe(), found.entries)
+    for entry in found.entries:
+        if entry.name in {"B[V, thrust]", "B[q, elevator]", "B[p, aileron]", "B[r, rudder]"}:
+            assert abs(entry.error - true[entry.name]) < 3.0 * entry.deviation, entry.name
+    assert all("at a bound" not in part.refusal for part in found.parts)
+    assert found.after.whiteness.max() < MAX_WHITENESS
 
 
 @pytest.mark.parametrize("air, uncertainty", FLIGHTS)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import AXES
-from aircraft_sim.turbulence import MODERATE, dryden
+from aircraft_sim.disturbance import AXES, ROTARY
+from aircraft_sim.turbulence import MODERATE, dryden, roll_gust
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
@@ -41,13 +41,18 @@ GUST_TIME = 0.5
 RATE_TIME = 0.2
 LEAST_RATE = 1e-4  # m/s^3 per root s, noise of that change where there is no gust: negligible
 LEVELS = np.array(
-    [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
-    + [(0.03, strength) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
+    [(strength, 0.0, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
+    + [(strength, 0.0, strength) for strength in (0.1, 0.3, 1.0, 3.0)]
+    + [(0.03, strength, 0.0) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
 )
 """Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of
-moderate turbulence, and noise of the change of its rate, m/s^3 per root s. A gust is smooth: with
-noise of the wind, or of its rate, the model has gusts as fast as the inputs, and the effects of the
-inputs come out too weak."""
+moderate turbulence, noise of the change of its rate, m/s^3 per root s, and noise of the rotary gust
+in parts of that of moderate turbulence. A gust is smooth: with noise of the wind, or of its rate,
+the model has gusts as fast as the inputs, and the effects of the inputs come out too weak."""
+
+
+SHEARED = ("alpha", "q")
+"""States that the slope of the vertical wind moves."""
 
 
 class Recording(NamedTuple):
@@ -290,20 +295,37 @@ class Passage:
         return r, states[-1, :, :s, 0]
 
 
-def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArray]:
+def in_rolling_air(airframe: Airframe) -> Airframe:
+    """The airframe with the rotary gust in roll, where its span is known.
+
+    That in pitch follows the vertical wind, see `filter_bank`. That in yaw is small beside the
+    lateral wind.
+    """
+    return airframe if airframe.span is None else airframe.with_rotary_gusts(ROTARY[:1])
+
+
+def wind_model(
+    axes: Sequence[str], speed: float, span: float | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Time constants, s, and noises, m/s per root s, of winds of first order like Dryden's moderate
     turbulence, (G,) each.
 
     They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1
     + (T omega)^2) along the flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across
-    it. Arguments: `speed` V0, m/s.
+    it. The rotary gust in roll, rad/s, is that of `roll_gust`. Arguments: `speed` V0 and `span` in
+    SI.
     """
     spectrum = dryden(**MODERATE, sigma=0.0)
-    places = np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
-    time = spectrum.length[places] / speed
-    along = places == AXES.index("longitudinal")
-    noise = spectrum.sigma[places] * np.sqrt(np.where(along, 2.0, 3.0) / time)
-    return np.where(along, time, time / np.sqrt(3.0)), noise
+    along = np.array([axis == "longitudinal" for axis in AXES])
+    time = spectrum.length / speed
+    noise = spectrum.sigma * np.sqrt(np.where(along, 2.0, 3.0) / time)
+    constants = dict(zip(AXES, np.where(along, time, time / np.sqrt(3.0)), strict=True))
+    noises = dict(zip(AXES, noise, strict=True))
+    if span is not None:
+        sigma, lag = roll_gust(spectrum, speed, span)
+        constants["roll"] = lag
+        noises["roll"] = sigma * np.sqrt(2.0 / lag)
+    return np.array([constants[axis] for axis in axes]), np.array([noises[axis] for axis in axes])
 
 
 def filter_bank(
@@ -315,6 +337,8 @@ def filter_bank(
     drift: float = DRIFT,
     *,
     near: bool = False,
+    span: float | None = None,
+    shear: FloatArray | None = None,
 ) -> FilterBank:
     """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0,
     m/s, z = [x, w, v, a, ..].
@@ -322,13 +346,24 @@ def filter_bank(
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
 
-    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in
-    `observer_design.Weights`. Models `near` the first one have gains exact to first order.
+    A rotary gust has neither v nor a. With a `shear` (N, 2) the vertical wind w turns the air, by
+    the slope of w behind the lag T = 4b / (pi V0) of the span b:
+
+        q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
+        alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
+
+    A frozen field of wind has (0, -1); the specification's sign is the other one, and other
+    models of the air move alpha, too. The noises are of `levels` of LEVELS, times `strength` (N,
+    G); `drift` as in `observer_design.Weights`. Models `near` the first one have gains exact to
+    first order.
     """
-    wind_time, noise = wind_model(names.winds, speed)
+    wind_time, noise = wind_model(names.winds, speed, span)
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
-    s = n + 3 * G
-    x, w, v, a = np.split(np.arange(s), [n, n + G, n + 2 * G])
+    is_rotary = np.array([axis in ROTARY for axis in names.winds], dtype=bool)
+    smooth = np.flatnonzero(~is_rotary)
+    ends = np.cumsum([n, G, len(smooth), len(smooth)])
+    x, w, v, a, slow = np.split(np.arange(ends[-1] + (shear is not None)), ends)
+    s = ends[-1] + len(slow)
     A = np.zeros((N, s, s))
     B = np.zeros((N, s, m))
     gravity = np.zeros((s, s))
@@ -339,28 +374,46 @@ def filter_bank(
     A[:, w, w] = -1.0 / wind_time
     A[:, v, v] = -1.0 / GUST_TIME
     A[:, a, a] = -1.0 / RATE_TIME
-    A[:, w, v] = A[:, v, a] = 1.0
+    A[:, w[smooth], v] = A[:, v, a] = 1.0
+    if shear is not None and span is not None:
+        lag = 4.0 * span / (np.pi * speed)
+        alpha, q = (names.states.index(name) for name in SHEARED)
+        vertical = w[names.winds.index("vertical")]
+        effects = np.stack([shear[:, 0], shear[:, 1] * model.A[:, q, q]], axis=1) / (speed * lag)
+        A[:, [alpha, q], vertical] -= effects
+        A[:, [alpha, q], slow] += effects
+        A[:, slow, vertical] = 1.0 / lag
+        A[:, slow, slow] = -1.0 / lag
     each = model._replace(
         A=A[:, None],
         B=B[:, None],
-        C=np.hstack([model.C, np.zeros((m, 3 * G))]),
+        C=np.hstack([model.C, np.zeros((m, s - n))]),
         gravity=gravity,
         wind=np.zeros((s, 0)),
-        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(3 * G)]),
-        size=np.concatenate([model.size, np.ones(3 * G)]),
+        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(s - n)]),
+        size=np.concatenate([model.size, np.ones(s - n)]),
     )
-    wind_states = tuple(
-        f"{kind}.{axis}" for kind, axis in product(("wind", "rate", "change"), names.winds)
+    smooth_axes = [names.winds[k] for k in smooth]
+    wind_states = tuple(f"wind.{axis}" for axis in names.winds) + tuple(
+        f"{kind}.{axis}" for kind, axis in product(("rate", "change"), smooth_axes)
     )
+    wind_states += ("slow.vertical",) * len(slow)
     sampled = observer_design.aircraft_model(
         each, names._replace(states=names.states + wind_states, winds=()), np.zeros(0)
     )
-    gust, change = (
-        strength[:, None] * LEVELS[levels, None, k] * factor
-        for k, factor in enumerate((noise, noise / np.max(noise)))
-    )
+    winds, changes, rolls = (LEVELS[levels, None, k] for k in range(3))
+    gust = strength[:, None] * np.where(is_rotary, rolls, winds) * noise
+    largest = np.max(noise[smooth], initial=0.0)
+    change = strength[:, None, smooth] * changes * (noise[smooth] / largest)
     loose = np.concatenate(
-        [np.full((*gust.shape[:2], n), LOOSE), gust, 0.0 * gust, change + LEAST_RATE], axis=-1
+        [
+            np.full((*gust.shape[:2], n), LOOSE),
+            gust,
+            0.0 * change,
+            change + LEAST_RATE,
+            np.zeros((*gust.shape[:2], len(slow))),
+        ],
+        axis=-1,
     )
     weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
     L = observer_design.aircraft_correction(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import ROTARY
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
@@ -20,6 +21,7 @@ from flight_design.identification.innovation_filters import (
     DRIFT,
     HOLD,
     LEVELS,
+    SHEARED,
     TRANSIENT,
     Block,
     FilterBank,
@@ -31,6 +33,7 @@ from flight_design.identification.innovation_filters import (
 )
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
+SHEAR_PRIOR = 1.0  # 1, the same of the effects of the slope of the vertical wind
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
 MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
 MAX_DELAY_ERROR = (
@@ -122,8 +125,8 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; where they are identified, the angles at the begin and the error of the delay, in
-    units of their deviations."""
+    the winds; where they are identified, the shear, the angles at the begin and the error of the
+    delay, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
@@ -222,6 +225,10 @@ class Likelihood:
             for names, places in zip(named, block, strict=True)
         ]
         self.names = Names(*parts)
+        rolls = any(axis in ROTARY for axis in self.names.winds)
+        in_part = set(SHEARED) <= set(self.names.states) and "vertical" in self.names.winds
+        self._is_sheared = airframe.span is not None and in_part
+        self._usable = np.flatnonzero((LEVELS[:, 2] == 0.0) | rolls)
         self._y = recorded.y[:, block.outputs]
         self._u = recorded.u[:, block.inputs]
         length = span_length(recorded)
@@ -240,8 +247,9 @@ class Likelihood:
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
             self.coarse.believe(deviation)
+        shear_prior = np.full(len(SHEARED) * self._is_sheared, SHEAR_PRIOR)
         self.prior = np.concatenate(
-            [deviation, wind_prior, np.ones(len(self._angles)), delay_prior]
+            [deviation, wind_prior, shear_prior, np.ones(len(self._angles)), delay_prior]
         )
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
@@ -253,7 +261,8 @@ class Likelihood:
             self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
             self._upper[-1] = MAX_DELAY_ERROR
         self._winds = slice(len(deviation), len(deviation) + len(wind_prior))
-        self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
+        self._shear = slice(self._winds.stop, self._winds.stop + len(shear_prior))
+        self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that
@@ -284,7 +293,15 @@ class Likelihood:
         airframe = self._airframe
         drift = self._drift
         bank = filter_bank(
-            self.with_errors(thetas), self.names, airframe.speed, strength, levels, drift, near=near
+            self.with_errors(thetas),
+            self.names,
+            airframe.speed,
+            strength,
+            levels,
+            drift,
+            near=near,
+            span=airframe.span,
+            shear=thetas[:, self._shear] if self._is_sheared else None,
         )
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
@@ -307,14 +324,14 @@ class Likelihood:
         Every level predicts the span from the estimates at its begin. The calmest one is taken
         whose log-likelihood is within CHANGE of the best.
         """
-        models = self.models(theta[None], np.arange(len(LEVELS)))
+        models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()
         u = models.u.reshape(self._u.shape)
         precision = np.linalg.inv(bank.covariance[:, 0])
         log_det = np.linalg.slogdet(bank.covariance[:, 0])[1]
         length = self._spans[0].stop // HOLD
         flight = Passage(bank, self._y, u, np.zeros(-(-len(self._y) // HOLD), dtype=np.int64))
-        z = np.repeat(models.begin, len(LEVELS), axis=0)
+        z = np.repeat(models.begin, len(self._usable), axis=0)
         calmest = list[int]()
         r_found = list[FloatArray]()
         for k in range(len(self._spans)):
@@ -325,14 +342,15 @@ class Likelihood:
             )
             calmest.append(int(np.argmax(gain >= gain.max() - CHANGE)))
             r_found.append(r[calmest[-1]])
-            z = np.repeat(after[calmest[-1]][None], len(LEVELS), axis=0)
+            z = np.repeat(after[calmest[-1]][None], len(self._usable), axis=0)
         passed = normalised(
             np.concatenate(r_found)[None, : len(self._y)],
             models.bank.covariance,
             self._of_span(calmest),
         )
-        self._passed = theta.tobytes(), np.array(calmest), passed
-        return np.array(calmest)
+        chosen = self._usable[calmest]
+        self._passed = theta.tobytes(), chosen, passed
+        return chosen
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
         """Values of the spans for the samples, (T,)."""
@@ -399,7 +417,9 @@ class Likelihood:
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
-        return names + [*self.names.winds, *angles, "delay"][: len(self.prior) - len(names)]
+        shears = [f"shear of {name}" for name in SHEARED * self._is_sheared]
+        others = [*self.names.winds, *shears, *angles, "delay"]
+        return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
         """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the

@@ -21,8 +21,10 @@ STARTS = (
     0,
     3,
     4,
-    9,
+    13,
 )  # levels with which the search begins: calm air, light and moderate turbulence, gusts
+TURBULENT = STARTS[2]
+SIGNS = (-1.0, 1.0)  # of the effect of the slope of the vertical wind on q, in two further starts
 # at most, of each start, and of the search from one of the best
 START_STEPS = 8
 STEPS = 12
@@ -53,11 +55,12 @@ class Search(Likelihood):
 
         r are the normalised innovations, S their covariance, N the number of samples. The cost has
         further minima: a wrong wind explains a wrong model. So the search begins several times,
-        with a level of `starts` in a span, on means over the shortest lag. From the REFINED best
-        starts, or 0, the search goes on with the level of a span by theta, or with `levels`, and
-        the strengths of the winds are free. At last spans without a level to explain them do not
-        count, nor a few gusts. A theta to `begin` at, (p,), is the only start. The theta of the
-        model that has `flown` is a further start.
+        with a level of `starts` in a span, and with either sign of what the slope of the wind does
+        to q, on means over the shortest lag. From the REFINED best starts, or 0, the search goes on
+        with the level of a span by theta, or with `levels`, and the strengths of the winds are
+        free. At last spans without a level to explain them do not count, nor a few gusts. A theta
+        to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a further
+        start.
         """
         if begin is None:
             ends = self._ends(starts, flown, used, levels, progress)
@@ -86,10 +89,15 @@ class Search(Likelihood):
         fixed = np.ones(len(self.prior), dtype=bool)
         fixed[self._winds] = False
         candidates = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
-        for level in starts:
-            theta = self._started(
-                np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress
-            )
+        begins = [(np.zeros(len(self.prior)), level) for level in starts]
+        if self._is_sheared:
+            # with the wrong sign of the slope's effect the search ends at another model
+            for sign in SIGNS:
+                begin = np.zeros(len(self.prior))
+                begin[self._shear.stop - 1] = sign
+                begins.append((begin, TURBULENT))
+        for begin, level in begins:
+            theta = self._started(begin, np.full(len(coarse._spans), level), fixed, progress)
             candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
             theta = self._started(flown, None, np.ones(len(flown), dtype=bool), progress)

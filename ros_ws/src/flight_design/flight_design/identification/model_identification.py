@@ -31,6 +31,7 @@ from flight_design.identification.innovation_filters import (
     Recording,
     blocks,
     filter_model,
+    in_rolling_air,
     whole_aircraft,
 )
 from flight_design.identification.likelihood import (
@@ -45,6 +46,7 @@ from flight_design.identification.likelihood import (
 )
 from flight_design.identification.likelihood_search import (
     REFINED,
+    SIGNS,
     START_STEPS,
     STARTS,
     STEPS,
@@ -172,7 +174,8 @@ def identify(
     search; `progress` is called with the steps `completed` of the search, and their largest number
     `total`. Raises ParameterError for an output that does not move.
     """
-    model = filter_model(airframe, actuation, recorded)
+    blown = in_rolling_air(airframe)
+    model = filter_model(blown, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     still = [
         name
@@ -188,12 +191,12 @@ def identify(
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every = blocks(model)
     step_count = count(1)
-    starts = len(STARTS) + (flown is not None)
+    starts = len(STARTS) + len(SIGNS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (
         START_STEPS + STEPS
     )
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
-    study = _Study(recorded, airframe, actuation.delay, unknown, validating, paired, at_bound)
+    study = _Study(recorded, blown, actuation.delay, unknown, validating, paired, at_bound)
 
     def step() -> None:
         progress(completed=next(step_count), total=total)

@@ -19,9 +19,16 @@ from flight_design.identification.innovation_filters import (
     Recording,
     blocks,
     filter_model,
+    in_rolling_air,
 )
 from flight_design.identification.likelihood import Unknown
-from flight_design.identification.likelihood_search import CLOSE, PROGRESS, STARTS, STEPS, Search
+from flight_design.identification.likelihood_search import (
+    CLOSE,
+    PROGRESS,
+    STEPS,
+    TURBULENT,
+    Search,
+)
 from flight_design.identification.model_quality import MAX_DEVIATION
 
 RECORD = 10.0  # s, of the flight that is tested
@@ -33,9 +40,6 @@ MAX_GAIN = 8.0  # of log-likelihood: four standard deviations, see `change_test`
 ANGLE = 0.3
 # rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
 FLOW = 0.03
-TURBULENT = STARTS[
-    2
-]  # level of the wind with which a search begins: moderate turbulence, whose strength is free
 # 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as
 # probable
 FACTOR = 1.0
@@ -90,6 +94,7 @@ def change_test(
     by default the delay of `actuation`.
     """
     changes = []
+    flown = in_rolling_air(flown)
     for block in blocks(filter_model(flown, actuation, recorded)):
         outputs = tuple(flown.outputs[i] for i in block.outputs)
         effects = Effects(
@@ -148,9 +153,9 @@ class Effects(Search):
             )
         )
         self._errors = np.arange(len(self.prior)) < self.count
-        self._winds, self._begin = (
+        self._winds, self._shear, self._begin = (
             slice(part.start - entries + self.count, part.stop - entries + self.count)
-            for part in (self._winds, self._begin)
+            for part in (self._winds, self._shear, self._begin)
         )
         turned = np.any(self._model.gravity[:, self._angles], axis=0)
         self.prior[self._begin] = np.where(turned, 1.0, FLOW / ANGLE)
