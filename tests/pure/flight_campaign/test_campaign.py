@@ -308,9 +308,9 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
             if flown.aircraft.uncertainty.number
             else model
         )
-        made = SimpleNamespace(
-            take=lambda *_: None, propose=lambda *_: LearnerResult(proposed, "given")
-        )
+        # nothing is known at the first tick
+        results = [LearnerResult(None, ""), LearnerResult(proposed, "given")]
+        made = SimpleNamespace(take=lambda *_: None, propose=Mock(side_effect=results))
         return lambda _: made
 
     (folder := tmp_path / "learn").mkdir()

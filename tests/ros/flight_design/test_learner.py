@@ -55,8 +55,9 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
     assert flown == "completed"
     tape = simulate(chosen, learn=learner(chosen), announce=events.append)
-    assert [event.stamp_ns for event in events] == [nanoseconds(10.5), nanoseconds(11.0)]
-    assert events[0].change
+    assert [event.stamp_ns for event in events] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
+    assert events[0].change  # the airframe file, before there is a record
+    assert events[1].change
     assert lines == [f"t = {event.stamp_ns / 1e9:.2f} s: {event.sentence}" for event in events]
     recorded = read_run(run).tape
     for name, signal in tape.signals.items():

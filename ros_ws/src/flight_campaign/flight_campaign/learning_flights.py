@@ -21,8 +21,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
-from flight_core.vectors import FloatArray
-from rise_di_controller.proposals import Event, EventKind
+from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
 
 if TYPE_CHECKING:
     from flight_campaign.campaign import Definition
@@ -36,14 +35,18 @@ class LearningOutcome(NamedTuple):
     """Outcomes of the identifications of a flight."""
 
     first_model: float  # s, when the first model flew; NaN without one
-    models: int  # proposals that flew
+    models: int  # proposals that flew, without the rough model
     refused: int  # identifications refused by the learner, and proposals refused by the controller
     fallbacks: int  # to the law of the start, in all channels or in some
 
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
     """Outcomes of the identifications of a flight, from its tape and its events."""
-    flown = [event.stamp_ns for event in events if event.kind is EventKind.FLIES]
+    flown = [
+        event.stamp_ns
+        for event in events
+        if event.kind is EventKind.FLIES and UNVERIFIED not in event.sentence
+    ]
     fallbacks = sum(event.kind in {EventKind.FALLBACK, EventKind.RESTART} for event in events)
     refused = sum(event.kind is EventKind.REFUSED for event in events)
     if "learned" in tape:

@@ -84,6 +84,9 @@ class Event(NamedTuple):
     sentence: str
 
 
+UNVERIFIED = "until a model is learned"
+"""Ends the sentence of a proposal of the rough model before any record."""
+
 FALLBACKS = 2
 """Fallbacks of a part in an engagement after which the part has no further model: the second model
 was certified, too."""
@@ -110,13 +113,13 @@ class Fallback(NamedTuple):
 
 
 class Updates:
-    """When identifications and tests begin: at the first tick at or after each of the times,
-    counted from the first tick.
+    """When proposals are due: at the first tick, with the rough model as it is, then at the first
+    tick at or after each of the times, counted from the first tick.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
         self._check_ns = nanoseconds(settings.check)
-        self._times_ns = deque(map(nanoseconds, settings.updates))
+        self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
         self._first_ns: int | None = None
 
     def due(self, now_ns: int) -> bool:

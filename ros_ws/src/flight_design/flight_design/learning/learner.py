@@ -40,6 +40,7 @@ from flight_design.identification.model_quality import (
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from rise_di_controller import divergence
 from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
+from rise_di_controller.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
@@ -102,9 +103,11 @@ class Learner:
         design: Design,
         delay: float = 0.0,
         rough: Unknown = KNOWN,
+        design_of_rough: Design | None = None,
     ) -> None:
         """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling
-        and lags.
+        and lags. `design_of_rough` designs for a model that errs: by it the rough model flies from
+        the start, and later in parts without a learned model; None: the law of the start does.
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances. With
         more noise than DRIFT the aircraft is not tested for a change: the disturbances stand for a
@@ -121,6 +124,9 @@ class Learner:
         self._controller = controller
         self._rough = airframe
         self._design = design
+        # None too once the rough model has not flown, or the law fell back
+        self._design_of_rough = design_of_rough
+        self._has_proposed_rough = False
         self._period = 1.0 / controller.rate
         self._believed = rough
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
@@ -196,12 +202,20 @@ class Learner:
         flies the law of the start, without this input. Before the first model of a part, a rough
         airframe that explains the flight as it is, with white innovations, is taken itself.
 
+        The first proposal, before any record, is the rough airframe designed as one that errs.
+        Parts that are refused later fly so, too. The law of the start follows where that proposal
+        does not fly, or the law falls back.
+
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the
         proposal was refused, or the controller fell back. Outputs that the controller gave up,
         `given_up`, are not proposed again. Where no part is left, nothing is identified, and the
         sentence says so once.
         """
+        is_first = not self._has_proposed_rough
+        self._has_proposed_rough = True
         try:
+            if is_first and self._design_of_rough is not None and flown == self._proposed:
+                return self._rough_proposal()
             return self._proposal(flown, given_up)
         except ParameterError as error:  # no steady airspeed, no motion, or no design
             return LearnerResult(None, str(error))
@@ -216,6 +230,7 @@ class Learner:
             return LearnerResult(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
+        self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
             return LearnerResult(
@@ -305,6 +320,25 @@ class Learner:
         return LearnerResult(
             proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals])
         )
+
+    def _distrust(self, *, lost: bool) -> None:
+        """No longer fly the rough model where it was refused, or the law fell back."""
+        is_rough_alone = not self._known and not self._dead
+        if lost and (is_rough_alone or self._fell_back(-1)):
+            self._design_of_rough = None
+
+    def _rough_proposal(self) -> LearnerResult:
+        """The rough airframe by a design for one that errs. Raises ParameterError."""
+        name = self._rough.name
+        try:
+            proposed = self._designed_behind(0.0, self._rough, {}, self._dead)
+        except ParameterError as error:
+            self._design_of_rough = None
+            raise ParameterError(f"the airframe {name} as it is: {error}") from None
+        self._last = proposed
+        self._proposed = proposed.digest()
+        self._proposals.add(self._proposed)
+        return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
         """Give up the outputs that the controller gave up. The rest of what flies is the last
@@ -489,13 +523,20 @@ class Learner:
         known: Mapping[tuple[str, ...], Known],
         dead: Mapping[tuple[str, ...], str],
     ) -> RiseDiConfig:
-        """`_designed`, with the delay margin behind a delay, s. Raises ParameterError."""
+        """`_designed`, with the delay margin behind a delay, s. While the rough model flies, parts
+        without another fly by it. Raises ParameterError.
+        """
         start = self._controller
-        learned = {output for part in known for output in part}
-        bare = [output not in learned for output in start.outputs]
+        flying = {output for part in known for output in part}
+        design = self._design
+        held = {output for part in dead for output in part}
+        if self._design_of_rough is not None and not is_within(start.outputs, flying | held):
+            design = self._design_of_rough
+            flying = set(start.outputs) - held
+        bare = [output not in flying for output in start.outputs]
         designed = start.model_copy(update={"learn": None})
-        if learned:
-            designed = self._design(with_margin(designed, margin_behind(delay, start)), model)
+        if flying:
+            designed = design(with_margin(designed, margin_behind(delay, start)), model)
             designed = _with_deviations(
                 designed, {k: v for part in known.values() for k, v in part.deviation.items()}
             )
@@ -544,13 +585,13 @@ def unchanged(changes: Iterable[Change]) -> str:
 
 def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """A controller whose model of the feedforward has the standard deviations of B, given by entry
-    and relative to it.
+    and relative to it, PRIOR for an entry that no flight has shown.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one
     names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
     values = tuple(
-        abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True)
+        abs(value) * deviation.get(name, PRIOR) for name, value in zip(names, model.B, strict=True)
     )
     return designed.model_copy(
         update={"feedforward": model.model_copy(update={"deviation": values})}

@@ -4,6 +4,7 @@
 of `rise-di gains`.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,16 +77,22 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
             f"{airframe.speed:g} m/s, that of the model",
         )
 
-    def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
+    sketch = aircraft.is_jsbsim
+
+    def design(start: RiseDiConfig, model: Airframe, *, errs: bool = False) -> RiseDiConfig:
         assert start.observer is not None  # noqa: S101 - a controller that learns has one
         margin = start.observer.margin
-        sketch = aircraft.is_jsbsim
         return observed(
-            start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds
+            start, scenario, model, margin, uncertain=errs, sketched=sketch, speeds=speeds
         )[0]
 
     return lambda parameters: Learner(
-        parameters, airframe, design, parameters.delay if real_time else 0.0, rough
+        parameters,
+        airframe,
+        design,
+        parameters.delay if real_time else 0.0,
+        rough,
+        None if sketch else partial(design, errs=True),
     )
 
 
@@ -176,7 +183,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed, left)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
-            if proposal.sentence:
+            # the rough model, proposed before there is a record, teaches nothing
+            if proposal.sentence and now_ns > begin_ns:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
     require(
