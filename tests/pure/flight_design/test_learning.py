@@ -30,7 +30,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import Prediction
+from flight_design.identification.model_quality import Prediction, another_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning.change_test import Change
 from flight_design.learning.learner import Known, Learner
@@ -185,13 +185,13 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
     B, of_file = load_airframe(model).matrix_b(), load_airframe("osprey").matrix_b()
     found = {entry.name: entry.error for entry in flown.learner.identification.entries}  # type: ignore[union-attr]
     assert B[2, 0] / of_file[2, 0] - 1.0 == pytest.approx(found["B[q, elevator]"])
-    assert learner(scenario(learn={"prior": str(model)})) is not None
+    assert learner(scenario(learn={"prior": {"file": str(model)}})) is not None
     with pytest.raises(
         ParameterError,
-        match=r"^controller\.learn\.prior: found an airframe with another name, expected a "
+        match=r"^controller\.learn\.prior\.file: found an airframe with another name, expected a "
         r"model of",
     ):
-        learner(scenario(learn={"prior": "navion_lateral"}))
+        learner(scenario(learn={"prior": {"file": "navion_lateral"}}))
 
 
 def test_log_teaches_with_other_settings(flown: Flown) -> None:
@@ -321,6 +321,15 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     after = made.propose(1).controller
     assert after is not None
     assert acting_inputs(after) == ("elevator", "thrust")
+
+
+def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:
+    # twice the deviation of +-50 %: the square of the largest factor
+    made = made_learner(scenario(learn={"prior": {"off": 0.58}}))
+    assert made._believed.factor == pytest.approx(2.5**2)
+    far = [Entry("B", "q", "elevator", 56.15, 3.0, 0.05, 56.15)]
+    assert "at a bound of the search, 0.4 or 2.5 times" in another_airframe(far, "osprey")
+    assert another_airframe(far, "osprey", factor=made._believed.factor) == ""
 
 
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(

@@ -158,10 +158,12 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    if (
-        learn is not None and learn.prior is None
+    if learn is not None and (
+        learn.prior is None or learn.prior.file is None
     ):  # the learner begins with the airframe, not with the corner
-        scenario = scenario.vary(controller={"learn": {"prior": scenario.aircraft.airframe}})
+        scenario = scenario.vary(
+            controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
+        )
     cornered = equipment.with_equipment(scenario, equipment_parts).vary(
         aircraft={"airframe": str(airframe)}
     )

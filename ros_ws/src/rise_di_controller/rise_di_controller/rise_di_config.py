@@ -75,6 +75,19 @@ class ScheduleConfig(Config):
         return () if self.slow is None or self.fast is None else (self.slow, self.fast)
 
 
+class PriorConfig(Config):
+    """The rough model with which learning begins."""
+
+    file: str | None = Field(
+        default=None, description="its airframe file, by `rise-di learn`; none: the airframe"
+    )
+    off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
+        default=None,
+        description="how rough it is: standard deviation of the entries of A and B over their "
+        "values; none: 0.29, that of +-50 %",
+    )
+
+
 class LearnConfig(Config):
     """Learning in the air, an extension of the paper: A and B are identified in flight, and the
     observer is designed again.
@@ -90,9 +103,8 @@ class LearnConfig(Config):
     check: Annotated[float, Field(ge=1, le=600)] = Field(
         default=10.0, description="after these times: period of the test for a changed aircraft, s"
     )
-    prior: str | None = Field(
-        default=None,
-        description="the airframe file of the rough model, by `rise-di learn`; none: the airframe",
+    prior: PriorConfig | None = Field(
+        default=None, description="the rough model; none: the airframe"
     )
     without: tuple[str, ...] | None = Field(
         default=None,

@@ -114,7 +114,14 @@ class Unknown(NamedTuple):
     delay: float = 0.0  # s, of u
     angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
     effect: float = PRIOR  # 1, of an entry of B before the flight
+    error: float = PRIOR  # 1, of an entry of A
     drift: float = DRIFT  # sizes/s per root s, of the disturbances
+
+    @property
+    def factor(self) -> float:
+        """Largest factor of an entry over the nominal one, either way: MAX_FACTOR at PRIOR."""
+        roughness = max(self.error, self.effect, PRIOR) / PRIOR
+        return float(MAX_FACTOR**roughness)
 
 
 KNOWN = Unknown()
@@ -239,7 +246,8 @@ class Likelihood:
             None  # theta, levels and innovations of `levels`
         )
         self.count = int(count_A + count_B)  # of the entries that are identified
-        self.believe(np.repeat([PRIOR, unknown.effect], [count_A, count_B]))
+        self._factor = unknown.factor
+        self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
@@ -257,6 +265,11 @@ class Likelihood:
         self._upper[self._errors] = (
             deviation / PRIOR * [largest_error(entry) for entry in self.nominal_entries()]
         )
+        rough = np.zeros(len(self.prior), dtype=bool)
+        nominal = np.array([entry.nominal for entry in self.nominal_entries()])
+        rough[self._errors] = (deviation > PRIOR) & (nominal != 0.0)
+        self._upper[rough] = self._factor - 1.0
+        self._lower[rough] = 1.0 / self._factor - 1.0
         if len(delay_prior):  # no u acts before it is sent
             self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
             self._upper[-1] = MAX_DELAY_ERROR

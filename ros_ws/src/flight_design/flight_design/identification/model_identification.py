@@ -135,7 +135,7 @@ class _Study(NamedTuple):
             prediction(fit.after, self.validating),
         )
         sentences = (
-            another_airframe(entries, self.airframe.name, self.at_bound),
+            another_airframe(entries, self.airframe.name, self.at_bound, self.unknown.factor),
             too_little_excitation(entries, outputs),
             other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
             no_better(*predictions),

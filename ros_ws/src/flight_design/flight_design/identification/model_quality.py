@@ -101,15 +101,21 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     )
 
 
-def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> str:
-    """The entries at a bound of the search, if more than `allowed`."""
-    at_bound = [
-        entry.name for entry in entries if not -MAX_ERROR < entry.error < largest_error(entry)
-    ]
+def another_airframe(
+    entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
+) -> str:
+    """The entries at a bound of the search, if more than `allowed`; `factor` is the largest one."""
+    at_bound = []
+    for entry in entries:
+        lower, upper = -MAX_ERROR, largest_error(entry)
+        if factor > MAX_FACTOR and entry.nominal:
+            lower, upper = 1.0 / factor - 1.0, factor - 1.0
+        if not lower < entry.error < upper:
+            at_bound.append(entry.name)
     if len(at_bound) > allowed:
         return (
             f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, "
-            f"{1.0 - MAX_ERROR:g} or {MAX_FACTOR:g}"
+            f"{1.0 / factor:.2g} or {factor:.2g}"
             " times the nominal value, expected a log of this airframe, in calm air if its "
             "effect of wind is not known"
         )

@@ -301,7 +301,8 @@ class Learner:
                 else sentence(part)
             )
         if self._changed and any(
-            another_airframe(part.entries, self._rough.name, AT_BOUND) for part in identified.parts
+            another_airframe(part.entries, self._rough.name, AT_BOUND, self._believed.factor)
+            for part in identified.parts
         ):
             # the model that flew may have been the wrong one, and not the aircraft have changed
             self._prior = self._model if self._prior is self._rough else self._rough

@@ -62,8 +62,11 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     else:
         airframe = load_airframe(aircraft.airframe)
         rough = KNOWN
-    if controller.learn.prior is not None:
-        airframe = _prior(controller.learn.prior, airframe)
+    prior = controller.learn.prior
+    if prior is not None and prior.file is not None:
+        airframe = _prior(prior.file, airframe)
+    if prior is not None and prior.off is not None:
+        rough = rough._replace(error=prior.off, effect=prior.off)
 
     speeds = None
     if controller.schedule is not None:
@@ -103,7 +106,7 @@ def _prior(path: str, flown: Airframe) -> Airframe:
         same = getattr(prior, key) == getattr(flown, key)
         require(
             same,
-            "controller.learn.prior",
+            "controller.learn.prior.file",
             f"an airframe with another {key}",
             f"a model of {flown.name}",
         )
