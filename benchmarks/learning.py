@@ -104,13 +104,14 @@ AIR: dict[str, dict[str, Any]] = {
     "light turbulence": {"turbulence": MODERATE | {"wind": 7.7}},
     "severe turbulence": {"turbulence": MODERATE | {"wind": 23.1}},
     "turbulence and gusts": {"turbulence": MODERATE, "gusts": TRAIN},
+    "air that turns": {"turbulence": MODERATE | {"rotary": True}},
 }
 
 
 class Cell(NamedTuple):
     """What the aircraft of a cell have in common."""
 
-    kind: str  # "learn", "rough", "coupled", "late", "weak", "dead" or "alarm"
+    kind: str  # "learn", "turning", "rough", "coupled", "late", "weak", "dead" or "alarm"
     air: str
     uncertainty: float
     share: float = 1.0  # of --aircraft
@@ -123,6 +124,7 @@ CELLS = {
     for p in (0.3, 0.5)
 } | {
     "rough prior": Cell("rough", "turbulence", 0.3, 0.5),
+    "air that turns": Cell("turning", "air that turns", 0.3, 0.25),
     "coupled": Cell("coupled", "turbulence", 0.3, 0.25),
     "u late": Cell("late", "turbulence", 0.3, 0.25),
     "weak": Cell("weak", "turbulence", 0.3, 0.5),
@@ -364,7 +366,9 @@ def learn(name: str, cell: Cell, number: int) -> Row:
     """A learner beside what does not learn."""
     with TemporaryDirectory() as folder:
         chosen = learning(cell, number, LEARNED)
-        others = beside(cell.uncertainty, number) if cell.kind in {"learn", "rough"} else {}
+        others = (
+            beside(cell.uncertainty, number) if cell.kind in {"learn", "turning", "rough"} else {}
+        )
         if cell.kind == "rough":
             prior = rough(number)
             Path(folder, "prior.yaml").write_text(as_yaml(prior))
@@ -399,7 +403,9 @@ def learn(name: str, cell: Cell, number: int) -> Row:
 
 def with_prior(chosen: Scenario, folder: str) -> Scenario:
     """A scenario whose learner begins with the airframe of a file."""
-    settings = chosen.rise_di().model_dump()["learn"] | {"prior": str(Path(folder, "prior.yaml"))}
+    settings = chosen.rise_di().model_dump()["learn"] | {
+        "prior": {"file": str(Path(folder, "prior.yaml"))}
+    }
     return chosen.vary(controller={"learn": settings})
 
 
@@ -512,6 +518,7 @@ def alarms(name: str, cell: Cell, number: int) -> Row:
 
 FLIGHTS = {
     "learn": learn,
+    "turning": learn,
     "rough": learn,
     "coupled": learn,
     "late": learn,
@@ -605,7 +612,8 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
     """Scores beside those of the others."""
     yield from scores(name, chosen)
     known = [each for each in chosen if not math.isnan(each.true)]
-    near = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "rough": 0.75}.get(cell.kind)
+    shares = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "turning": 0.75, "rough": 0.75}
+    near = shares.get(cell.kind)
     within = COUPLED_WITHIN if cell.kind == "coupled" else WITHIN
     share = float(np.mean([each.learner <= within * each.true for each in known]))
     yield row(
@@ -694,6 +702,7 @@ def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
 COUPLED_WITHIN = 1.15
 CELL_FIGURES = {
     "learn": learn_figures,
+    "turning": learn_figures,
     "rough": learn_figures,
     "coupled": learn_figures,
     "late": learn_figures,
