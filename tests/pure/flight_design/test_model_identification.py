@@ -9,6 +9,7 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
 from flight_design.identification.innovation_filters import Actuation, Recording
+from flight_design.identification.likelihood_search import Search
 from flight_design.identification.model_identification import Identification, identify, model_yaml
 from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
 from flight_log.bag import LogAttachments
@@ -143,6 +145,14 @@ def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
             assert abs(entry.error - true[entry.name]) < 3.0 * entry.deviation, entry.name
     assert all("at a bound" not in part.refusal for part in found.parts)
     assert found.after.whiteness.max() < MAX_WHITENESS
+
+
+def test_air_that_moves_the_aircraft_more_than_any_wind_does_is_refused() -> None:
+    # a frozen field of wind has effects of (0, -1), the specification's sign (0, 1)
+    search: Any = SimpleNamespace(_shear=slice(0, 2), _upper=np.array([2.07, 2.07]))
+    for effects, name in (([0.0, -1.0], ""), ([2.07, -0.2], "alpha"), ([0.1, -2.07], "q")):
+        refusal = Search.strange_air(search, SimpleNamespace(theta=np.array(effects)))  # type: ignore[arg-type]
+        assert (f"wind on {name} at a bound" in refusal) if name else (refusal == "")
 
 
 @pytest.mark.parametrize("air, uncertainty", FLIGHTS)

@@ -461,6 +461,21 @@ class Likelihood:
             entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors
         ]
 
+    def strange_air(self, fit: Fit) -> str:
+        """The state that the slope of the wind moves most, if by the bound of the search: the wind
+        then stands for another aircraft.
+        """
+        effects = np.abs(fit.theta[self._shear])
+        bounds = self._upper[self._shear]
+        at_bound = np.flatnonzero(effects >= bounds)
+        if not len(at_bound):
+            return ""
+        names = " and ".join(SHEARED[k] for k in at_bound)
+        return (
+            f"air: found an effect of the slope of the vertical wind on {names} at a bound of the "
+            f"search, {bounds[0]:.2g}, expected less"
+        )
+
     def known(self) -> NDArray[np.bool_]:
         """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
         return np.isfinite(self._y).all(axis=1) & (

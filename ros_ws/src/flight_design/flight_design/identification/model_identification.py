@@ -136,6 +136,7 @@ class _Study(NamedTuple):
         )
         sentences = (
             another_airframe(entries, self.airframe.name, self.at_bound, self.unknown.factor),
+            search.strange_air(fit),
             too_little_excitation(entries, outputs),
             other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
             no_better(*predictions),
