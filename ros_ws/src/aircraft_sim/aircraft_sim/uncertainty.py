@@ -133,7 +133,7 @@ def sampled_matrices(
         "A": np.full(airframe.matrix_a().shape, part_A),
         "B": np.full(airframe.matrix_b().shape, part_B),
     }
-    places = _drawn_places(airframe)
+    places = drawn_places(airframe)
     for name, part in spread.entries.items():
         require(
             name in places,
@@ -179,11 +179,11 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
     """
     matrices = {"A": A, "B": B}
     return {
-        name: matrices[matrix][:, i, j] for name, (matrix, i, j) in _drawn_places(airframe).items()
+        name: matrices[matrix][:, i, j] for name, (matrix, i, j) in drawn_places(airframe).items()
     }
 
 
-def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
+def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
     """The entries that `sampled_matrices` draws: matrix, row and column by name."""
     named = {
         "A": (airframe.matrix_a(), [*airframe.states]),
@@ -205,7 +205,7 @@ def with_entries(
     in `wind_factors`.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
-    places = _drawn_places(airframe)
+    places = drawn_places(airframe)
     for name, deviation in deviations.items():
         matrix, i, j = places[name]
         matrices[matrix][i, j] *= 1.0 + deviation

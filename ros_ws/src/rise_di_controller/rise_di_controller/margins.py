@@ -132,7 +132,7 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
 
 def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray) -> ComplexArray:
     """L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
-    form = _schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
+    form = schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
 
@@ -171,7 +171,7 @@ def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
     """
     parts = []
     for form in _schur_forms(plant, law, loop):
-        w, S = _on_grid(form, loop.period)
+        w, S = on_grid(form, loop.period)
         phase, _ = _phase_margins(form, w, _loop_of_sensitivity(S), loop.period)
         parts.append(np.where(_stable(form)[:, None], phase, 0.0))
     return np.concatenate(parts).reshape(*_batch_shape(plant, law), -1)
@@ -181,7 +181,7 @@ def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
     return np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (plant.A, plant.B, law.A)))
 
 
-class _SchurForm(NamedTuple):
+class SchurForm(NamedTuple):
     """The closed loop in Schur form: v = d + L (z - T)^-1 R d, from a disturbance d of the inputs
     to v = d + u.
     """
@@ -192,10 +192,11 @@ class _SchurForm(NamedTuple):
 
     @property
     def eigenvalues(self) -> ComplexArray:
+        """Eigenvalues of the closed loops, (N, k)."""
         return np.asarray(np.einsum("...ii->...i", self.T))
 
 
-def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_SchurForm]:
+def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[SchurForm]:
     """The closed loops of an aircraft, or of N, in batches."""
     shape = _batch_shape(plant, law)
     count = int(np.prod(shape))
@@ -212,10 +213,10 @@ def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_Sc
         batch = slice(k, k + BATCH)
         aircraft = LinearPlant(A[batch], B[batch], plant.C)
         its_law = LinearLaw(*(matrix[batch] for matrix in laws))
-        yield _schur_form(aircraft, its_law, loop)
+        yield schur_form(aircraft, its_law, loop)
 
 
-def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
+def schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SchurForm:
     """The closed loops of N aircraft: A (N, n, n), B (N, n, m) under one law or N laws."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
@@ -225,10 +226,10 @@ def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
     T, Q = (np.array(matrices, dtype=np.complex128) for matrices in zip(*pairs, strict=True))
     B = np.concatenate([B, np.zeros((N, law.A.shape[-1], m))], axis=1)
     K = np.concatenate([law.D @ C, np.broadcast_to(law.C, (N, *law.C.shape[-2:]))], axis=2)
-    return _SchurForm(T, Q.conj().swapaxes(1, 2) @ B, K @ Q)
+    return SchurForm(T, Q.conj().swapaxes(1, 2) @ B, K @ Q)
 
 
-def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
+def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
     """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part
     at once.
     """
@@ -246,11 +247,11 @@ def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
     return np.asarray(np.eye(m) + product.swapaxes(2, 3).reshape(N, -1, m, m)[:, :F])
 
 
-def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
+def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
     """Margins of the aircraft of a batch."""
     stable = _stable(form)
     m = form.R.shape[-1]
-    w, S = _on_grid(form, period)
+    w, S = on_grid(form, period)
     near = _around_peaks(S, w)
     every = np.concatenate([S, _balanced(_sensitivity(form, np.exp(1j * near * period)))], axis=1)
     diagonal = np.einsum("NFii->NFi", every)
@@ -279,11 +280,11 @@ def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
     )
 
 
-def _stable(form: _SchurForm) -> NDArray[np.bool_]:
+def _stable(form: SchurForm) -> NDArray[np.bool_]:
     return np.asarray(np.max(np.abs(form.eigenvalues), axis=1) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
 
 
-def _on_grid(form: _SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
+def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
     """The grids of the aircraft, (N, F), rad/s, and S on them, balanced, (N, F, m, m)."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
@@ -313,7 +314,7 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
-    norms = [_norm_bound(matrix)[..., None] for matrix in (S, half)]
+    norms = [norm_bound(matrix)[..., None] for matrix in (S, half)]
     peaks = np.argmax(
         np.concatenate([np.abs(diagonal), np.abs(diagonal - 0.5), *norms], axis=2), axis=1
     )  # (N, Q)
@@ -337,7 +338,7 @@ def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _refined(
-    form: _SchurForm,
+    form: SchurForm,
     w: FloatArray,
     places: tuple[IntArray, IntArray, IntArray],
     values: FloatArray,
@@ -348,7 +349,7 @@ def _refined(
     falsi, Illinois.
     """
     aircraft, place, channel = places
-    forms = _SchurForm(*(part[aircraft] for part in form))
+    forms = SchurForm(*(part[aircraft] for part in form))
     low = w[aircraft, place]
     high = w[aircraft, place + 1]
     at_low = values[aircraft, place, channel]
@@ -380,7 +381,7 @@ def _log_gain(L: ComplexArray) -> FloatArray:
 
 
 def _phase_margins(
-    form: _SchurForm, w: FloatArray, L: ComplexArray, period: float
+    form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and the frequency, (N, m)."""
     gains = _log_gain(L)
@@ -396,7 +397,7 @@ def _phase_margins(
 
 
 def _gain_margins(
-    form: _SchurForm, w: FloatArray, L: ComplexArray, period: float
+    form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
     """Factors next to 1 below and above for L_i = -1, (N, m); L_i is real at w = 0 and at pi / T
     too.
@@ -454,7 +455,7 @@ def _balanced(matrices: ComplexArray) -> ComplexArray:
     return M
 
 
-def _norm_bound(matrices: ComplexArray) -> FloatArray:
+def norm_bound(matrices: ComplexArray) -> FloatArray:
     """sqrt(norm(M, 1) norm(M, inf)) >= norm(M, 2), over the last two axes."""
     sizes = np.abs(matrices)
     return np.asarray(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)))
@@ -482,7 +483,7 @@ def _largest_norm(balanced: ComplexArray) -> FloatArray:
     """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is
     refined to convergence.
     """
-    bounds = _norm_bound(balanced)
+    bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))
     least = np.abs(np.einsum("NFii->NFi", balanced)).max(
         axis=(1, 2)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
+from aircraft_sim.uncertainty import UNIFORM, Spread, drawn_places, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
@@ -23,12 +23,15 @@ from rise_di_controller.linear_loop import (
     Loop,
     closed_loop,
     delay_margin,
+    is_stable,
     linear_law,
 )
 from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
 from rise_di_controller.model_sections import AllocationConfig
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.uncertain_loop import Box, aircraft_at
+from rise_di_controller.worst_case import worst_in_box
 
 
 class LinearLoop(NamedTuple):
@@ -39,6 +42,7 @@ class LinearLoop(NamedTuple):
     plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
     law: LinearLaw
     loop: Loop
+    box: Box | None = None  # of the uncertain aircraft; None without any
 
     @property
     def nominal(self) -> LinearPlant:
@@ -60,6 +64,7 @@ class LoopMargins(NamedTuple):
     worst_delay: float | None = None  # s
     aircraft: int = 0  # number of uncertain aircraft
     stable: int = 0  # number of those that are stable
+    by_search: bool = False  # whether `worst` is that of a search over the box, not of samples
 
 
 def margins(
@@ -104,6 +109,8 @@ def margins(
 
 def loop_assessment(linear: LinearLoop) -> LoopMargins:
     """The margins of a loop: of the nominal aircraft, and the worst of the uncertain aircraft."""
+    if linear.box is not None and len(linear.plant.A) > 1:
+        return _assessed_by_search(linear, linear.box)
     together = loop_margins(linear.plant, linear.law, linear.loop)
     nominal = Margins._make(value[0] for value in together)
     uncertain = Margins._make(value[1:] for value in together)
@@ -121,20 +128,38 @@ def loop_assessment(linear: LinearLoop) -> LoopMargins:
     stable = int(uncertain.stable.sum())
     return result._replace(
         worst=uncertain.worst(),
-        worst_delay=_least_delay(linear, delay),
+        worst_delay=_least_delay(linear._replace(plant=_some(linear.plant, slice(1, None))), delay),
         aircraft=count,
         stable=stable,
     )
 
 
+def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
+    """The margins with the worst of the box by search; the samples count for stability alone."""
+    nominal = loop_assessment(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
+    samples = closed_loop(
+        _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
+    )
+    radii = np.abs(np.linalg.eigvals(samples)).max(axis=-1)
+    found = worst_in_box(linear.nominal, linear.law, linear.loop, box)
+    aircraft = aircraft_at(_some(linear.plant, slice(1)), box, found.corners)
+    return nominal._replace(
+        worst=found.worst,
+        worst_delay=_least_delay(linear._replace(plant=aircraft), nominal.delay),
+        aircraft=len(radii),
+        stable=int((radii <= 1.0 + SPECTRAL_RADIUS_TOLERANCE).sum()),
+        by_search=True,
+    )
+
+
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
-    """The smallest delay margin of the uncertain aircraft, at most the nominal delay margin, s.
+    """The smallest delay margin of the aircraft of a loop, at most the nominal delay margin, s.
 
     The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer
     nominal margin.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
-    uncertain = LinearPlant(linear.plant.A[1:], linear.plant.B[1:], linear.plant.C)
+    uncertain = linear.plant
     for delay in np.append(
         np.arange(0.0, longest, max(linear.loop.period / 2.0, longest / 12.0)), longest
     ):
@@ -144,8 +169,14 @@ def _least_delay(linear: LinearLoop, nominal: float) -> float:
         radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
         unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
         if len(unstable):
-            plants = (LinearPlant(uncertain.A[k], uncertain.B[k], uncertain.C) for k in unstable)
-            return min(nominal, *(delay_margin(plant, linear.law, linear.loop) for plant in plants))
+            least = nominal
+            for k in unstable[np.argsort(-radii[unstable])]:
+                plant = LinearPlant(uncertain.A[k], uncertain.B[k], uncertain.C)
+                if not is_stable(
+                    plant, linear.law, linear.loop, np.full(len(linear.inputs), least)
+                ):
+                    least = min(least, delay_margin(plant, linear.law, linear.loop))
+            return least
     return nominal
 
 
@@ -196,6 +227,43 @@ def linear_loop(
         linear_law(controller.tuned_law(), len(rows), loop.period),
         loop,
     )
+
+
+def box_of(
+    airframe: Airframe,
+    controller: ControllerConfig,
+    uncertainty: float,
+    spread: Spread = UNIFORM,
+    effectors: AllocationConfig | None = None,
+) -> Box:
+    """The box of the aircraft that `sampled_matrices` draws around an airframe, in the law's order;
+    with `effectors` B of each effector is uncertain.
+    """
+    distribution = np.eye(len(airframe.inputs))
+    seen = airframe
+    if effectors is not None:
+        distribution = _distribution(airframe, effectors)
+        seen = through_allocation(airframe, controller)
+    distribution = distribution[:, law_order(seen, controller)[1]]
+    places = drawn_places(airframe)
+    part = np.array([spread.entries.get(name, uncertainty) for name in places])
+    n = len(airframe.states)
+    E = np.zeros((n, len(places)))
+    F = np.zeros((len(places), n))
+    G = np.zeros((len(places), distribution.shape[1]))
+    matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}
+    for entry, (matrix, i, j) in enumerate(places.values()):
+        E[i, entry] = 1.0
+        size = part[entry] * matrices[matrix][i, j]
+        if matrix == "A":
+            F[entry, j] = size
+        else:
+            G[entry] = size * distribution[j]
+    return Box(tuple(places), part, E, F, G)
+
+
+def _some(plant: LinearPlant, chosen: slice) -> LinearPlant:
+    return LinearPlant(plant.A[chosen], plant.B[chosen], plant.C)
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.loop_margins import (
     LoopMargins,
+    box_of,
     is_literal,
     law_order,
     linear_loop,
@@ -458,6 +459,8 @@ def assess_gains(
     if is_literal(controller):
         return GainAssessment(controller, theorem, loop_conditions, bounds, None, study)
     loop = linear_loop(controller, study.airframe, study.A, study.B)
+    if study.uncertainty > 0.0:
+        loop = loop._replace(box=box_of(study.airframe, controller, study.uncertainty))
     margins = loop_assessment(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     loop_conditions += (Condition("linear stability", None, stable, 1.0),)

@@ -1,0 +1,303 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Upper bound of the structured singular value of a loop, over every frequency.
+
+mu(M) is 1 / the size of the least Delta = diag(delta_i) with det(I - M Delta) = 0, delta_i real or
+complex. For any D = diag(exp(t)) and G = diag(g), g_i = 0 at complex channels,
+
+    mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = D M D^-1
+
+Every D and G gives a valid bound: an early end of the search costs tightness alone. Source: M. K.
+H. Fan, A. L. Tits, J. C. Doyle, IEEE Transactions on Automatic Control 36(1), 1991.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import SPECTRAL_RADIUS_TOLERANCE
+from rise_di_controller.uncertain_loop import Channels, ComplexArray
+
+RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) of the limit of stability
+
+# of the search for D and G
+BALANCE_ROUNDS = 6
+LARGEST_G = 1e4
+LEVELS = 40
+CENTRING = 6
+LENGTHS = tuple(0.6**k for k in range(20))  # of Newton's step
+CENTRED = 0.5  # decrement at a centre
+FALL = 0.3  # of the way from the level to the bound that is left
+STALLED = 1e-3  # part of the bound by which the level is above it at the end
+
+ROOM = 1.002  # factor of the level above a bound that did not hold
+NARROWEST = 1e-7  # part of pi / T: shorter intervals count as points
+MAX_RAISES = 400
+MAX_LEVEL = 1e3  # 1 / level beyond it: none
+NEIGHBOURS = 2
+STARTS = 2
+AGAIN = 1.05  # a bound above it is sought from the next start too
+LOWEST = 1e-3  # of the upper end of an interval that begins at 0: where it is split
+LEAST_MODE = 1e-6  # abs(z) of a motion ended within a period
+# abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: what is found
+# too much costs a shorter interval
+ON_CIRCLE = 1e-7
+CHECKED = 7  # points of an interval at which the bound is computed again
+
+
+class Scaling(NamedTuple):
+    """log D and G, (p,) each."""
+
+    t: FloatArray
+    g: FloatArray
+
+
+def balanced(M: ComplexArray) -> FloatArray:
+    """Find log D, (p,), that makes row and column of a channel about equally large: Osborne's
+    iteration.
+    """
+    t = np.zeros(len(M))
+    sizes = np.abs(M) ** 2
+    np.fill_diagonal(sizes, 0.0)
+    least = 1e-18 * sizes.sum() + 1e-300
+    for _ in range(BALANCE_ROUNDS):
+        for i in range(len(M)):
+            factor = np.sqrt((sizes[i].sum() + least) / (sizes[:, i].sum() + least))
+            sizes[i] /= factor
+            sizes[:, i] *= factor
+            t[i] -= 0.5 * np.log(factor)
+    return t
+
+
+def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
+    """The bound of some matrices (..., p, p) by a D and a G."""
+    N = np.exp(scaling.t)[:, None] * M * np.exp(-scaling.t)
+    skew = 1j * scaling.g[:, None] * N
+    adjoint = np.conj(np.swapaxes(N, -1, -2))
+    H = adjoint @ N + skew + np.conj(np.swapaxes(skew, -1, -2))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(H)[..., -1], 0.0)))
+
+
+def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tuple[float, Scaling]:
+    """A bound of M, (p, p), the first `real` channels real, by D and G from a search; below
+    `target` D and G in the middle of those with the target.
+
+    The method of centres on the linear matrix inequality
+
+        F = level D - N* D N - j (G N - N* G) > 0,  trace D = p,  D > 0,  abs(g_i) < LARGEST_G
+
+    minimises -log det F - log det D - sum log(LARGEST_G^2 - g^2) by Newton's method, for a level
+    that falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
+    """
+    N = np.exp(start.t)[:, None] * M * np.exp(-start.t)
+    centre = Centre(np.ones(len(M)), np.clip(start.g[:real], -LARGEST_G / 2.0, LARGEST_G / 2.0))
+    wanted = target**2
+    least = centre.bound(N)
+    level = max(1.1 * least, wanted)
+    for _ in range(LEVELS):
+        reached = level <= wanted
+        for _ in range(CENTRING):
+            centre, decrement = centre.stepped(N, level)
+            if decrement < CENTRED:
+                break
+        least = min(centre.bound(N), level)
+        if reached or level - least < STALLED * least:
+            break
+        level = max(least + FALL * (level - least), wanted)
+    g = np.r_[centre.g / centre.d[:real], np.zeros(len(M) - real)]
+    return float(np.sqrt(max(least, 0.0))), Scaling(start.t + 0.5 * np.log(centre.d), g)
+
+
+class Centre(NamedTuple):
+    """D and G of the inequality."""
+
+    d: FloatArray  # (p,)
+    g: FloatArray  # (real,)
+
+    def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
+        """F, (p, p)."""
+        skew = 1j * np.r_[self.g, np.zeros(len(N) - len(self.g))][:, None] * N
+        right = (N.conj().T * self.d) @ N + skew + skew.conj().T
+        return np.asarray(level * np.diag(self.d) - right)
+
+    def bound(self, N: ComplexArray) -> float:
+        """The least level of these D and G."""
+        root = np.sqrt(self.d)
+        return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
+
+    def stepped(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
+        """The D and G of a Newton step, and the decrement of Newton's method, 0 at the centre."""
+        real = len(self.g)
+        P = np.linalg.inv(self.inequality(N, level))
+        R = N @ P
+        Q = R @ N.conj().T
+        room = LARGEST_G**2 - self.g**2
+        slope = np.r_[
+            np.diag(Q).real - level * np.diag(P).real - 1.0 / self.d,
+            2.0 * (self.g / room - np.diag(R).imag[:real]),
+        ]
+        sizes = np.abs(R) ** 2
+        dd = level**2 * np.abs(P) ** 2 - level * (sizes + sizes.T) + np.abs(Q) ** 2
+        dg = 2.0 * (level * P * R.T - R * Q.T).imag[:, :real]
+        gg = 2.0 * (Q * P.T - R * R.T).real[:real, :real]
+        dd[np.diag_indices(len(N))] += 1.0 / self.d**2
+        gg[np.diag_indices(real)] += 2.0 * (LARGEST_G**2 + self.g**2) / room**2
+        curvature = np.block([[dd, dg], [dg.T, gg]])
+        trace = np.r_[np.ones(len(N)), np.zeros(real)]
+        down, along = np.linalg.solve(curvature, np.stack([slope, trace], axis=1)).T
+        step = (trace @ down) / (trace @ along) * along - down
+        decrement = float(np.sqrt(max(-slope @ step, 0.0)))
+        for length in LENGTHS:
+            longer = self.moved(length * step)
+            if longer.inside(N, level):
+                return longer, decrement
+        return self, 0.0  # rounding
+
+    def moved(self, step: FloatArray) -> "Centre":
+        """D and G after a step, (p + real,)."""
+        return Centre(self.d + step[: len(self.d)], self.g + step[len(self.d) :])
+
+    def inside(self, N: ComplexArray, level: float) -> bool:
+        """Whether the inequality and the limits hold."""
+        if self.d.min() <= 0.0 or np.abs(self.g).max(initial=0.0) >= LARGEST_G:
+            return False
+        try:
+            np.linalg.cholesky(self.inequality(N, level))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+
+def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
+    """Frequencies, rad/s, ascending, at which diag(scale) M(z) passes the bound 1 by a D and a G.
+
+    lambda_max(N* N + j (G N - N* G)) = 1 on abs(z) = RADIUS exactly where a pencil of twice the
+    states has an eigenvalue there. Source: S. Boyd, V. Balakrishnan, P. Kabamba, Mathematics of
+    Control, Signals, and Systems 2, 1989, for the largest singular value.
+    """
+    from scipy.linalg import eigvals  # noqa: PLC0415 - a flight starts without it
+
+    s = np.exp(scaling.t)
+    A = part.A / RADIUS
+    W = part.W / RADIUS / s
+    Z = (s * scale)[:, None] * part.Z
+    D = (s * scale)[:, None] * part.D / s
+    n, p = W.shape
+    G = 1j * np.diag(scaling.g)
+    inner = D.T @ D - D.T @ G + G @ D - np.eye(p)
+    x = -np.linalg.solve(inner, D.T @ Z + G @ Z)
+    y = -np.linalg.solve(inner, W.T.astype(complex))
+    H = D - G
+    none = np.zeros((n, n))
+    F = np.block([[A + W @ x, W @ y], [none, np.eye(n)]])
+    E = np.block([[np.eye(n), none], [Z.T @ (Z + H @ x), A.T + Z.T @ H @ y]])
+    z = eigvals(F, E)
+    z = z[np.isfinite(z) & (np.abs(z) > 0.5) & (np.abs(z) < 2.0)]
+    on_circle = np.abs(np.log(np.abs(z))) < ON_CIRCLE
+    return np.asarray(np.sort(np.abs(np.angle(z[on_circle])))) / part.period
+
+
+class Cover(NamedTuple):
+    """A level above the bound at every frequency, and how it was shown."""
+
+    level: float  # infinite: none below MAX_LEVEL
+    peak: float  # rad/s, where the level was raised last
+    intervals: int  # each with one D and one G, together from 0 to pi / T
+
+
+def cover(part: Channels, start: float, *, disks: bool = False) -> Cover:
+    """The least level found, from `start` up, with mu(diag(scale) M) < 1 at every frequency.
+
+    scale is 1 / level in every channel: the loop is stable for abs(d_i) <= 1 / level. With `disks`
+    it is 1 in the real channels and 1 / level in the complex ones: 1 / level is then the disk of
+    each aircraft with abs(d_i) <= 1. One D and one G hold up to the next of the `crossings` on
+    either side; an interval that holds at a level holds above it too.
+    """
+    search = _Search(part, start, disks=disks)
+    for w in _modes(part):
+        search.prove(w)
+    while (gap := search.gap()) and search.level < MAX_LEVEL:
+        low, high = gap
+        search.prove(float(np.sqrt(max(low, LOWEST * high) * high)))
+    level = search.level if search.level < MAX_LEVEL else np.inf
+    return Cover(level, search.peak, len(search.proved))
+
+
+def _modes(part: Channels) -> list[float]:
+    """0 and the frequencies of the modes, rad/s: peaks are near."""
+    z = np.linalg.eigvals(part.A)
+    z = z[np.abs(z) > LEAST_MODE]
+    w = np.abs(np.log(z)) / part.period
+    return [0.0, *np.unique(np.round(w[w < np.pi / part.period], 3)).tolist()]
+
+
+class _Search:
+    """The level, and the intervals at which it is proved."""
+
+    def __init__(self, part: Channels, start: float, *, disks: bool) -> None:
+        c = len(part.D) - part.real
+        self.part = part
+        self.level = start
+        self.peak = 0.0
+        self.moves = np.r_[np.full(part.real, not disks), np.full(c, True)]
+        self.proved: list[tuple[float, float]] = []
+        self.scalings: list[tuple[float, Scaling]] = []
+
+    def gap(self) -> tuple[float, float] | None:
+        """The lowest frequencies without a proof, rad/s."""
+        low = 0.0
+        narrowest = NARROWEST * np.pi / self.part.period
+        for begin, end in sorted(self.proved):
+            if begin > low + narrowest:
+                return low, begin
+            low = max(low, end)
+        highest = np.pi / self.part.period
+        return (low, highest) if low < highest - narrowest else None
+
+    def prove(self, w: float) -> None:
+        """Add an interval around w, rad/s; the level rises where it has to."""
+        M = self.part.response(w, RADIUS)
+        starts = self._starts(w, self._scale()[:, None] * M)
+        for _ in range(MAX_RAISES):
+            scaled = self._scale()[:, None] * M
+            bound = np.inf
+            for start in starts:
+                tried, scaling = tightened(scaled, self.part.real, start, 1.0)
+                if tried < bound:
+                    bound = tried
+                    best = scaling
+                if bound < AGAIN:
+                    break
+            if bound < 1.0 and (interval := self._interval(w, best)):
+                self.proved.append(interval)
+                self.scalings.append((w, best))
+                return
+            starts = [best]
+            self.peak = w
+            self.level *= ROOM * np.sqrt(max(bound, 1.0))
+            if self.level > MAX_LEVEL:
+                return
+        raise ArithmeticError(f"no interval around {w:g} rad/s")
+
+    def _scale(self) -> FloatArray:
+        return np.where(self.moves, 1.0 / self.level, 1.0)
+
+    def _starts(self, w: float, scaled: ComplexArray) -> list[Scaling]:
+        """D and G of the neighbours and the balanced D, the best first."""
+        near = sorted(self.scalings, key=lambda pair: abs(np.log((pair[0] + 1e-3) / (w + 1e-3))))
+        tried = [Scaling(balanced(scaled), np.zeros(len(scaled)))]
+        tried += [scaling for _, scaling in near[:NEIGHBOURS]]
+        return sorted(tried, key=lambda scaling: float(bound_at(scaled, scaling)))[:STARTS]
+
+    def _interval(self, w: float, scaling: Scaling) -> tuple[float, float] | None:
+        """The frequencies around w at which D and G of w hold, rad/s; None for none."""
+        scale = self._scale()
+        ends = crossings(self.part, scaling, scale)
+        highest = np.pi / self.part.period
+        low = float(np.max(ends[ends <= w], initial=0.0))
+        high = float(np.min(ends[ends > w], initial=highest))
+        inside = np.linspace(low, high, CHECKED + 2)[1:-1].astype(np.float64)
+        M = scale[:, None] * self.part.response(inside, RADIUS)
+        holds = high - low > NARROWEST * highest and (bound_at(M, scaling) < 1.0).all()
+        return (low, high) if holds else None

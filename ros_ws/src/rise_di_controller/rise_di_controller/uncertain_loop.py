@@ -1,0 +1,265 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled loop of every aircraft of a box, with the uncertain entries of A and B pulled out.
+
+    A + E diag(d) F,  B + E diag(d) G,  abs(d_i) <= 1
+    zeta+ = A zeta + W w + U v,  z = Z zeta + D w + V v,  u = K zeta,  w = d z
+
+z holds the first TERMS Legendre coefficients of F x + G u over a period, w those of the deviation.
+The motion is exact in d but for the coefficients left out, an error of the order of (period
+rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems",
+chapter 10.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import (
+    LinearLaw,
+    LinearPlant,
+    Loop,
+    sampled_plant,
+    zero_order_hold,
+)
+
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.intp]
+
+TERMS = 2  # Legendre coefficients of a signal within a period
+ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
+
+# singular value below which a direction of normalised vectors counts as none
+NO_DIRECTION = 1e-9
+# part of the sizes of row and column below which an entry of M counts as 0
+NO_COUPLING = 1e-13
+PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is taken
+
+
+class Box(NamedTuple):
+    """Uncertain entries of a plant, k of them: d_i in [-1, 1] changes A by E_i d_i F_i, B by E_i
+    d_i G_i.
+    """
+
+    names: tuple[str, ...]
+    part: FloatArray  # (k,) relative deviation of the entry at d_i = 1
+    E: FloatArray  # (n, k)
+    F: FloatArray  # (k, n)
+    G: FloatArray  # (k, m)
+
+
+def aircraft_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
+    """The plants of some deviations d, (..., k)."""
+    effect = box.E * d[..., None, :]
+    return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
+
+
+class UncertainLoop(NamedTuple):
+    """The loop with the channels of k entries pulled out, TERMS k columns of W, and of m inputs."""
+
+    A: FloatArray  # (q, q)
+    W: FloatArray  # (q, p)
+    Z: FloatArray  # (p, q)
+    D: FloatArray  # (p, p)
+    U: FloatArray  # (q, m)
+    V: FloatArray  # (p, m)
+    K: FloatArray  # (m, q)
+    period: float  # s
+
+
+def uncertain_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> UncertainLoop:
+    """The loop of a plant, A (n, n), with the entries of a box pulled out."""
+    n, m = plant.B.shape
+    k = len(box.names)
+    size = n + TERMS * k
+    A = np.zeros((size, size))
+    A[:n, :n] = plant.A
+    A[n : n + k, :n] = box.F / loop.period
+    A[n + k :, n : n + k] = np.eye(k) / loop.period
+    B = np.vstack([plant.B, box.G / loop.period, np.zeros((k, m))])
+    C = np.hstack([plant.C, np.zeros((len(plant.C), TERMS * k))])
+    sampled = sampled_plant(LinearPlant(A, B, C), loop, np.zeros(m))
+
+    steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
+    steps[:size, :size] = A
+    steps[:n, size:] = box.E
+    drive = np.zeros((size + k, 2 * k))
+    drive[:n, :k] = box.E
+    drive[size:, k:] = np.eye(k) / loop.period
+    _, moved = zero_order_hold(steps, drive, loop.period)
+    held = moved[:size, :k]
+    rising = moved[:size, k:]
+    driven = np.hstack([held, ROOT * (2.0 * rising - held)])
+
+    kept = np.r_[0:n, size : len(sampled.A)]
+    first = np.arange(n, n + k)
+    places = (first, first + k)
+
+    def coefficients(matrix: FloatArray) -> FloatArray:
+        """From the integral of z and the integral of this one to the Legendre coefficients."""
+        once, twice = (matrix[rows] for rows in places)
+        return np.concatenate([once, ROOT * (once - 2.0 * twice)])
+
+    P = sampled.A[np.ix_(kept, kept)]
+    Pu = sampled.B[kept]
+    Q = coefficients(sampled.A)[:, kept]
+    Qu = coefficients(sampled.B)
+    C = sampled.C[:, kept]
+    states = len(law.A)
+    none = np.zeros((states, TERMS * k))
+    W = np.zeros((len(kept), TERMS * k))
+    W[:n] = driven[:n]
+    return UncertainLoop(
+        np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
+        np.vstack([W, none]),
+        np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
+        coefficients(driven),
+        np.vstack([Pu, np.zeros((states, m))]),
+        Qu,
+        np.hstack([law.D @ C, law.C]),
+        loop.period,
+    )
+
+
+class Channels(NamedTuple):
+    """A part of a loop as zeta+ = A zeta + W w, z = Z zeta + D w; the k real channels first."""
+
+    A: FloatArray
+    W: FloatArray
+    Z: FloatArray
+    D: FloatArray
+    entries: tuple[int, ...]  # places of the entries in the box
+    period: float
+
+    @property
+    def real(self) -> int:
+        """Number of real channels, TERMS an entry."""
+        return TERMS * len(self.entries)
+
+    def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
+        """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
+        z = radius * np.exp(1j * np.asarray(w) * self.period)
+        motion = z[..., None, None] * np.eye(len(self.A)) - self.A
+        return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
+
+    def closed(self, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """State matrices of the loops of deviations d, (N, k) of this part, and the matrices left
+        and right of a change of d.
+        """
+        wide = np.tile(d, TERMS)
+        p = self.real
+        inverse = np.linalg.inv(np.eye(p) - self.D[:p, :p] * wide[:, None, :])
+        right = inverse @ self.Z[:p]
+        left = self.W[:, :p] @ np.linalg.inv(np.eye(p) - wide[:, :, None] * self.D[:p, :p])
+        return self.A + (self.W[:, :p] * wide[:, None, :]) @ right, left, right
+
+
+def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels:
+    """All entries of the box as channels, and disks in some inputs, v added to u and u + v / 2:
+    S - I / 2.
+    """
+    chosen = list(inputs)
+    p = loop.W.shape[1]
+    c = len(chosen)
+    below = np.hstack([np.zeros((c, p)), np.eye(c) / 2.0])
+    return Channels(
+        loop.A,
+        np.hstack([loop.W, loop.U[:, chosen]]),
+        np.vstack([loop.Z, loop.K[chosen]]),
+        np.vstack([np.hstack([loop.D, loop.V[:, chosen]]), below]),
+        tuple(range(p // TERMS)),
+        loop.period,
+    )
+
+
+def sensitivity_slopes(
+    loop: UncertainLoop, d: FloatArray, w: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """S, (F, m, m), of the aircraft of deviations d, (k,), at frequencies w, rad/s, and its slopes
+    along d, (F, k, m, m).
+    """
+    A, left, right = every_channel(loop).closed(d[None])
+    wide = np.tile(d, TERMS)
+    through = np.linalg.solve(np.eye(len(wide)) - loop.D * wide, loop.V)
+    U = loop.U + (loop.W * wide) @ through
+    z = np.exp(1j * w * loop.period)
+    k, m = len(d), U.shape[1]
+    motion = z[:, None, None] * np.eye(len(U)) - A[0]
+    X = np.linalg.solve(motion, np.hstack([left[0], U]).astype(complex))
+    into = loop.K @ X[:, :, :-m]  # (F, m, TERMS k)
+    out = right[0] @ X[:, :, -m:] + through  # (F, TERMS k, m)
+    each = np.einsum("Fic,Fcj->Fcij", into, out)
+    S = np.eye(m) + loop.K @ X[:, :, -m:]
+    return np.asarray(S), np.asarray(each.reshape(len(w), TERMS, k, m, m).sum(axis=1))
+
+
+def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels]:
+    """The strongly connected parts of the loop, reduced; with disks in some inputs the parts with
+    those.
+
+    The structured singular value of a block triangular matrix is the largest of the blocks.
+    """
+    from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    every = every_channel(loop, inputs)
+    k = len(every.entries)
+    c = len(inputs)
+    at = np.pi / loop.period * np.array(PATTERN_PARTS)
+    sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
+    wide = sizes > NO_COUPLING * np.sqrt(np.outer(sizes.max(axis=1), sizes.max(axis=0)) + 1e-300)
+    node = np.r_[np.tile(np.arange(k), TERMS), k + np.arange(c)]
+    pattern = np.zeros((k + c, k + c), dtype=bool)
+    np.logical_or.at(pattern, (node[:, None], node[None]), wide)
+    count, label = connected_components(csr_array(pattern), directed=True, connection="strong")
+    parts = []
+    for number in range(count):
+        nodes = np.flatnonzero(label == number)
+        looped = len(nodes) > 1 or pattern[nodes[0], nodes[0]]
+        if looped and (not inputs or nodes[-1] >= k):
+            channels = np.flatnonzero(np.isin(node, nodes))
+            entries = tuple(nodes[nodes < k].tolist())
+            parts.append(_reduced(every, channels)._replace(entries=entries))
+    return parts
+
+
+def _reduced(every: Channels, channels: IntArray) -> Channels:
+    """Some channels without the states that no w of these moves or no z of these shows: kept
+    constants, integrals, the rest of the loop.
+    """
+    A = every.A
+    W = every.W[:, channels]
+    Z = every.Z[channels]
+    coupled = np.abs(A) > NO_COUPLING
+    moved = (np.abs(W) > NO_COUPLING).any(axis=1)
+    shown = (np.abs(Z) > NO_COUPLING).any(axis=0)
+    for _ in range(len(A)):
+        moved |= coupled[:, moved].any(axis=1)
+        shown |= coupled[shown].any(axis=0)
+    both = moved & shown
+    A = A[np.ix_(both, both)]
+    W = W[both]
+    Z = Z[:, both]
+    for _ in range(2):
+        Q = _reached(A, W)
+        turned = (Q.T @ W).T
+        A = (Q.T @ A @ Q).T
+        W = (Z @ Q).T
+        Z = turned
+    return every._replace(A=A, W=W, Z=Z, D=every.D[np.ix_(channels, channels)])
+
+
+def _reached(A: FloatArray, W: FloatArray) -> FloatArray:
+    """An orthonormal basis of the states that W reaches through A."""
+    Q = np.zeros((len(A), 0))
+    added = W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    while added.shape[1]:
+        for _ in range(2):  # twice: rounding
+            added = added - Q @ (Q.T @ added)
+        left, values, _ = np.linalg.svd(added, full_matrices=False)
+        added = left[:, values > NO_DIRECTION]
+        Q = np.hstack([Q, added])
+        added = A @ added
+    return Q

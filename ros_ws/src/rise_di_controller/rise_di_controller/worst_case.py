@@ -1,0 +1,271 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The worst aircraft of a box, by search: the first unstable one, and the least margins.
+
+A search walks over the corners of the box: each entry goes to the side to which the figure falls,
+by its gradient through the loop with the entries pulled out.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import (
+    SPECTRAL_RADIUS_TOLERANCE,
+    LinearLaw,
+    LinearPlant,
+    Loop,
+)
+from rise_di_controller.margins import (
+    NO_MODE,
+    VANISHED,
+    Margins,
+    loop_margins,
+    norm_bound,
+    on_grid,
+    schur_form,
+)
+from rise_di_controller.margins import SLOW as SLOW_TURN
+from rise_di_controller.structured_value import balanced
+from rise_di_controller.uncertain_loop import (
+    Box,
+    Channels,
+    UncertainLoop,
+    aircraft_at,
+    every_channel,
+    sensitivity_slopes,
+    uncertain_loop,
+)
+
+SEED = 1  # of the corners at which a search starts
+STARTS = 24
+ROUNDS = 12
+POLISHED = 4  # corners whose entries are flipped one by one
+RESOLUTION = 1e-4  # of the size of an unstable deviation
+NEAR = 2.5  # factor of a frequency within which a mode counts
+SLOW = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
+
+
+def first_unstable(
+    part: Channels, frequency: float, entries: int, largest: float
+) -> tuple[float, FloatArray] | None:
+    """The least size of an unstable deviation found near a frequency, rad/s, up to `largest`, and
+    the deviation, (entries,); None for none.
+
+    From STARTS corners: up to the size at which a mode near the frequency leaves abs(z) < 1, then
+    to the corner to which abs(z) grows, until the size no longer falls.
+    """
+    rng = np.random.default_rng(SEED)
+    k = len(part.entries)
+    corners = np.where(rng.random((STARTS, k)) < 0.5, -1.0, 1.0)
+    begin = np.sign(_growth(part, np.zeros((1, k)), frequency))
+    corners = np.concatenate([np.where(begin == 0.0, 1.0, begin), corners])
+    tried: dict[tuple[float, ...], float] = {}
+    for _ in range(ROUNDS):
+        sizes = np.array([_limit(part, corner, frequency, largest) for corner in corners])
+        tried.update(zip(map(tuple, corners), sizes, strict=True))
+        at = np.minimum(sizes, largest)[:, None] * corners
+        turned = np.where(_growth(part, at, frequency) < 0.0, -1.0, 1.0)
+        fresh = [corner for corner in set(map(tuple, turned)) if corner not in tried]
+        if not fresh:
+            break
+        corners = np.array(sorted(fresh))
+    ranked = sorted(tried, key=lambda corner: (tried[corner], corner))
+    flipped = [_flipped(part, np.array(c), frequency, largest) for c in ranked[:POLISHED]]
+    best = min(flipped, key=lambda corner: _limit(part, corner, frequency, largest))
+    size = _limit(part, best, frequency, largest)
+    if not np.isfinite(size):
+        return None
+    d = np.zeros(entries)
+    d[list(part.entries)] = size * best
+    return float(size), d
+
+
+def _flipped(part: Channels, corner: FloatArray, frequency: float, largest: float) -> FloatArray:
+    """The corner after flips of one entry each, as long as the loop is the more unstable for it."""
+    for _ in range(ROUNDS):
+        size = min(_limit(part, corner, frequency, largest), largest)
+        k = len(corner)
+        trial = np.where(np.eye(k, dtype=bool), -corner, corner)
+        both = np.concatenate([corner[None], trial])
+        radii = _near(np.linalg.eigvals(part.closed(size * both)[0]), frequency, part.period)
+        radius = radii.max(axis=-1)
+        if np.argmax(radius) == 0:
+            break
+        corner = both[int(np.argmax(radius))]
+    return corner
+
+
+def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
+    """abs(z) of the modes near a frequency, 0 of the others."""
+    w = np.abs(np.angle(z)) / period
+    near = w < SLOW if frequency < SLOW else (w > frequency / NEAR) & (w < frequency * NEAR)
+    return np.asarray(np.where(near, np.abs(z), 0.0))
+
+
+def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
+    """The size along a corner at which a mode near a frequency leaves; infinite for none."""
+
+    def unstable(size: FloatArray) -> NDArray[np.bool_]:
+        z = np.linalg.eigvals(part.closed(size[:, None] * corner)[0])
+        largest_near = _near(z, frequency, part.period).max(axis=-1)
+        return np.asarray(largest_near > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
+
+    sizes = np.linspace(0.0, largest, 9)[1:]
+    outside = unstable(sizes)
+    if not outside.any():
+        return np.inf
+    high = sizes[int(np.argmax(outside))]
+    low = high - sizes[0]
+    while high - low > RESOLUTION / 2.0:
+        inner = np.linspace(low, high, 6)[1:-1]
+        outside = unstable(inner)
+        place = int(np.argmax(outside)) if outside.any() else len(inner)
+        steps = np.r_[low, inner, high]
+        low = steps[place]
+        high = steps[place + 1]
+    return float(high)
+
+
+def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
+    """Slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k), at some deviations."""
+    A, left, right = part.closed(d)
+    z, X = np.linalg.eig(A)
+    Y = np.linalg.inv(X)
+    rows = np.arange(len(d))
+    worst = np.argmax(_near(z, frequency, part.period), axis=-1)
+    into = Y[rows, worst][:, None, :] @ left
+    out = right @ X[rows, :, worst][:, :, None]
+    change = into[:, 0] * out[:, :, 0] / z[rows, worst][:, None]
+    return np.asarray(change.real.reshape(len(d), -1, len(part.entries)).sum(axis=1))
+
+
+# The least margins of a box
+
+BEGUN = 8  # corners drawn at the begin, beside those of the slopes at the nominal aircraft
+WALKED = 5  # rounds of the walk over the corners
+
+
+class WorstCase(NamedTuple):
+    """The least margins found in a box, each figure by itself."""
+
+    worst: Margins
+    corners: FloatArray  # (N, k) deviations of all aircraft that were tried
+    margins: Margins  # of these
+    least_phase: FloatArray  # (k,) deviations with the smallest phase margin
+
+
+def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> WorstCase:
+    """The least margins over the corners of a box around a plant, A (n, n), by search.
+
+    Each figure goes from the corner at which it is least to the corner to which its slope points,
+    until no figure moves. The values are those of `loop_margins`.
+    """
+    rng = np.random.default_rng(SEED)
+    k = len(box.names)
+    whole = uncertain_loop(plant, law, loop, box)
+    drawn = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
+    slopes = _slopes(plant, law, loop, box, whole, np.zeros(k))
+    corners = np.unique(np.concatenate([_corners(slopes), drawn]), axis=0)
+    margins = loop_margins(aircraft_at(plant, box, corners), law, loop)
+    walked: set[tuple[int, int]] = set()
+    for _ in range(WALKED):
+        least = np.argmin(_figures(margins), axis=0).tolist()
+        steps = [pair for pair in enumerate(least) if pair not in walked]
+        walked.update(steps)
+        added = []
+        for place in sorted({place for _, place in steps}):
+            if margins.stable[place]:
+                slopes = _slopes(plant, law, loop, box, whole, corners[place])
+                added += [_corners(slopes[f]) for f, at in steps if at == place]
+        fresh = [c for c in map(tuple, added) if not (corners == c).all(axis=1).any()]
+        if not fresh:
+            break
+        fresh_corners = np.unique(fresh, axis=0)
+        further = loop_margins(aircraft_at(plant, box, fresh_corners), law, loop)
+        corners = np.concatenate([corners, fresh_corners])
+        margins = Margins(*(np.concatenate(pair) for pair in zip(margins, further, strict=True)))
+    smallest = int(np.argmin(margins.phase.min(axis=1)))
+    return WorstCase(margins.worst(), corners, margins, corners[smallest])
+
+
+def _corners(slopes: FloatArray) -> FloatArray:
+    """The corners to which figures of these slopes fall."""
+    return np.asarray(np.where(slopes > 0.0, -1.0, 1.0))
+
+
+def _figures(margins: Margins) -> FloatArray:
+    """The figures of N aircraft, (N, 4 m + 3): the less the worse, in the order of `_slopes`."""
+    whole = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
+    return np.concatenate(
+        [margins.phase, margins.gain, 1.0 / margins.sensitivity, margins.disk, np.stack(whole, 1)],
+        axis=1,
+    )
+
+
+def _slopes(
+    plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, whole: UncertainLoop, d: FloatArray
+) -> FloatArray:
+    """The slopes of `_figures` along the deviations at d, (4 m + 3, k), each up to a factor.
+
+    With a = d log L / d d_i and b = d log L / d w the phase changes by Im a - Im b Re a / Re b at
+    abs(L) = 1, the log of the gain by Re a - Re b Im a / Im b at real L; a peak of abs(S - c) by
+    its slope at constant frequency.
+    """
+    at = aircraft_at(plant, box, d[None])
+    form = schur_form(at, law, loop)
+    w, S = (values[0] for values in on_grid(form, loop.period))
+    m = S.shape[-1]
+    diagonal = np.einsum("Fii->Fi", S)
+    log_loop = np.log(1.0 / diagonal - 1.0)
+    off = np.abs(np.angle(-np.exp(log_loop)))
+    peaks = [
+        np.argmin(np.abs(log_loop.real) + 0.1 * off, axis=0),
+        np.argmin(off + 0.3 * np.abs(log_loop.real), axis=0),
+        np.argmax(np.abs(diagonal), axis=0),
+        np.argmax(np.abs(diagonal - 0.5), axis=0),
+    ]
+    half = S - np.eye(m) / 2.0
+    places = np.concatenate([*peaks, [int(np.argmax(norm_bound(matrix))) for matrix in (S, half)]])
+    at_places, change = sensitivity_slopes(whole, d, w[places])  # (4 m + 2, k, m, m)
+    rows = np.tile(np.arange(m), 4)
+    own = change[np.arange(4 * m), :, rows, rows]
+    x = diagonal[places[: 4 * m], rows][:, None]
+    a = -own / (x * (1.0 - x))
+    with np.errstate(divide="ignore", invalid="ignore"):  # frequencies may come twice
+        b = np.gradient(log_loop, w, axis=0)[places[: 4 * m], rows][:, None]
+        phase = a.imag - b.imag * a.real / b.real
+        gain = a.real - b.real * a.imag / b.imag
+    side = np.sign(np.angle(-np.exp(log_loop[places[: 4 * m], rows])))[:, None]
+    direction = -np.sign(log_loop.real[places[: 4 * m], rows])[:, None]
+    peak = -(own * np.conj(x - np.repeat([0.0, 0.0, 0.0, 0.5], m)[:, None])).real
+    kinds = np.repeat([0, 1, 2, 2], m)[:, None]
+    each = np.where(kinds == 0, side * phase, np.where(kinds == 1, -direction * gain, peak))
+    together = []
+    for centre, matrix, part in zip((0.0, 0.5), at_places[4 * m :], change[4 * m :], strict=True):
+        t = np.exp(balanced(matrix))[:, None]
+        left, _, right = np.linalg.svd(t * (matrix - centre * np.eye(m)) / t.T)
+        turned = t * part / t.T
+        together.append(-np.einsum("i,kij,j->k", left[:, 0].conj(), turned, right[0].conj()).real)
+    return np.nan_to_num(np.concatenate([each, together, [_damping_slope(whole, d)]]))
+
+
+def _damping_slope(whole: UncertainLoop, d: FloatArray) -> FloatArray:
+    """The slope of the least damping of a slow mode along the deviations at d, (k,), up to a
+    factor: zeta = -cos(angle(log z)).
+    """
+    every = every_channel(whole)
+    A, left, right = every.closed(d[None])
+    z, X = np.linalg.eig(A[0])
+    turn = np.log(np.where(np.abs(z) > VANISHED, z, VANISHED).astype(complex))
+    slow = (turn.imag > NO_MODE) & (np.abs(turn) < SLOW_TURN)
+    if not slow.any():
+        return np.zeros(len(d))
+    damping = np.where(slow, -turn.real / np.maximum(np.abs(turn), NO_MODE), np.inf)
+    mode = int(np.argmin(damping))
+    into = np.linalg.solve(X.T, np.eye(len(z))[mode]) @ left[0]
+    change = into * (right[0] @ X[:, mode]) / z[mode]  # of log z, by channel
+    angle = (change / turn[mode]).imag.reshape(-1, len(d)).sum(axis=0)
+    return np.asarray(np.sin(np.angle(turn[mode])) * angle)
