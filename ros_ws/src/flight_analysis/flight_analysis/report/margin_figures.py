@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from flight_analysis.closed_loop.guarantee import Guarantee
 from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
 from flight_analysis.report import comparison
 from flight_analysis.report.plotting import Figure, add_line, set_layout
@@ -193,6 +194,50 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
         by_input[name] = {key: float(getattr(margins, key)[i]) for key in each}
     together = {"disk": float(margins.disk_all), "sensitivity": float(margins.sensitivity_all)}
     return {"inputs": by_input, "all": together, "damping": float(margins.damping)}
+
+
+def guarantee_text(promise: Guarantee) -> list[str]:
+    """A guarantee in sentences."""
+    stable = math.floor(1e3 * promise.stable) / 10.0
+    where = f"limit of the bound at {promise.frequency:.2g} rad/s"
+    lines = [f"guarantee: stable for every aircraft within {stable:.1f} % ({where})"]
+    if promise.unstable is None:
+        lines.append("no unstable aircraft found within 99 %")
+    else:
+        first = promise.unstable
+        deviation = math.ceil(1e3 * first.deviation) / 10.0
+        lines.append(
+            f"the first unstable aircraft found: at {deviation:.1f} % ({first.frequency:.2g} rad/s)"
+        )
+    if not promise.holds:
+        asked = 100.0 * promise.uncertainty
+        lines.append(
+            f"an aircraft within {asked:g} % may be unstable: no disk margin is guaranteed"
+        )
+    return lines
+
+
+def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
+    """Input, guaranteed disk margin, and the least disk margin found, ALL_INPUTS last."""
+    worst = margins.worst
+    found = [math.nan] * (len(promise.inputs) + 1)
+    if worst is not None:
+        found = [*worst.disk.tolist(), float(worst.disk_all)]
+    disks = [*promise.disk.tolist(), promise.disk_all]
+    return list(zip((*promise.inputs, ALL_INPUTS), disks, found, strict=True))
+
+
+def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
+    """A guarantee: deviations as parts of an entry, frequencies in rad/s."""
+    return {
+        "uncertainty": promise.uncertainty,
+        "holds": promise.holds,
+        "stable": promise.stable,
+        "frequency": promise.frequency,
+        "unstable": None if promise.unstable is None else promise.unstable._asdict(),
+        "disk": dict(zip(promise.inputs, promise.disk.tolist(), strict=True)),
+        "disk_all": promise.disk_all,
+    }
 
 
 # Bode and Nyquist plots

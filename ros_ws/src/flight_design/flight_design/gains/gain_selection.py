@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.loop_margins import (
+    LinearLoop,
     LoopMargins,
     box_of,
     is_literal,
@@ -136,6 +137,10 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         """
         return () if self.margins is None else self.margins.channel_delay
 
+    def loop_with_box(self) -> LinearLoop:
+        """The linear loop with the box of the study. Raises ParameterError for the literal sign."""
+        return loop_with_box(self.study, self.controller)
+
     @property
     def has_requirement(self) -> bool:
         """Whether margins are asked of the loop: not of an ideal loop with the implicit or the
@@ -156,6 +161,14 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def failing(self) -> tuple[Condition, ...]:
         """Every condition that does not hold."""
         return gain_conditions.failing((*self.theorem, *self.loop))
+
+
+def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
+    """The linear loop of a controller around the aircraft of a study, with the box of these."""
+    loop = linear_loop(controller, study.airframe, study.A, study.B)
+    if study.uncertainty == 0.0:
+        return loop
+    return loop._replace(box=box_of(study.airframe, controller, study.uncertainty))
 
 
 @dataclass(frozen=True)
@@ -458,9 +471,7 @@ def assess_gains(
         theorem, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
         return GainAssessment(controller, theorem, loop_conditions, bounds, None, study)
-    loop = linear_loop(controller, study.airframe, study.A, study.B)
-    if study.uncertainty > 0.0:
-        loop = loop._replace(box=box_of(study.airframe, controller, study.uncertainty))
+    loop = loop_with_box(study, controller)
     margins = loop_assessment(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     loop_conditions += (Condition("linear stability", None, stable, 1.0),)

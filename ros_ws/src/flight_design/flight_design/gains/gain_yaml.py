@@ -222,7 +222,8 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
     worst = (
         ""
         if margins.worst is None
-        else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
+        else f"; worst {'found' if margins.by_search else f'of {margins.aircraft}'} "
+        f"{np.degrees(margins.worst.phase.min()):.0f} deg"
     )
     return (
         f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping "

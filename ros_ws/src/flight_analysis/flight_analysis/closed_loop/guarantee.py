@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What holds for every aircraft of a box: up to which deviation the loop is stable, and which disk
+margins remain.
+
+The deviations are constant in time and the loop is linear: no saturation, no rate limit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.loop_margins import LinearLoop
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import closed_loop, is_stable
+from rise_di_controller.structured_value import cover
+from rise_di_controller.uncertain_loop import UncertainLoop, aircraft_at, parts_of, uncertain_loop
+from rise_di_controller.worst_case import first_unstable
+
+LARGEST = 0.99  # part of an entry up to which an unstable aircraft is sought
+LEAST_LEVEL = 0.1  # of the bound: a loop stable beyond ten times the box counts as stable to there
+WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg
+EXACT = 1.002  # factor on the deviations of an unstable aircraft until the exact loop confirms it
+CONFIRMED = 10  # such factors that are tried
+
+
+class Unstable(NamedTuple):
+    """An unstable aircraft."""
+
+    deviation: float  # largest relative deviation of an entry
+    frequency: float  # rad/s
+    entries: dict[str, float]  # relative deviation by entry
+
+
+class Guarantee(NamedTuple):
+    """What holds for every aircraft of a box; `stable` and `unstable` as parts of each entry."""
+
+    uncertainty: float  # largest relative deviation in the box
+    stable: float  # every aircraft within this deviation is stable, at most 1
+    frequency: float  # rad/s, of the limit
+    unstable: Unstable | None  # the first one found; None up to LARGEST
+    inputs: tuple[str, ...]
+    disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
+    disk_all: float  # with independent disks in all inputs at once
+
+    @property
+    def holds(self) -> bool:
+        """Whether every aircraft of the box is stable."""
+        return self.stable >= self.uncertainty
+
+
+def guarantee(linear: LinearLoop) -> Guarantee:
+    """The guarantee for the box of a loop. Raises ParameterError for a loop without a box."""
+    box = linear.box
+    require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
+    assert box is not None  # noqa: S101 - for mypy
+    largest = float(np.max(box.part))
+    m = len(linear.inputs)
+    none = Guarantee(largest, 0.0, 0.0, None, linear.inputs, np.zeros(m), 0.0)
+    if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
+        return none
+    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box)
+    stable = np.inf
+    frequency = 0.0
+    unstable = None
+    for part in parts_of(whole):
+        covered = cover(part, LEAST_LEVEL)
+        if 1.0 / covered.level < stable:
+            stable = 1.0 / covered.level
+            frequency = covered.peak
+        reached = first_unstable(part, covered.peak, len(box.names), LARGEST / largest)
+        if reached is not None:
+            confirmed = _confirmed(linear, reached[1])
+            if confirmed is not None and (
+                unstable is None or confirmed.deviation < unstable.deviation
+            ):
+                unstable = confirmed
+    found = none._replace(
+        stable=min(float(stable) * largest, 1.0), frequency=frequency, unstable=unstable
+    )
+    if not found.holds:
+        return found
+    each = [_disk(whole, (i,)) for i in range(m)]
+    return found._replace(disk=np.array(each), disk_all=_disk(whole, tuple(range(m))))
+
+
+def _disk(whole: UncertainLoop, inputs: tuple[int, ...]) -> float:
+    """The disk margin of every aircraft of the box, the least of the parts with some inputs."""
+    levels = [cover(part, 1.0 / WIDEST_DISK, disks=True).level for part in parts_of(whole, inputs)]
+    return 1.0 / max(levels, default=1.0 / WIDEST_DISK)
+
+
+def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
+    """The aircraft of deviations d, a little larger where the exact loop asks for it."""
+    box = linear.box
+    assert box is not None  # noqa: S101 - for mypy
+    still = np.zeros(len(linear.inputs))
+    for _ in range(CONFIRMED):
+        aircraft = aircraft_at(linear.nominal, box, d)
+        if not is_stable(aircraft, linear.law, linear.loop, still):
+            matrix = closed_loop(aircraft, linear.law, linear.loop, still)
+            z = np.linalg.eigvals(matrix)
+            turn = abs(np.angle(z[int(np.argmax(np.abs(z)))]))
+            parts = d * box.part
+            entries = {
+                name: float(part) for name, part in zip(box.names, parts, strict=True) if part
+            }
+            return Unstable(float(np.abs(parts).max()), turn / linear.loop.period, entries)
+        d = EXACT * d
+    return None
