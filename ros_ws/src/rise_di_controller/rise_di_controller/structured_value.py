@@ -23,7 +23,7 @@ RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) of the limit of stability
 
 # of the search for D and G
 BALANCE_ROUNDS = 6
-LARGEST_G = 1e4
+LARGEST_G = 1e3
 LEVELS = 40
 CENTRING = 6
 LENGTHS = tuple(0.6**k for k in range(20))  # of Newton's step
@@ -32,7 +32,7 @@ FALL = 0.3  # of the way from the level to the bound that is left
 STALLED = 1e-3  # part of the bound by which the level is above it at the end
 
 ROOM = 1.002  # factor of the level above a bound that did not hold
-NARROWEST = 1e-7  # part of pi / T: shorter intervals count as points
+NARROWEST = 1e-8  # part of pi / T: less than LARGEST_G leaves around a frequency of a real M
 MAX_RAISES = 400
 MAX_LEVEL = 1e3  # 1 / level beyond it: none
 NEIGHBOURS = 2
@@ -225,11 +225,14 @@ def cover(part: Channels, start: float, *, disks: bool = False) -> Cover:
 
 
 def _modes(part: Channels) -> list[float]:
-    """0 and the frequencies of the modes, rad/s: peaks are near."""
-    z = np.linalg.eigvals(part.A)
+    """The ends, 0 and pi / T, where M is real and no interval of a neighbour holds, and the
+    frequencies of the modes, rad/s: peaks are near.
+    """
+    z = np.linalg.eigvals(part.A).astype(complex)
     z = z[np.abs(z) > LEAST_MODE]
     w = np.abs(np.log(z)) / part.period
-    return [0.0, *np.unique(np.round(w[w < np.pi / part.period], 3)).tolist()]
+    highest = np.pi / part.period
+    return [0.0, highest, *np.unique(np.round(w[w < highest], 3)).tolist()]
 
 
 class _Search:

@@ -32,6 +32,7 @@ from rise_di_controller.structured_value import balanced
 from rise_di_controller.uncertain_loop import (
     Box,
     Channels,
+    ComplexArray,
     UncertainLoop,
     aircraft_at,
     every_channel,
@@ -45,6 +46,7 @@ ROUNDS = 12
 POLISHED = 4  # corners whose entries are flipped one by one
 RESOLUTION = 1e-4  # of the size of an unstable deviation
 NEAR = 2.5  # factor of a frequency within which a mode counts
+FIXED = 5e-7  # abs(z - 1) of an eigenvalue 1 of every aircraft: an angle that integrates y
 SLOW = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
 
 
@@ -102,7 +104,7 @@ def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
     """abs(z) of the modes near a frequency, 0 of the others."""
     w = np.abs(np.angle(z)) / period
     near = w < SLOW if frequency < SLOW else (w > frequency / NEAR) & (w < frequency * NEAR)
-    return np.asarray(np.where(near, np.abs(z), 0.0))
+    return np.asarray(np.where(near & (np.abs(z - 1.0) > FIXED), np.abs(z), 0.0))
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
@@ -145,7 +147,8 @@ def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
 # The least margins of a box
 
 BEGUN = 8  # corners drawn at the begin, beside those of the slopes at the nominal aircraft
-WALKED = 5  # rounds of the walk over the corners
+FOLLOWED = 2  # corners at which a figure is least, from which the walk goes on
+WALKED = 6  # rounds of the walk over the corners
 
 
 class WorstCase(NamedTuple):
@@ -172,8 +175,9 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
     margins = loop_margins(aircraft_at(plant, box, corners), law, loop)
     walked: set[tuple[int, int]] = set()
     for _ in range(WALKED):
-        least = np.argmin(_figures(margins), axis=0).tolist()
-        steps = [pair for pair in enumerate(least) if pair not in walked]
+        least = np.argsort(_figures(margins), axis=0)[:FOLLOWED]
+        steps = [(f, at) for row in least.tolist() for f, at in enumerate(row)]
+        steps = [pair for pair in steps if pair not in walked]
         walked.update(steps)
         added = []
         for place in sorted({place for _, place in steps}):
@@ -219,37 +223,58 @@ def _slopes(
     w, S = (values[0] for values in on_grid(form, loop.period))
     m = S.shape[-1]
     diagonal = np.einsum("Fii->Fi", S)
-    log_loop = np.log(1.0 / diagonal - 1.0)
-    off = np.abs(np.angle(-np.exp(log_loop)))
-    peaks = [
-        np.argmin(np.abs(log_loop.real) + 0.1 * off, axis=0),
-        np.argmin(off + 0.3 * np.abs(log_loop.real), axis=0),
-        np.argmax(np.abs(diagonal), axis=0),
-        np.argmax(np.abs(diagonal - 0.5), axis=0),
-    ]
+    L = 1.0 / diagonal - 1.0
+    log_gain = np.log(np.abs(L))
+    off = np.abs(np.angle(-L))
     half = S - np.eye(m) / 2.0
-    places = np.concatenate([*peaks, [int(np.argmax(norm_bound(matrix))) for matrix in (S, half)]])
-    at_places, change = sensitivity_slopes(whole, d, w[places])  # (4 m + 2, k, m, m)
+    phase_at, phase_rate = _crossed(w, L, log_gain, off[:-1])
+    gain_at, gain_rate = _crossed(
+        w, L, L.imag, np.where(L.real < 0.0, np.abs(log_gain), np.inf)[:-1]
+    )
+    peaks = [np.argmax(np.abs(matrix), axis=0) for matrix in (diagonal, diagonal - 0.5)]
+    peaks += [[int(np.argmax(norm_bound(matrix)))] for matrix in (S, half)]
+    frequencies = np.concatenate([phase_at, gain_at, w[np.concatenate(peaks)]])
+    S_at, change = sensitivity_slopes(whole, d, frequencies)  # (4 m + 2, m, m), (.., k, m, m)
     rows = np.tile(np.arange(m), 4)
     own = change[np.arange(4 * m), :, rows, rows]
-    x = diagonal[places[: 4 * m], rows][:, None]
+    x = S_at[np.arange(4 * m), rows, rows][:, None]
     a = -own / (x * (1.0 - x))
-    with np.errstate(divide="ignore", invalid="ignore"):  # frequencies may come twice
-        b = np.gradient(log_loop, w, axis=0)[places[: 4 * m], rows][:, None]
+    b = np.concatenate([phase_rate, gain_rate, np.ones(2 * m)])[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # b of a loop without a crossing
         phase = a.imag - b.imag * a.real / b.real
         gain = a.real - b.real * a.imag / b.imag
-    side = np.sign(np.angle(-np.exp(log_loop[places[: 4 * m], rows])))[:, None]
-    direction = -np.sign(log_loop.real[places[: 4 * m], rows])[:, None]
+    loop_at = 1.0 / x - 1.0
     peak = -(own * np.conj(x - np.repeat([0.0, 0.0, 0.0, 0.5], m)[:, None])).real
     kinds = np.repeat([0, 1, 2, 2], m)[:, None]
-    each = np.where(kinds == 0, side * phase, np.where(kinds == 1, -direction * gain, peak))
+    falling = np.sign(np.log(np.abs(loop_at))) * gain
+    each = np.where(
+        kinds == 0, np.sign(np.angle(-loop_at)) * phase, np.where(kinds == 1, falling, peak)
+    )
     together = []
-    for centre, matrix, part in zip((0.0, 0.5), at_places[4 * m :], change[4 * m :], strict=True):
+    for centre, matrix, part in zip((0.0, 0.5), S_at[4 * m :], change[4 * m :], strict=True):
         t = np.exp(balanced(matrix))[:, None]
         left, _, right = np.linalg.svd(t * (matrix - centre * np.eye(m)) / t.T)
         turned = t * part / t.T
         together.append(-np.einsum("i,kij,j->k", left[:, 0].conj(), turned, right[0].conj()).real)
     return np.nan_to_num(np.concatenate([each, together, [_damping_slope(whole, d)]]))
+
+
+def _crossed(
+    w: FloatArray, L: ComplexArray, values: FloatArray, distance: FloatArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Frequencies of the nearest zero of `values`, (F, m), by input, and d log L / d w there, (m,);
+    the lowest frequency without a zero.
+    """
+    columns = np.arange(values.shape[1])
+    crosses = np.signbit(values[:-1]) != np.signbit(values[1:])
+    wide = np.diff(w)[:, None] > 0.0
+    place = np.argmin(np.where(crosses & wide, distance, np.inf), axis=0)
+    before = values[place, columns]
+    after = values[place + 1, columns]
+    step = w[place + 1] - w[place]
+    share = np.clip(before / np.where(before == after, 1.0, before - after), 0.0, 1.0)
+    rate = np.log(L[place + 1, columns] / L[place, columns]) / np.maximum(step, 1e-12)
+    return w[place] + share * step, rate
 
 
 def _damping_slope(whole: UncertainLoop, d: FloatArray) -> FloatArray:

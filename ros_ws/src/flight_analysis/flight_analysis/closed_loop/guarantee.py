@@ -63,19 +63,17 @@ def guarantee(linear: LinearLoop) -> Guarantee:
     whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box)
     stable = np.inf
     frequency = 0.0
-    unstable = None
+    unstable: Unstable | None = None
     for part in parts_of(whole):
         covered = cover(part, LEAST_LEVEL)
         if 1.0 / covered.level < stable:
             stable = 1.0 / covered.level
             frequency = covered.peak
-        reached = first_unstable(part, covered.peak, len(box.names), LARGEST / largest)
-        if reached is not None:
-            confirmed = _confirmed(linear, reached[1])
-            if confirmed is not None and (
-                unstable is None or confirmed.deviation < unstable.deviation
-            ):
-                unstable = confirmed
+        for w in (covered.peak, 0.0):  # a slow divergence hides beside a peak
+            reached = first_unstable(part, w, len(box.names), LARGEST / largest)
+            confirmed = None if reached is None else _confirmed(linear, reached[1])
+            candidates = [each for each in (unstable, confirmed) if each is not None]
+            unstable = min(candidates, key=lambda each: each.deviation, default=None)
     found = none._replace(
         stable=min(float(stable) * largest, 1.0), frequency=frequency, unstable=unstable
     )
