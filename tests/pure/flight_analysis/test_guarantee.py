@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 """The guarantee for every aircraft of a box: closed forms, corners, and SLICOT as an independent
-program where somebody installed it.
+program where installed.
 """
 
 import itertools
@@ -122,7 +122,7 @@ def test_every_scaling_is_above_corners_of_small_matrices() -> None:
 
 
 def test_bound_is_that_of_slicot() -> None:
-    slycot = pytest.importorskip("slycot", reason="GPL: an oracle where somebody installed it")
+    slycot = pytest.importorskip("slycot", reason="GPL: an oracle where installed")
     rng = np.random.default_rng(7)
     for _ in range(5):
         M = rng.standard_normal((6, 6)) + 1j * rng.standard_normal((6, 6))

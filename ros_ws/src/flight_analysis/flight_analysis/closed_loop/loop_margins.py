@@ -33,6 +33,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.uncertain_loop import Box, aircraft_at
 from rise_di_controller.worst_case import worst_in_box
 
+BARE = (
+    "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
+)
+
 
 class LinearLoop(NamedTuple):
     """The loop of a controller around a model of its aircraft; channels in the law's order."""
@@ -219,7 +223,7 @@ def linear_loop(
     vane_rows = [(states == name).astype(np.float64) for name in controller.vanes]
     C = np.vstack([airframe.matrix_c()[rows], *vane_rows])
     plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
-    model = f"model: {airframe.name}"
+    model = f"model: {airframe.name}{'' if A.any() else BARE}"
     return LinearLoop(
         model,
         controller.inputs,
