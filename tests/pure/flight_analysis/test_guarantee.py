@@ -5,14 +5,18 @@ program where installed.
 """
 
 import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.guarantee import guarantee
-from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, scenario_loop
+from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
@@ -192,3 +196,15 @@ def test_search_over_two_entries_is_brute_force() -> None:
     brute = loop_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
     assert search.worst.phase == pytest.approx(brute.phase, rel=1e-6)
     assert search.worst.disk == pytest.approx(brute.disk, rel=1e-3)
+
+
+def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:
+    folder = tmp_path / "first"
+    arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75", "--json"]
+    arguments += ["--set", f"worst={folder}", "--set", "samples=1"]
+    result = CliRunner().invoke(application(["gains"]), arguments)
+    assert result.exit_code == 1, result.output
+    promise = json.loads(result.stdout)["guarantee"]
+    assert not promise["holds"]
+    assert promise["stable"] < 0.75 > promise["unstable"]["deviation"]
+    assert not margins(find_scenario(str(folder / "scenario.yaml"))).nominal.stable

@@ -361,7 +361,8 @@ def _show_guarantee(console: Console, promise: Guarantee | None, answer: Assessm
     title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
     table = new_table(title, heads, left_aligned=("input",))
     for name, disk, least in guarantee_rows(promise, margins):
-        values = (np.degrees(disk_phase(disk)), decibels(disk_gain(disk)), least)
+        size = np.array(disk)
+        values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
         table.add_row(
             name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
         )

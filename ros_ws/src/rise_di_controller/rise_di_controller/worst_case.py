@@ -256,7 +256,8 @@ def _slopes(
         left, _, right = np.linalg.svd(t * (matrix - centre * np.eye(m)) / t.T)
         turned = t * part / t.T
         together.append(-np.einsum("i,kij,j->k", left[:, 0].conj(), turned, right[0].conj()).real)
-    return np.nan_to_num(np.concatenate([each, together, [_damping_slope(whole, d)]]))
+    slopes = np.concatenate([each, together, [_damping_slope(whole, d)]])
+    return np.asarray(np.nan_to_num(slopes))
 
 
 def _crossed(
@@ -274,7 +275,7 @@ def _crossed(
     step = w[place + 1] - w[place]
     share = np.clip(before / np.where(before == after, 1.0, before - after), 0.0, 1.0)
     rate = np.log(L[place + 1, columns] / L[place, columns]) / np.maximum(step, 1e-12)
-    return w[place] + share * step, rate
+    return np.asarray(w[place] + share * step), np.asarray(rate)
 
 
 def _damping_slope(whole: UncertainLoop, d: FloatArray) -> FloatArray:
