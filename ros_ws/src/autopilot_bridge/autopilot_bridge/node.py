@@ -86,17 +86,6 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 "false: an autopilot on MAVLink ticks by its own clock",
             )
             require(self._map.link is None, key, "true", cause)
-        named: list[NamedRow] = [
-            *self._map.outputs.items(),
-            *self._map.pose.items(),
-            *self._map.sensors.items(),
-            *((trim_key(name), row) for name, row in self._map.trims.items()),
-            *self._map.conditions.items(),
-            *self._map.overrides.items(),
-        ]
-        rows_by_topic: dict[str, list[NamedRow]] = {}
-        for name, row in named:
-            rows_by_topic.setdefault(row.topic, []).append((name, row))
         self._link = (
             None
             if self._map.link is None
@@ -110,14 +99,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._recorded: dict[
             str, tuple[Callable[[bytes], None], Encoder]
         ] = {}  # what comes over MAVLink, as named vectors
-        self._readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
-        for topic, rows in rows_by_topic.items():
-            kind = _message_type(rows[0][1].type)
-            for name, row in rows:
-                _require_field(kind(), name, row)
-            if fault := version_fault(topic, kind):
-                self.get_logger().warning(fault)
-            self._readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
+        self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
         self._u = self.receive(
@@ -158,6 +140,29 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 else f"disengaged, waiting for {self.get_name()}/engage"
             )
         )
+
+    def _read_topics(self) -> list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]]:
+        """Subscribe to the topics of the map. Returns each with its rows."""
+        named: list[NamedRow] = [
+            *self._map.outputs.items(),
+            *self._map.pose.items(),
+            *self._map.sensors.items(),
+            *((trim_key(name), row) for name, row in self._map.trims.items()),
+            *self._map.conditions.items(),
+            *self._map.overrides.items(),
+        ]
+        rows_by_topic: dict[str, list[NamedRow]] = {}
+        for name, row in named:
+            rows_by_topic.setdefault(row.topic, []).append((name, row))
+        readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
+        for topic, rows in rows_by_topic.items():
+            kind = _message_type(rows[0][1].type)
+            for name, row in rows:
+                _require_field(kind(), name, row)
+            if fault := version_fault(topic, kind):
+                self.get_logger().warning(fault)
+            readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
+        return readers
 
     def _reader(self, topic: Topic) -> PolledSubscription | MavlinkReader:
         if self._link is None or not topic.name.startswith(f"{MAVLINK}/"):
