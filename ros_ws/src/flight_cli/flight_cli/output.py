@@ -47,8 +47,7 @@ from flight_analysis.report.summary import (
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
-# exit statuses; bad input is 2 (`flight_cli.cli`)
-ENDED_EARLY = 3
+# exit status; bad input is 2 (`flight_cli.cli`)
 INTERRUPTED = 130
 # of a written file
 LICENCE = (
