@@ -25,6 +25,7 @@ from aircraft_sim.jsbsim_aircraft import (
     require_aircraft,
     root,
 )
+from aircraft_sim.jsbsim_commands import hysteresis_of
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import trim_solution
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -92,6 +93,18 @@ def external(tmp_path: Path) -> Path:
     path = tmp_path / "own.xml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def test_hysteresis_of_a_model_is_named(external: Path) -> None:
+    assert hysteresis_of(external) == ""
+    servo = (
+        '<actuator name="servo"><input>own/elevator</input>'
+        "<hysteresis_width>0.02</hysteresis_width></actuator>"
+    )
+    text = external.read_text(encoding="utf-8")
+    marked = text.replace('<channel name="Pitch">', f'<channel name="Pitch">{servo}', 1)
+    external.write_text(marked, encoding="utf-8")
+    assert hysteresis_of(external).startswith("; servo of the model have a hysteresis_width")
 
 
 def test_command_without_effect_is_named_with_what_the_model_reads(external: Path) -> None:

@@ -149,6 +149,25 @@ def sentence_without_effect(
     return f"{', '.join(parts)} moves no acceleration{reads}"
 
 
+def hysteresis_of(model: Path | None) -> str:
+    """The end of a sentence on a trim that fails: the components of a model that hold their output
+    while a command moves little, so that no small step has an effect; empty without any.
+    """
+    members = {} if model is None else model_files(model).members
+    names = [
+        element.get("name", "?")
+        for content in members.values()
+        for element in ElementTree.fromstring(content).iter()  # noqa: S314 - model_files has read it
+        if element.find("hysteresis_width") is not None
+    ]
+    return (
+        f"; {', '.join(names)} of the model have a hysteresis_width, in which no small command has an effect: "
+        "remove it"
+        if names
+        else ""
+    )
+
+
 def _read_by_model(model: Path) -> list[str]:
     """The properties that the control systems of a model read or declare, and no component
     writes.

@@ -27,6 +27,7 @@ from aircraft_sim.jsbsim_commands import (
     command_paths,
     commands_and_limits,
     engine_count,
+    hysteresis_of,
     residuals,
     sentence_without_effect,
     set_command,
@@ -299,7 +300,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
         problem = error_text(error)
     raise FlightEnded(
         f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} "
-        f"m: {problem}"
+        f"m: {problem}{hysteresis_of(foreign_model(condition.name))}"
     )
 
 
