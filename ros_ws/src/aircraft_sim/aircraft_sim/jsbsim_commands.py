@@ -161,8 +161,8 @@ def hysteresis_of(model: Path | None) -> str:
         if element.find("hysteresis_width") is not None
     ]
     return (
-        f"; {', '.join(names)} of the model have a hysteresis_width, in which no small command has an effect: "
-        "remove it"
+        f"; {', '.join(names)} of the model have a hysteresis_width, in which no small command "
+        "has an effect: remove it"
         if names
         else ""
     )
