@@ -22,7 +22,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
     is_ready=lambda *_: False,
     is_matched=lambda *_: False,
     has_time=lambda: True,
-    speed=lambda: 1.0,
+    ahead=lambda lead: lead,
     clock=time,
     clock_ended=lambda: "",
 )  # in place of a FlightMonitor

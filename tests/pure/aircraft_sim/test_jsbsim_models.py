@@ -104,7 +104,7 @@ def test_hysteresis_of_a_model_is_named(external: Path) -> None:
     text = external.read_text(encoding="utf-8")
     marked = text.replace('<channel name="Pitch">', f'<channel name="Pitch">{servo}', 1)
     external.write_text(marked, encoding="utf-8")
-    assert hysteresis_of(external).startswith("; servo of the model have a hysteresis_width")
+    assert hysteresis_of(external).startswith("; servos of the model have a hysteresis_width")
 
 
 def test_command_without_effect_is_named_with_what_the_model_reads(external: Path) -> None:

@@ -207,7 +207,7 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
         "--watch",
     ]
     assert ends(fleet.on_exit(ProcessExited("fleet", 0), context))
-    with pytest.raises(RuntimeError, match="the fleet ended with status 3"):
+    with pytest.raises(RuntimeError, match="rise-di fly ended with status 3"):
         fleet.on_exit(ProcessExited("fleet", 3), context)
     file.write_text("aircraft: {1a: {}}", encoding="utf-8")
     with pytest.raises(ParameterError, match="found '1a'"):

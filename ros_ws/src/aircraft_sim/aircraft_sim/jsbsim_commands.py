@@ -150,22 +150,13 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """The end of a sentence on a trim that fails: the components of a model that hold their output
-    while a command moves little, so that no small step has an effect; empty without any.
+    """The end of a sentence on a trim that fails, where servos of a model hold their output while a
+    command moves little; empty without such.
     """
     members = {} if model is None else model_files(model).members
-    names = [
-        element.get("name", "?")
-        for content in members.values()
-        for element in ElementTree.fromstring(content).iter()  # noqa: S314 - model_files has read it
-        if element.find("hysteresis_width") is not None
-    ]
-    return (
-        f"; {', '.join(names)} of the model have a hysteresis_width, in which no small command "
-        "has an effect: remove it"
-        if names
-        else ""
-    )
+    if not any(b"<hysteresis_width>" in content for content in members.values()):
+        return ""
+    return "; servos of the model have a hysteresis_width, which hides a small command: remove it"
 
 
 def _read_by_model(model: Path) -> list[str]:

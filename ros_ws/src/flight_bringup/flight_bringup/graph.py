@@ -217,6 +217,8 @@ def parameter_overrides(
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
         further += topics.recorded_with("learner")
+    if autopilot is not None:
+        further += autopilot.topics
     if further:
         overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further]
     overrides[RECORDER]["directory"] = str(run)
@@ -236,8 +238,6 @@ def parameter_overrides(
             )
             overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
     if spec in (RECORDER, ONE_PROCESS):
-        if autopilot is not None:
-            overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further, *autopilot.topics]
         maps = () if autopilot is None else (autopilot.map_path,)
         files = attachments_for(
             scenario, run, {node.executable: values for node, values in overrides.items()}, maps

@@ -76,9 +76,9 @@ class FlightMonitor(Client):
         """Whether the time of the flight is known: in simulated time from the first /clock on."""
         return self._simulated is None or self._simulated.known()
 
-    def speed(self) -> float:
-        """Simulated time over that of the host, at least 1: an instant that far ahead is ahead."""
-        return 1.0 if self._simulated is None else max(self._simulated.speed(), 1.0)
+    def ahead(self, lead: float) -> float:
+        """A time of the host as one of the flight, s: at least as long."""
+        return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def waits_for_clock(self) -> bool:
         """Whether the simulator has paused /clock."""

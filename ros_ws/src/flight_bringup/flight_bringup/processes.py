@@ -71,7 +71,7 @@ def end_with_parent() -> list[str]:
 def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
     """Time of the stamps and of the ticks of t = 0, s, `lead` of the host from now."""
     clock = monitor.clock
-    lead *= monitor.speed()
+    lead = monitor.ahead(lead)
     return start_instant(lead, seconds(clock.time_ns())), seconds(clock.monotonic_ns()) + lead
 
 

@@ -32,7 +32,6 @@ from flight_bringup.graph import (
     second_stage,
 )
 from flight_bringup.launch.stages import (
-    FlightClock,
     argument,
     boolean_argument,
     end_with_launch,
@@ -43,12 +42,10 @@ from flight_bringup.launch.stages import (
     rosbag2,
     runs_argument,
     scenario_argument,
-    sim_time_argument,
     start_in_stages,
     watch_argument,
     watch_page,
 )
-from flight_core.parameters import require
 from flight_design.identification.sign_check import require_signs
 from launch import LaunchContext, LaunchDescription
 
@@ -75,7 +72,6 @@ def generate_launch_description() -> LaunchDescription:
             ),
             runs_argument(),
             watch_argument(),
-            sim_time_argument(),
             namespace_argument(
                 "namespace of all nodes, one an aircraft; topics that a map names in full are "
                 "not in it"
@@ -95,25 +91,12 @@ def _fly(context: LaunchContext) -> list[Action]:
     require_limits(autopilot, scenario)
     recorder = argument(context, "recorder")
     recorded = recorder != "false"
-    clock = FlightClock(context)
-    require(
-        not (clock.simulated and recorder == "rosbag2"),
-        "use_sim_time",
-        "true with rosbag2",
-        "the stack's recorder",
-    )
     run = new_run(scenario, Path(argument(context, "runs"))) if recorded else Path()
     end_with_launch(context)
 
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
         overrides = parameter_overrides(
-            spec,
-            scenario,
-            run,
-            start_time,
-            lockstep=False,
-            use_sim_time=clock.simulated,
-            autopilot=autopilot,
+            spec, scenario, run, start_time, lockstep=False, autopilot=autopilot
         )
         return flight_node(spec, scenario, overrides, run)
 
@@ -121,13 +104,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         span = scenario.flight.duration
         end = (
             end_with_log(
-                context,
-                run,
-                clock,
-                lead,
-                start_time + span,
-                span,
-                by_rosbag2=recorder == "rosbag2",
+                context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2"
             )
             if duration
             else []
@@ -136,9 +113,7 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     page = watch_page(context, run) if recorded else []
     first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
-    actions = page + start_in_stages(
-        context, run, clock, {spec: node(spec) for spec in first}, follow
-    )
+    actions = page + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
     if recorder == "rosbag2":
         overrides = parameter_overrides(
             RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot

@@ -30,9 +30,9 @@ from flight_bringup.graph import (
 )
 from flight_bringup.launch.stages import (
     BOOLEAN,
-    FlightClock,
     argument,
     begin_when_matched,
+    by_rise_di,
     complete,
     end_with_launch,
     end_with_log,
@@ -96,13 +96,10 @@ def _fly(context: LaunchContext) -> list[Action]:
         "rosbag2 in lockstep",
         "true: the aircraft waits for the stack's recorder",
     )
-    clock = FlightClock(context)
-    require(
-        not (clock.simulated and (lockstep or by_rosbag2)),
-        "use_sim_time",
-        "true in lockstep, or with rosbag2",
-        "a flight in real time, with the stack's recorder",
-    )
+    if argument(context, "use_sim_time") == "true":
+        found = "true in lockstep, or with rosbag2"
+        require(not (lockstep or by_rosbag2), "use_sim_time", found, "it in real time")
+        return by_rise_di(context, argument(context, "scenario"))
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
@@ -110,14 +107,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         return flight_node(
             spec,
             scenario,
-            parameter_overrides(
-                spec,
-                scenario,
-                run,
-                start_time,
-                lockstep=lockstep,
-                use_sim_time=clock.simulated,
-            ),
+            parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep),
             run,
         )
 
@@ -131,17 +121,17 @@ def _fly(context: LaunchContext) -> list[Action]:
             ]
         elif begins:
             end = begin_when_matched(
-                context, run, clock, (*first, *nodes), duration, by_rosbag2=by_rosbag2
+                context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2
             )
         else:  # a user activates the controller, or no user does
             end = end_with_log(
-                context, run, clock, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
+                context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
             )
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     actions = watch_page(context, run) + start_in_stages(
-        context, run, clock, {spec: node(spec) for spec in first}, follow
+        context, run, {spec: node(spec) for spec in first}, follow
     )
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)

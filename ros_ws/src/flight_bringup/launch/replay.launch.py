@@ -33,7 +33,6 @@ from flight_bringup.graph import (
     replayed_topics,
 )
 from flight_bringup.launch.stages import (
-    FlightClock,
     argument,
     boolean_argument,
     complete,
@@ -168,9 +167,5 @@ def _play(context: LaunchContext) -> list[Action]:
 
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
     return start_in_stages(
-        context,
-        run,
-        FlightClock(context),
-        {spec: node(spec) for spec in nodes},
-        lambda lead, start_time: second_stage,
+        context, run, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage
     )

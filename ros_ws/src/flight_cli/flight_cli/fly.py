@@ -3,10 +3,9 @@
 """`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
 
 import sys
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -288,7 +287,8 @@ def _with_files(
         "one with guidance",
     )
     if home := sections.get("home"):
-        print(f"note: {_home_note(home, above_sea=above_sea)}", file=sys.stderr)
+        ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
+        print(f"note: home by the fence file: {home}{ground}", file=sys.stderr)
     if route is not None:
         return with_route(
             scenario,
@@ -296,17 +296,6 @@ def _with_files(
             sections,
         )
     return scenario.vary(guidance=sections)
-
-
-def _home_note(home: Mapping[str, Any], *, above_sea: bool) -> str:
-    """The home that a fence file gives."""
-    height = home.get("altitude")
-    altitude = "" if height is None else f", altitude {height:g} m"
-    if height is not None and height <= 0.0 and not above_sea:
-        altitude += ": the ground, so give its point a height above it"
-    return (
-        f"home by the fence file: {home['north']:.0f} m north, {home['east']:.0f} m east{altitude}"
-    )
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

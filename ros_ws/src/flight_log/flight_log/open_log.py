@@ -9,9 +9,9 @@ A path that is no log is refused in one sentence with what is there.
 import re
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,6 +21,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
 from mcap.records import Channel, McapRecord, Message, Schema
+from numpy.typing import NDArray
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
@@ -36,6 +37,7 @@ from flight_log.file_kinds import (
     ZSTD_MAGIC,
     file_kind,
 )
+from flight_log.named_vectors import tables
 from flight_log.rosbag2_metadata import (
     METADATA,
     PACKED_SUFFIXES,
@@ -235,13 +237,17 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
         yield batch
         return
     rows = [plain_message(row.tobytes()) for row in batch.data]
+    yield from _batches(batch.channel_id, rows, batch.log_ns, batch.publish_ns, batch.sequence)
+
+
+def _batches(
+    channel_id: int, messages: Iterable[bytes], *columns: NDArray[np.int64]
+) -> Iterator[MessageBatch]:
+    """Messages of a channel with the columns of a MessageBatch, those of equal length together."""
     begin = 0
-    for size, group in groupby(rows, len):
-        group_rows = list(group)
-        end = begin + len(group_rows)
-        table = np.frombuffer(b"".join(group_rows), dtype=np.uint8).reshape(len(group_rows), size)
-        times = batch.log_ns[begin:end], batch.publish_ns[begin:end]
-        yield MessageBatch(batch.channel_id, table, *times, batch.sequence[begin:end])
+    for table in tables(messages):
+        end = begin + len(table)
+        yield MessageBatch(channel_id, table, *(column[begin:end] for column in columns))
         begin = end
 
 
@@ -280,14 +286,10 @@ class SqliteScan:
                 else:
                     yield row
             for channel, messages in by_channel.items():
-                for size, group in groupby(messages, lambda message: len(message[1])):
-                    group_rows = list(group)
-                    table = np.frombuffer(
-                        b"".join(data for _, data in group_rows), dtype=np.uint8
-                    ).reshape(len(group_rows), size)
-                    log_ns = np.array([time_ns for time_ns, _ in group_rows], dtype=np.int64)
-                    unknown = np.zeros(len(group_rows), dtype=np.int64)
-                    yield MessageBatch(channel, table, log_ns, unknown, unknown)
+                log_ns = np.array([time_ns for time_ns, _ in messages], dtype=np.int64)
+                unknown = np.zeros(len(messages), dtype=np.int64)
+                contents = (data for _, data in messages)
+                yield from _batches(channel, contents, log_ns, unknown, unknown)
 
     def _rows(self) -> Iterator[Schema | Channel | tuple[int, int, bytes]]:
         # Takes 70 ms, which no bag of ours needs.

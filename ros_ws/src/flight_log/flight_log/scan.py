@@ -242,11 +242,12 @@ class Scan:
         ]
         self.known_end_ns = max(ends, default=0)
         most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that much
-        self.message_counts = {}
-        for record in index:
-            if isinstance(record, Statistics):
-                counts = record.channel_message_counts.items()
-                self.message_counts |= {channel: min(count, most) for channel, count in counts}
+        self.message_counts = {
+            channel: min(count, most)
+            for record in index
+            if isinstance(record, Statistics)
+            for channel, count in record.channel_message_counts.items()
+        }
         return index
 
     def _parts(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[Part]:
@@ -256,7 +257,7 @@ class Scan:
             self.complete = False
             return
         position = self.position = max(self.position, len(MCAP0_MAGIC))
-        for part in _with_message_indexes(frames(stream, position, _known_places(index, size))):
+        for part in whole_parts(stream, position, _known_places(index, size)):
             position = part.end
             yield part
             if part.opcode in ENDS:
@@ -281,39 +282,29 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
     return [*sorted(start for start in starts if start < size), size]
 
 
-def frames(
-    stream: IO[bytes], position: int, known: Sequence[int]
-) -> Iterator[tuple[int, int, bytes]]:
-    """Opcode, place behind the record, and content of every whole record from a place up to the end
-    of the data.
+def whole_parts(stream: IO[bytes], position: int, known: Sequence[int]) -> Iterator[Part]:
+    """Every whole record from a place up to the end of the data, with the message indexes behind.
 
     After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last
     record is in ENDS, or the file is truncated, or grows.
     """
     stream.seek(position)
     size = known[-1]
-    while position + RECORD.size <= size:
+    before: Part | None = None
+    is_end = False
+    while position + RECORD.size <= size and not is_end:
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
         next_known = known[bisect_right(known, position)]
         end = position + RECORD.size + length
-        is_end = opcode in ENDS
-        if end <= next_known and (not is_end or next_known == size):
-            position = end
-            yield opcode, position, stream.read(length)
-            if is_end:
-                return
-        elif next_known < size:
-            position = next_known
-            stream.seek(position)
-            yield DAMAGED, position, b""
-        else:
-            return
-
-
-def _with_message_indexes(frames: Iterator[tuple[int, int, bytes]]) -> Iterator[Part]:
-    """Every record with the message indexes behind; only a chunk has message indexes."""
-    before: Part | None = None
-    for opcode, end, content in frames:
+        is_end = opcode in ENDS and next_known == size
+        if end > next_known or is_end != (opcode in ENDS):
+            if next_known == size:
+                break
+            opcode = DAMAGED
+            end = next_known
+        position = end
+        content = b"" if opcode == DAMAGED else stream.read(length)
+        stream.seek(position)
         if before is not None and opcode == Opcode.MESSAGE_INDEX:
             before.message_indexes.append(content)
             before = before._replace(end=end)
@@ -395,7 +386,7 @@ def split(data: bytes) -> Iterator[McapRecord]:
                 channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence
             )
         else:
-            yield from _decode_inner(opcode, data[position:end])
+            yield from decode(opcode, data[position:end])
         position = end
 
 
@@ -409,27 +400,14 @@ def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]
 
     The message indexes of a chunk save most of the time. A wrong index changes nothing.
     """
-    if parts[0].opcode == Opcode.CHUNK:
-        yield from _split_batches(
-            [(decompress(part.content), _places(part.message_indexes)) for part in parts]
-        )
-        return
-    for record in decode(parts[0].opcode, parts[0].content):
-        if isinstance(record, Message):
-            log_ns, publish_ns = (
-                np.array([time], dtype=np.uint64).view(np.int64)
-                for time in (record.log_time, record.publish_time)
-            )
-            number = np.array([record.sequence], dtype=np.int64)
-            yield MessageBatch(
-                record.channel_id,
-                np.frombuffer(record.data, dtype=np.uint8)[None],
-                log_ns,
-                publish_ns,
-                number,
-            )
-        else:
-            yield record
+    yield from _split_batches([(_plain(part), _places(part.message_indexes)) for part in parts])
+
+
+def _plain(part: Part) -> bytes:
+    """The records of a part, those of a chunk decompressed. Raises DECODE_ERRORS."""
+    if part.opcode == Opcode.CHUNK:
+        return decompress(part.content)
+    return RECORD.pack(part.opcode, len(part.content)) + part.content
 
 
 def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
@@ -515,34 +493,22 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
             if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
                 further.append(position)
             else:
-                others += _decode_inner(opcode, data[begin : begin + length])
+                others += decode(opcode, data[begin : begin + length])
             position = begin + length
     return others, np.sort(np.append(places, further)) if further else places
-
-
-def _decode_inner(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """As `decode`, of a record in a chunk; a chunk holds no chunk (MCAP specification, Chunk)."""
-    if opcode == Opcode.CHUNK:
-        raise McapError("a chunk inside a chunk")
-    return decode(opcode, content)
 
 
 def decode_parts(parts: Iterable[Part]) -> Iterator[McapRecord]:
     """The records of parts of a file, in order. Raises DECODE_ERRORS."""
     for part in parts:
-        yield from decode(part.opcode, part.content)
+        yield from split(_plain(part))
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """The record, or the records of a chunk. Raises DECODE_ERRORS."""
-    if opcode == DAMAGED:
-        raise McapError("a record longer than the place for it")
-    if opcode == Opcode.CHUNK:
-        yield from split(decompress(content))
-    elif opcode == Opcode.MESSAGE:
-        channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
-        yield Message(channel, log_time, content[MESSAGE.size :], publish_time, sequence)
-    elif opcode in RECORD_READERS:
+    """A record that is no message. Raises DECODE_ERRORS."""
+    if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:  # no chunk holds another one
+        raise McapError("a record that is damaged")
+    if opcode in RECORD_READERS:
         if opcode == Opcode.ATTACHMENT:
             (crc,) = CRC.unpack(content[-CRC.size :])
             if crc not in (0, zlib.crc32(content[: -CRC.size])):

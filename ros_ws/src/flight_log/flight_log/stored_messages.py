@@ -111,25 +111,19 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
         for name in ("ParameterEvent", "Parameter", "ParameterValue")
     }
     texts = (bool, int, float, str)
-    empty = np.zeros(0)
 
     def parameter(name: str, value: Any) -> Any:
         array = isinstance(value, (list, tuple))
         kind = (
             0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
         )
-        by_kind: dict[int, Any] = {
-            1: False,
-            2: 0,
-            3: 0.0,
-            4: "",
-            5: empty.astype(np.uint8),
-            6: empty.astype(bool),
-        }
-        by_kind |= {7: empty.astype(np.int64), 8: empty, 9: []}
+        empty = [np.zeros(0, dtype=dtype) for dtype in (np.uint8, bool, np.int64, float)]
+        fields: list[Any] = [False, 0, 0.0, "", *empty, []]  # of the kinds from 1 on
         if kind:
-            by_kind[kind] = np.array(value, dtype=by_kind[kind].dtype) if 6 <= kind < 9 else value
-        return types["Parameter"](name, types["ParameterValue"](kind, *by_kind.values()))
+            default = fields[kind - 1]
+            is_table = isinstance(default, np.ndarray)
+            fields[kind - 1] = np.array(value, dtype=default.dtype) if is_table else value
+        return types["Parameter"](name, types["ParameterValue"](kind, *fields))
 
     changed = [parameter(name, value) for name, value in changes.items() if value is not None]
     deleted = [parameter(name, None) for name, value in changes.items() if value is None]

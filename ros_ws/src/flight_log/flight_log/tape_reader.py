@@ -6,6 +6,7 @@ ones.
 
 import re
 import shlex
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -196,17 +197,12 @@ def read_run(
         if (has := listed(log.kinds))
         else "no sample on any topic"
     )
-    unset = {
-        topic: clock.unset
-        for topic, samples in log.topics.items()
-        if (clock := samples.recording()).unset
-    }
-    lacks = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
-    lacks += [
-        refusal_note(topic, count)
-        for topic, samples in log.topics.items()
-        if (count := samples.refused())
-    ]
+    lacks = []
+    for topic, samples in log.topics.items():
+        if unset := samples.recording().unset:
+            lacks.append(f"{topic}: {unset} samples without a usable stamp")
+        if count := samples.refused():
+            lacks.append(refusal_note(topic, count))
     require(bool(filled), str(run), "; ".join([nothing, *lacks, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
@@ -524,7 +520,7 @@ class _Log:
         self.truncated: list[str] = []  # names of the truncated files
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
-        self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
+        self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
         self.lines: list[bytes] = []  # of /rosout: that a node is ready
         self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
         self.reports: dict[
@@ -538,19 +534,17 @@ class _Log:
     ) -> Callable[[MessageBatch], None] | None:
         """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
         samples = self.samples_of(topic, type_name, expected)
-        if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
-            times = self.sent.setdefault(topic, [])
+        is_timed = topic.rpartition("/")[2] in TIMED_TOPICS
+        if samples is not None:
 
             def take(batch: MessageBatch) -> None:
                 samples.add(batch.data, batch.log_ns, batch.sequence)
-                if batch.data.shape[1] >= STAMP.stop:
+                if is_timed and batch.data.shape[1] >= STAMP.stop:
                     self.times = Times(stamps_of(batch.data), batch.sent_ns)
                     if batch.publish_ns.all():
-                        times.append(self.times)
+                        self.sent[topic].append(self.times)
 
             return take
-        if samples is not None:
-            return lambda batch: samples.add(batch.data, batch.log_ns, batch.sequence)
         if topic == ROSOUT and type_name == LOG:
             return lambda batch: self.lines.extend(
                 line for line in map(bytes, batch.data) if READY in line

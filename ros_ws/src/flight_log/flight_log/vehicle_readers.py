@@ -8,7 +8,7 @@ sequence of a link).
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
@@ -45,7 +45,6 @@ from flight_log.vehicle_log import (
     ULOG_TORQUES,
     Choice,
     Format,
-    Source,
     Table,
     VehicleLog,
 )
@@ -333,30 +332,28 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
     ), False
 
 
+def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
+    """The fields of places by message."""
+    fields: dict[str, set[str]] = {}
+    for message, field in places:
+        fields.setdefault(message, set()).add(field)
+    return fields
+
+
 def _ulog_fields() -> dict[str, set[str]]:
     """The fields of a ULog for the comparison of instances, by topic."""
-    fields: dict[str, set[str]] = {}
-    places = [
-        (source.message, source.field)
-        for source in chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
-    ]
-    for topic, field in (*places, *ULOG_TORQUES):
-        fields.setdefault(topic, set()).add(field)
-    return fields
+    sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
+    places = [(source.message, source.field) for source in sources]
+    return _by_message([*places, *ULOG_TORQUES])
 
 
 def _wanted(log_format: Format) -> dict[str, set[str]]:
     """The fields that are read, by message."""
     sources = (*log_format.sources.values(), *log_format.torques.values(), log_format.mode)
-    places = [*chain.from_iterable(sources)]
+    places = [(source.message, source.field) for source in chain(*sources)]
     for source, count in ((log_format.sticks, STICKS), (log_format.servos, SERVOS)):
-        places += [
-            Source(source.message, source.field.format(number)) for number in range(1, count + 1)
-        ]
-    wanted: dict[str, set[str]] = {}
-    for source in places:
-        wanted.setdefault(source.message, set()).add(source.field)
-    return wanted
+        places += [(source.message, source.field.format(k)) for k in range(1, count + 1)]
+    return _by_message(places)
 
 
 ULOG_VALUES = 65535

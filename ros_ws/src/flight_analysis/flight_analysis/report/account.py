@@ -58,6 +58,7 @@ AIRCRAFT = re.compile(
 )  # of a process that is the simulated aircraft of the stack
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
+APART = ("legs", "outside")  # in the section `guidance` of a summary
 SHORTFALL = re.compile(
     rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|{BESIDE}|"
     rf"{INCOMPLETE}).*",
@@ -160,19 +161,13 @@ class Account(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """The account for `summary.json`, which has the legs in `guidance`."""
-        topics = {
+        content = {name: value for name, value in self._asdict().items() if name not in APART}
+        content["topics"] = {
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
         }
-        return {
-            "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy,
-            "unguided": self.unguided,
-            "unflown": list(self.unflown),
-            "off_orbit": self.off_orbit,
-            "beside": self.beside,
-            "processes": {name: process._asdict() for name, process in self.processes.items()},
-            "commands": None if self.commands is None else self.commands._asdict(),
-            "late": self.late,
-        }  # fmt: skip
+        content["processes"] = {name: each._asdict() for name, each in self.processes.items()}
+        content["commands"] = None if self.commands is None else self.commands._asdict()
+        return content
 
 
 def best_error_over(tape: Tape) -> tuple[str, Signal]:
@@ -720,30 +715,18 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     if content is None:
         return None
     fields_of = itemgetter(*TopicAccount._fields)
-    topics = {name: TopicAccount(*fields_of(topic)) for name, topic in content["topics"].items()}
     guided = summary["guidance"] or {}
-    legs = tuple(FlownLeg(**leg) for leg in guided.get("legs", ()))
-    outside = None if guided.get("fence") is None else Outside(**guided["fence"])
-    unguided = content.get("unguided", False)
-    unflown = tuple(content.get("unflown", ()))
-    processes = {
-        name: ProcessAccount(**process) for name, process in content.get("processes", {}).items()
+    values: dict[str, Any] = content | {
+        "topics": {
+            name: TopicAccount(*fields_of(topic)) for name, topic in content["topics"].items()
+        },
+        "processes": {
+            name: ProcessAccount(**process)
+            for name, process in content.get("processes", {}).items()
+        },
+        "commands": content.get("commands") and Commands(**content["commands"]),
+        "legs": [FlownLeg(**leg) for leg in guided.get("legs", ())],
+        "outside": guided.get("fence") and Outside(**guided["fence"]),
     }
-    commands = None if content.get("commands") is None else Commands(**content["commands"])
-    lacks = tuple(content["lacks"])
-    late = content.get("late")
-    return Account(
-        content["end"],
-        topics,
-        lacks,
-        content["busy"],
-        unguided,
-        legs,
-        unflown,
-        processes,
-        commands,
-        late,
-        outside,
-        content.get("off_orbit", 0.0),
-        content.get("beside", 0.0),
-    )
+    lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+    return Account(**(values | lists))

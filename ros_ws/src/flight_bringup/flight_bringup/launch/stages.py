@@ -39,7 +39,6 @@ from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instan
 from flight_bringup.processes import (
     FIRST_U,
     LOG_TIMEOUT,
-    NO_CLOCK,
     READY_TIMEOUT,
     end_with_parent,
     leave_outcome,
@@ -56,7 +55,6 @@ from flight_ros.topics import (
     NEWEST_SAMPLES,
     NODE_STATE,
     RECORDED,
-    SIMULATED_CLOCK,
     START,
     STATES,
     NodeState,
@@ -83,61 +81,6 @@ class FlownEvent(Event):
     """The flight has reached its end."""
 
     name = "flight_bringup.FlownEvent"
-
-
-USE_SIM_TIME = "use_sim_time"
-CLOCK_PERIOD = 0.1  # s, of looks at /clock
-
-
-class FlightClock:
-    """The time of the nodes of a launch: that of the host, or the newest /clock."""
-
-    def __init__(self, context: LaunchContext) -> None:
-        transport.prepare()  # before the first rclpy.init of this process
-        self.simulated = context.launch_configurations.get(USE_SIM_TIME) == "true"
-        self._newest = 0.0
-        if self.simulated:
-            get_ros_node(context).create_subscription(
-                SIMULATED_CLOCK.type, SIMULATED_CLOCK.name, self._take, NEWEST_SAMPLES
-            )
-
-    def _take(self, message: Any) -> None:
-        self._newest = message.clock.sec + message.clock.nanosec / NANOSECONDS
-
-    def known(self) -> bool:
-        """Whether there is a time: in simulated time from the first /clock on."""
-        return not self.simulated or self._newest > 0.0
-
-    def now(self) -> float:
-        """The time of the stamps, s."""
-        return self._newest if self.simulated else time.time()
-
-    def once_known(self, then: Callable[[], Sequence[Action]]) -> Sequence[Action]:
-        """The actions of `then` as soon as there is a time."""
-        if self.known():
-            return then()
-        look = OpaqueFunction(function=lambda context: [*self.once_known(then)])
-        return [TimerAction(period=CLOCK_PERIOD, actions=[look])]
-
-    def after(
-        self, duration: float, then: Callable[[LaunchContext], list[Action] | None]
-    ) -> TimerAction:
-        """Run a function after a duration of this time, s."""
-        if not self.simulated:
-            return TimerAction(period=duration, actions=[OpaqueFunction(function=then)])
-        end = self._newest + duration
-
-        def look(context: LaunchContext) -> list[Action] | None:
-            if self._newest < end and not context.is_shutdown:
-                return [TimerAction(period=CLOCK_PERIOD, actions=[OpaqueFunction(function=look)])]
-            return then(context)
-
-        return TimerAction(period=CLOCK_PERIOD, actions=[OpaqueFunction(function=look)])
-
-
-def sim_time_argument() -> DeclareLaunchArgument:
-    """The argument `use_sim_time`."""
-    return boolean_argument(USE_SIM_TIME, False, "fly by the /clock of a simulator: docs/ros.md")
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
@@ -198,6 +141,35 @@ def namespace_argument(
 ) -> DeclareLaunchArgument:
     """The argument `namespace`."""
     return DeclareLaunchArgument("namespace", default_value="", description=description)
+
+
+def sim_time_argument() -> DeclareLaunchArgument:
+    """The argument `use_sim_time`."""
+    return boolean_argument(
+        "use_sim_time", False, "run `rise-di fly` by the /clock of a simulator: docs/ros.md"
+    )
+
+
+def by_rise_di(context: LaunchContext, file: str) -> list[Action]:
+    """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch; the launch ends
+    with it, with exit status 1 where a flight was not completed.
+    """
+
+    def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
+        if event.returncode != 0 and not context.is_shutdown:
+            raise RuntimeError(f"rise-di fly ended with status {event.returncode}")
+        return [Shutdown(reason="flight completed")]
+
+    end_with_launch(context)
+    options = ["--set", f"runs={argument(context, 'runs')}"]
+    options += ["--set", "use_sim_time"] * (argument(context, "use_sim_time") == "true")
+    for name in ("duration", "namespace"):
+        if value := context.launch_configurations.get(name):
+            options += [f"--{name}", value]
+    options += ["--watch"] * (argument(context, "watch") == "true")
+    rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
+    command = [rise_di, "fly", file, *options]
+    return [ExecuteProcess(cmd=command, name="flight", output="screen", on_exit=end)]
 
 
 def argument(context: LaunchContext, name: str) -> str:
@@ -314,15 +286,14 @@ def on_state(
 def start_in_stages(
     context: LaunchContext,
     run: Path,
-    clock: FlightClock,
     first: Mapping[NodeSpec, Node],
     second: Callable[[float, float], Sequence[Action]],
 ) -> list[Action]:
     """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the
     actions of `second`.
 
-    The arguments of `second` are the time until t = 0 and the time of t = 0, s. A node that is not
-    ready after READY_TIMEOUT, or no /clock, ends the launch with exit status 1.
+    The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that
+    is not ready after READY_TIMEOUT ends the launch with exit status 1.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
@@ -332,16 +303,12 @@ def start_in_stages(
     def ready(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
         lead = start_lead(time.monotonic() - begin)
-        if waiting:
-            return ()
-        return clock.once_known(lambda: second(lead, start_instant(lead, clock.now())))
+        return () if waiting else second(lead, start_instant(lead, time.time()))
 
     def require_ready(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in waiting)
             end_with(run, f"{NEVER_FLEW}: {names} not ready after {READY_TIMEOUT:g} s")
-        if not clock.known() and not context.is_shutdown:
-            end_with(run, f"{NEVER_FLEW}: {NO_CLOCK} after {READY_TIMEOUT:g} s")
 
     handlers = [
         on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
@@ -356,7 +323,6 @@ def start_in_stages(
 def begin_when_matched(
     context: LaunchContext,
     run: Path,
-    clock: FlightClock,
     nodes: Sequence[NodeSpec],
     duration: float,
     *,
@@ -383,12 +349,15 @@ def begin_when_matched(
         del waiting[spec]
         if waiting:
             return []
-        start_time = start_instant(LEAD, clock.now())
+        start_time = start_instant(LEAD, time.time())
         publish(instant(nanoseconds(start_time)))
         start_ns[0] = nanoseconds(start_time)
         return [
-            clock.after(LEAD + FIRST_U, require_flight),
-            clock.after(LEAD + duration + 2.0 * LOG_TIMEOUT, give_up),
+            TimerAction(period=LEAD + FIRST_U, actions=[OpaqueFunction(function=require_flight)]),
+            TimerAction(
+                period=LEAD + duration + 2.0 * LOG_TIMEOUT,
+                actions=[OpaqueFunction(function=give_up)],
+            ),
         ]
 
     def fly() -> Sequence[Action]:
@@ -435,7 +404,6 @@ def begin_when_matched(
 def end_with_log(
     context: LaunchContext,
     run: Path,
-    clock: FlightClock,
     lead: float,
     end_time: float,
     duration: float,
@@ -443,7 +411,7 @@ def end_with_log(
     by_rosbag2: bool,
 ) -> list[Action]:
     """End a flight of `duration`, which began with `lead`, once the log holds y, y_m and u to the
-    time `end_time`, s.
+    system time `end_time`, s.
 
     A log without u, as of a bridge that is not engaged, ends it after the duration; one that has
     stopped, LOG_TIMEOUT later.
@@ -452,7 +420,7 @@ def end_with_log(
 
     def held(stamp_ns: int) -> bool:
         last[0] = time.monotonic()
-        return min(stamp_ns, nanoseconds(clock.now())) >= nanoseconds(end_time)
+        return min(stamp_ns, time.time_ns()) >= nanoseconds(end_time)
 
     def end(context: LaunchContext) -> list[Action]:
         if context.is_shutdown:
@@ -460,7 +428,7 @@ def end_with_log(
         moves = time.monotonic() < last[0] + LOG_TIMEOUT
         return [TimerAction(period=LOG_TIMEOUT, actions=complete(run))] if moves else complete(run)
 
-    timer = clock.after(lead + duration, end)
+    timer = TimerAction(period=lead + duration, actions=[OpaqueFunction(function=end)])
     return [timer, _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
 
 
@@ -512,6 +480,7 @@ def _subscribe_states(context: LaunchContext) -> None:
                 context.emit_event_sync, NodeStateEvent(node, message.value)
             )
 
+    transport.prepare()  # before the first rclpy.init of this process
     ros_node = get_ros_node(context)
     ros_node.create_subscription(
         NODE_STATE.type, f"{_namespace(context)}/{NODE_STATE.name}", receive, STATES
