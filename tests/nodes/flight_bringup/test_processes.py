@@ -24,6 +24,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
     has_time=lambda: True,
     ahead=lambda lead: lead,
     clock=time,
+    by_clock=False,
     clock_ended=lambda: "",
 )  # in place of a FlightMonitor
 
@@ -144,9 +145,7 @@ def test_flight_by_a_clock_that_never_comes_is_told_so(
     expected = "/clock: no message of a simulator after 0.5 s"
     with (
         pytest.raises(NotReadyError, match=expected),
-        FlightProcesses(
-            osprey_gust, tmp_path, monitor, lockstep=False, one_process=False, use_sim_time=True
-        ),
+        FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False),
     ):
         pass
 

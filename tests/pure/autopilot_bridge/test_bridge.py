@@ -20,6 +20,7 @@ from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_bringup import fly as flying
 from flight_bringup.fly import _follow_real_time, _Span, interrupt, last
 from flight_bringup.processes import handle_signals
 from flight_core.rates import nanoseconds
@@ -950,12 +951,11 @@ def followed(
     begins it.
     """
     scenario = find_scenario("osprey_gust")
+    monotonic_ns = lambda: round(1e9 * vars(flying)["time"].monotonic())  # noqa: E731 - a stand-in
+    vars(monitor)["clock"] = SimpleNamespace(monotonic_ns=monotonic_ns)
+    vars(processes).update(scenario=scenario, monitor=monitor)
     span = _Span(scenario, processes, monitor, begins=begins)
-    return last(
-        _follow_real_time(
-            scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span
-        )
-    )
+    return last(_follow_real_time(processes, lambda t, text: None, announce, engaged_for, span))
 
 
 @pytest.mark.parametrize(

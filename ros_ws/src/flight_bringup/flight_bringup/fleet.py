@@ -237,7 +237,6 @@ class _Flight:
                 self.monitor,
                 lockstep=fleet.lockstep,
                 one_process=fleet.composed,
-                use_sim_time=fleet.use_sim_time,
                 namespace=absolute_namespace(self.member.name),
             ).__enter__()
         except ParameterError as error:
@@ -246,9 +245,9 @@ class _Flight:
             if reason := self.processes.match():
                 self.end(reason)
             elif fleet.lockstep:
-                self.begin(fleet, (0.0, 0.0))
+                self.begin((0.0, 0.0))
 
-    def begin(self, fleet: Fleet, start: tuple[float, float]) -> None:
+    def begin(self, start: tuple[float, float]) -> None:
         """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s; in
         lockstep it has begun.
         """
@@ -259,13 +258,7 @@ class _Flight:
         ):
             self.end(reason)
         else:
-            self.steps = follow(
-                self.member.scenario,
-                self.processes,
-                self.monitor,
-                self.progress,
-                lockstep=fleet.lockstep,
-            )
+            self.steps = follow(self.processes, self.progress)
 
     def step(self) -> bool:
         """Look at the flight once. Returns whether the flight goes on."""
@@ -365,4 +358,4 @@ def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
     if not fleet.lockstep:
         start = start_instants(LEAD + BEGIN_TIME * len(flights), flights[0].monitor)
         for flight in flights:
-            flight.begin(fleet, start)
+            flight.begin(start)

@@ -114,7 +114,6 @@ def fly_over_topics(
                 monitor,
                 lockstep=lockstep,
                 one_process=one_process,
-                use_sim_time=use_sim_time,
                 autopilot=autopilot,
                 namespace=namespace,
             ) as processes,
@@ -122,16 +121,7 @@ def fly_over_topics(
             if reason := processes.begin():
                 processes.outcome = reason
             else:
-                steps = follow(
-                    scenario,
-                    processes,
-                    monitor,
-                    progress,
-                    lockstep=lockstep,
-                    announce=announce,
-                    engaged_for=engaged_for,
-                )
-                processes.outcome = last(steps)
+                processes.outcome = last(follow(processes, progress, announce, engaged_for))
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -150,25 +140,22 @@ def last(steps: Steps) -> str:
 
 
 def follow(
-    scenario: Scenario,
     processes: FlightProcesses,
-    monitor: "FlightMonitor",
     progress: Progress,
-    *,
-    lockstep: bool,
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Steps:
     """Follow a flight that has begun, a step every POLL_PERIOD; as `fly_over_topics`."""
-    if lockstep:
-        return _follow_lockstep(scenario, processes, monitor, progress, announce)
+    if processes.lockstep:
+        return _follow_lockstep(processes, progress, announce)
+    scenario = processes.scenario
     begins = (
         processes.autopilot is None
         and scenario.controller.autostart
         and scenario.controller.start_active
     )
-    span = _Span(scenario, processes, monitor, begins=begins)
-    return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
+    span = _Span(scenario, processes, processes.monitor, begins=begins)
+    return _follow_real_time(processes, progress, announce, engaged_for, span)
 
 
 class _Span:
@@ -223,14 +210,14 @@ class _Span:
 
 
 def _follow_real_time(
-    scenario: Scenario,
     processes: FlightProcesses,
-    monitor: "FlightMonitor",
     progress: Progress,
     announce: Callable[[str], None],
     engaged_for: float,
     span: _Span,
 ) -> Steps:
+    scenario = processes.scenario
+    monitor = processes.monitor
     units = display_units(scenario)
     outputs = scenario.controller.outputs
     text = "starting"
@@ -239,7 +226,7 @@ def _follow_real_time(
     announced = ""
     engaged_at = math.inf
     while True:
-        _announce_learned(processes, monitor, processes.start_time, announce)
+        _announce_learned(processes, processes.start_time, announce)
         t = seconds(monitor.clock.monotonic_ns()) - processes.started
         if outcome := span.outcome(t):
             return outcome
@@ -270,34 +257,31 @@ def _follow_real_time(
                 for name, e in zip(outputs, values, strict=True)
             )
             text = f"{mode}  e: {', '.join(errors)}"
-        shown = "waiting for /clock" if monitor.waits_for_clock() else text
-        progress(min(max(t, 0.0), scenario.flight.duration), shown)
+        progress(min(max(t, 0.0), scenario.flight.duration), text)
         yield
 
 
 def _announce_learned(
     processes: FlightProcesses,
-    monitor: "FlightMonitor",
     start_time: float,
     announce: Callable[[str], None],
 ) -> None:
     """Announce what became of proposals since the last call, and the end of the learner."""
-    for instant, sentence in monitor.learned():
+    for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
     if ended := processes.learner_ended():
         announce(f"{ended}: the law flies on with the model that it has")
 
 
 def _follow_lockstep(
-    scenario: Scenario,
     processes: FlightProcesses,
-    monitor: "FlightMonitor",
     progress: Progress,
     announce: Callable[[str], None],
 ) -> Steps:
     """The real-time factor counts from the first instant in the log. The flight ends with the last
     u, and a complete log.
     """
+    scenario = processes.scenario
     end = (
         scenario.flight.duration - 1.0 / scenario.aircraft.rate
     )  # the last instant is the aircraft's last whole period
@@ -310,7 +294,7 @@ def _follow_lockstep(
         if (reason := processes.ended_early()) is not None:
             return reason
         now = time.monotonic()
-        if (recorded := monitor.recorded()) is not None:
+        if (recorded := processes.monitor.recorded()) is not None:
             t = recorded
             last_change = now
             if first is None:
@@ -319,10 +303,10 @@ def _follow_lockstep(
                 text = f"lockstep, {(t - first[1]) / (now - first[0]):.1f} times real time"
         elif now > last_change + timeout:
             return f"no progress for {timeout:g} s at t = {t:g} s"
-        _announce_learned(processes, monitor, 0.0, announce)
+        _announce_learned(processes, 0.0, announce)
         progress(t, text)
         yield
-    _announce_learned(processes, monitor, 0.0, announce)
+    _announce_learned(processes, 0.0, announce)
     return COMPLETED
 
 

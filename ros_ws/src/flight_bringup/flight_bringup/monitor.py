@@ -51,6 +51,7 @@ class FlightMonitor(Client):
         namespace: str = "",
     ) -> None:
         super().__init__("monitor", namespace)
+        self.by_clock = use_sim_time
         self._simulated = SimulatedTime(self._node) if use_sim_time else None
         self.clock: HostTime = self._simulated or time  # of the flight
         self._namespace = self._node.get_namespace().rstrip("/")
@@ -79,10 +80,6 @@ class FlightMonitor(Client):
     def ahead(self, lead: float) -> float:
         """A time of the host as one of the flight, s: at least as long."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
-
-    def waits_for_clock(self) -> bool:
-        """Whether the simulator has paused /clock."""
-        return self._simulated is not None and self._simulated.silent()
 
     def clock_ended(self) -> str:
         """Why the simulation of the flight is over; else empty."""

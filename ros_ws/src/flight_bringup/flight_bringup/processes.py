@@ -193,16 +193,14 @@ class FlightProcesses:
         *,
         lockstep: bool,
         one_process: bool,
-        use_sim_time: bool = False,
         autopilot: Autopilot | None = None,
         namespace: str = "",
     ) -> None:
-        self._use_sim_time = use_sim_time
-        self._scenario = scenario
+        self.scenario = scenario
         self._run = run
-        self._monitor = monitor
+        self.monitor = monitor
         self._namespace = namespace
-        self._lockstep = lockstep
+        self.lockstep = lockstep
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
@@ -230,10 +228,10 @@ class FlightProcesses:
             self._wait_until_ready(begin + READY_TIMEOUT)
             if not self._first:  # whose start gives the monitor the time to discover another flight
                 time.sleep(DISCOVERY_TIME)
-            self._monitor.require_free_domain()
+            self.monitor.require_free_domain()
             if not self._on_start:
                 lead = start_lead(time.monotonic() - begin)
-                self._set_start(start_instants(lead, self._monitor))
+                self._set_start(start_instants(lead, self.monitor))
             for node in self._second:
                 self._start(node)
         except BaseException as error:
@@ -267,8 +265,8 @@ class FlightProcesses:
         """
         leave_real_time_priority()  # the nodes have it
         if not (reason := self.match()) and self._on_start:
-            self._set_start(start or start_instants(LEAD, self._monitor))
-            self._monitor.start(self.start_time)
+            self._set_start(start or start_instants(LEAD, self.monitor))
+            self.monitor.start(self.start_time)
         return reason
 
     def _names(self, process: NodeProcess) -> list[str]:
@@ -285,8 +283,8 @@ class FlightProcesses:
     def _unmatched(self) -> list[str]:
         """What the flight waits for before t = 0, by node."""
         names = self._nodes()
-        ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
-        unmatched = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
+        ready = {name: self.monitor.is_ready(name, pid) for name, pid in names}
+        unmatched = [name for name, pid in names if not self.monitor.is_matched(name, pid)]
         return [
             f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}"
             for name in unmatched
@@ -301,21 +299,21 @@ class FlightProcesses:
         start = ON_START if self._on_start else self.start_time
         overrides = parameter_overrides(
             node,
-            self._scenario,
+            self.scenario,
             self._run,
             start,
-            lockstep=self._lockstep,
-            use_sim_time=self._use_sim_time,
+            lockstep=self.lockstep,
+            use_sim_time=self.monitor.by_clock,
             autopilot=self.autopilot,
         )
         if node is BRIDGE:
             overrides = {**overrides, "first_y": FIRST_Y}
         self.processes.append(
-            NodeProcess(node, self._scenario.path, overrides, log, self._namespace)
+            NodeProcess(node, self.scenario.path, overrides, log, self._namespace)
         )
 
     def _wait_until_ready(self, deadline: float) -> None:
-        while (waiting := self.waiting()) or not self._monitor.has_time():
+        while (waiting := self.waiting()) or not self.monitor.has_time():
             if (reason := self.ended_early()) is not None:
                 statuses = {process.popen.poll() for process in self.processes}
                 raise (ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError)(reason)
@@ -338,11 +336,11 @@ class FlightProcesses:
         another is then not the cause.
         """
         processes = [
-            process for process in self.processes if self._lockstep or process.node is not LEARNER
+            process for process in self.processes if self.lockstep or process.node is not LEARNER
         ]
         reasons = [reason for process in processes if (reason := _end(process)) is not None]
         first = min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
-        return first or self._monitor.clock_ended() or None
+        return first or self.monitor.clock_ended() or None
 
     def learner_ended(self) -> str:
         """How the learner has ended, told once; else empty."""
@@ -354,12 +352,12 @@ class FlightProcesses:
 
     def waiting(self) -> list[str]:
         """The nodes that are not ready."""
-        return [name for name, pid in self._nodes() if not self._monitor.is_ready(name, pid)]
+        return [name for name, pid in self._nodes() if not self.monitor.is_ready(name, pid)]
 
     def is_flying(self) -> bool:
         """Whether the aircraft has taken a u."""
         return any(
-            self._monitor.is_flying(name, pid)
+            self.monitor.is_flying(name, pid)
             for name, pid in self._nodes()
             if name == AIRCRAFT.executable
         )
@@ -369,7 +367,7 @@ class FlightProcesses:
         included.
         """
         return any(
-            self._monitor.is_completed(name, pid)
+            self.monitor.is_completed(name, pid)
             for name, pid in self._nodes()
             if name == AIRCRAFT.executable
         )
@@ -398,7 +396,7 @@ class FlightProcesses:
         ):  # a second Ctrl-C must not interrupt this: it would truncate the log
             if self.processes:
                 leave_outcome(self._run, self.outcome)
-            searches = self._lockstep and self.outcome == COMPLETED and self._scenario.learns()
+            searches = self.lockstep and self.outcome == COMPLETED and self.scenario.learns()
             last = {
                 RECORDER: CLOSE_TIMEOUT,
                 ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT,

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 from mcap.records import Attachment, Channel, Metadata, Schema
@@ -69,7 +68,7 @@ class Follower:
         self,
         run: Path,
         rate_of: Callable[[str, str], float],
-        remaps: Mapping[str, str] = MappingProxyType({}),
+        remaps: Mapping[str, str] = {},
     ) -> None:
         self.run = run
         self.complete = False  # the end of the data has been read

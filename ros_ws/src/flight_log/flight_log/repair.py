@@ -136,17 +136,13 @@ class _FileScan:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.messages: Counter[int] = Counter()
-        self.first_ns: int | None = None
+        self.first_ns = 2**63
         self.last_ns = 0
         scan = Scan(path)
         for record in scan.records():
             if isinstance(record, Message):
                 self.messages[record.channel_id] += 1
-                self.first_ns = (
-                    record.log_time
-                    if self.first_ns is None
-                    else min(self.first_ns, record.log_time)
-                )
+                self.first_ns = min(self.first_ns, record.log_time)
                 self.last_ns = max(self.last_ns, record.log_time)
             elif isinstance(record, Channel):
                 self.channels[record.id] = record
@@ -171,7 +167,9 @@ class _FileScan:
                     self.messages[identity],
                 )
             )
-        return FileContents(self.path.name, self.first_ns or 0, self.last_ns, tuple(counts))
+        return FileContents(
+            self.path.name, self.first_ns if self.messages else 0, self.last_ns, tuple(counts)
+        )
 
     def unchanged(self) -> FileRepair:
         return FileRepair(

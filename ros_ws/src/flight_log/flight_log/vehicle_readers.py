@@ -295,7 +295,10 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         if is_number(value)  # else it is damaged
     ]
     parameters = parameters_of(records)
-    tables, taken = flown(instances, _ulog_fields(), parameters, choice)
+    sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
+    places = [(source.message, source.field) for source in sources]
+    fields = _by_message([*places, *ULOG_TORQUES])
+    tables, taken = flown(instances, fields, parameters, choice)
     if (attitude := tables.get("vehicle_attitude")) is not None:
         tables["vehicle_attitude"] = Table(
             attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}
@@ -338,13 +341,6 @@ def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     for message, field in places:
         fields.setdefault(message, set()).add(field)
     return fields
-
-
-def _ulog_fields() -> dict[str, set[str]]:
-    """The fields of a ULog for the comparison of instances, by topic."""
-    sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
-    places = [(source.message, source.field) for source in sources]
-    return _by_message([*places, *ULOG_TORQUES])
 
 
 def _wanted(log_format: Format) -> dict[str, set[str]]:

@@ -168,8 +168,8 @@ def by_rise_di(context: LaunchContext, file: str) -> list[Action]:
             options += [f"--{name}", value]
     options += ["--watch"] * (argument(context, "watch") == "true")
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    command = [rise_di, "fly", file, *options]
-    return [ExecuteProcess(cmd=command, name="flight", output="screen", on_exit=end)]
+    words = [rise_di, "fly", file, *options]
+    return [ExecuteProcess(cmd=words, name="flight", output="screen", on_exit=end)]
 
 
 def argument(context: LaunchContext, name: str) -> str:
