@@ -221,8 +221,8 @@ def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
         "phase-margin=50",
         "--write",
         str(path),
-        "--page",
-        str(page),
+        "--set",
+        f"page={page}",
     )
     assert result.exit_code == 0, result.output
     assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(

@@ -198,8 +198,9 @@ def gains(
     page: Annotated[
         Path | None,
         typer.Option(
+            "--set page",
             help="HTML file for the margins with Bode and Nyquist plots: of the engineering "
-            "gains, or with --check."
+            "gains, or with --check.",
         ),
     ] = None,
     guaranteed: Annotated[
@@ -393,7 +394,7 @@ def _write_page(path: Path, answer: Assessment) -> None:
     """
     study = answer.study
     loop = linear_loop(answer.controller, study.airframe, study.A, study.B)
-    with writing("--page", path, "a page that can"):
+    with writing("--set page", path, "a page that can"):
         write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
