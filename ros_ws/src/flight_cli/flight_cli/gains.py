@@ -15,26 +15,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.guarantee import Guarantee, guarantee
 from flight_analysis.closed_loop.loop_margins import linear_loop
-from flight_analysis.closed_loop.scenario import scenario_yaml
-from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (
     MARGIN_COLUMNS,
     MARGIN_LEGEND,
-    decibels,
     guarantee_as_json,
-    guarantee_rows,
-    guarantee_text,
     margin_rows,
     margins_as_json,
     modes_text,
 )
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
+from flight_cli.gains_guarantee import require_guarantee, show_guarantee, write_unstable
 from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
 from flight_cli.words import AsJson
 from flight_core.files import display_path, writing
@@ -48,11 +42,9 @@ from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
-from rise_di_controller.margins import disk_gain, disk_phase
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 "
@@ -237,7 +229,7 @@ def gains(
         "--write beside it, without --observer",
     )
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
-    _require_guarantee(check=check, guaranteed=guaranteed, worst=worst)
+    require_guarantee(check=check, guaranteed=guaranteed, worst=worst)
     promise: Guarantee | None = None
     answers: dict[str, Assessment]
     with console.status("selecting gains on uncertain airframes") as status:
@@ -258,7 +250,7 @@ def gains(
             if guaranteed:
                 status.update("bounding every aircraft of the box")
                 promise = guarantee(answer.loop_with_box())
-                _write_unstable(worst, promise, airframe, scenario)
+                write_unstable(worst, promise, airframe, scenario)
         else:
             selection = select_gains(
                 airframe,
@@ -302,7 +294,7 @@ def gains(
         print_json(_as_json(study, answers, seed) | bounded)
     else:
         _show(console, study, answers)
-        _show_guarantee(console, promise, next(iter(answers.values())))
+        show_guarantee(console, promise, next(iter(answers.values())).margins)
         if not check and not observer and selection.engineering.has_requirement:
             _show_trade(console, selection)
         if origin:
@@ -313,61 +305,6 @@ def gains(
     unproved = promise is not None and not promise.holds
     if unproved or (check and failing(answers["scenario"].loop)):
         raise typer.Exit(CONDITION_FAILS)
-
-
-def _require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> None:
-    """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
-    require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
-    require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
-
-
-def _write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
-    """Write the first unstable aircraft as an airframe and the scenario that flies it, if a folder
-    is named.
-    """
-    if folder is None:
-        return
-    chosen = find_scenario(scenario)
-    frame = load_airframe(airframe)
-    require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
-    fits = (
-        not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
-    )
-    require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
-    require(
-        chosen.controller.allocation is None,
-        "worst",
-        "an allocation",
-        "a scenario without one: the entries are those of the law's inputs",
-    )
-    assert promise.unstable is not None  # noqa: S101 - for mypy
-    with writing("--set worst", folder, "a folder that can"):
-        folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "airframe.yaml"
-    write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
-    flown = chosen.vary(aircraft={"airframe": str(path.absolute())})
-    write_text("worst", folder / "scenario.yaml", scenario_yaml(flown))
-
-
-def _show_guarantee(console: Console, promise: Guarantee | None, answer: Assessment) -> None:
-    """The guarantee in sentences, and a table of the disk margins."""
-    if promise is None:
-        return
-    for line in guarantee_text(promise):
-        console.print(line, highlight=False, soft_wrap=True)
-    margins = answer.margins
-    if not promise.holds or margins is None or margins.worst is None:
-        return
-    heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
-    title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
-    table = new_table(title, heads, left_aligned=("input",))
-    for name, disk, least in guarantee_rows(promise, margins):
-        size = np.array(disk)
-        values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
-        table.add_row(
-            name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
-        )
-    console.print(table)
 
 
 def _require_check_alone(selections: Mapping[str, object], loop: Mapping[str, object]) -> None:

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What `rise-di gains --check --guarantee` shows and writes."""
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import as_yaml, with_entries
+from flight_analysis.closed_loop.guarantee import Guarantee
+from flight_analysis.closed_loop.loop_margins import LoopMargins
+from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
+from flight_cli.output import LICENCE, new_table, write_text
+from flight_core.files import writing
+from flight_core.parameters import require
+from rise_di_controller.margins import disk_gain, disk_phase
+
+FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
+
+
+def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> None:
+    """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
+    require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
+    require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
+
+
+def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
+    """Write the first unstable aircraft as an airframe and the scenario that flies it, if a folder
+    is named.
+    """
+    if folder is None:
+        return
+    chosen = find_scenario(scenario)
+    frame = load_airframe(airframe)
+    require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
+    fits = (
+        not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
+    )
+    require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
+    require(
+        chosen.controller.allocation is None,
+        "worst",
+        "an allocation",
+        "a scenario without one: the entries are those of the law's inputs",
+    )
+    assert promise.unstable is not None  # noqa: S101 - for mypy
+    with writing("--set worst", folder, "a folder that can"):
+        folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "airframe.yaml"
+    write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
+    flown = chosen.vary(aircraft={"airframe": str(path.absolute())})
+    write_text("worst", folder / "scenario.yaml", scenario_yaml(flown))
+
+
+def show_guarantee(
+    console: Console, promise: Guarantee | None, margins: LoopMargins | None
+) -> None:
+    """The guarantee in sentences, and a table of the disk margins."""
+    if promise is None:
+        return
+    for line in guarantee_text(promise):
+        console.print(line, highlight=False, soft_wrap=True)
+    if not promise.holds or margins is None or margins.worst is None:
+        return
+    heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
+    title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
+    table = new_table(title, heads, left_aligned=("input",))
+    for name, disk, least in guarantee_rows(promise, margins):
+        size = np.array(disk)
+        values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
+        table.add_row(
+            name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
+        )
+    console.print(table)
