@@ -214,7 +214,9 @@ class StateSpaceModel:
         if self._over_place is not None:
             rate = rate + self._rate_by_wind()
             along = wind_field.body_axes(0.0, 0.0, self._psi) @ self._wind_here
-            wind = wind + along[[AXES.index(axis) for axis in self._axes]]
+            blown = [place for place, axis in enumerate(self._axes) if axis in AXES]
+            wind = wind.copy()
+            wind[blown] += along[[AXES.index(self._axes[place]) for place in blown]]
         return truth.values(self._state, wind, rate, flown)
 
     def diverged(self) -> bool:
