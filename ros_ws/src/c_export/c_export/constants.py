@@ -18,12 +18,12 @@ from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray
 from reference_model.model import stepper
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller import samples
 from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
 from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
 from rise_di_controller.observer import ObserverParams
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.samples import AGREEING, FIRST_NS, MEMORY, TIMES
 from rise_di_controller.saturation import Limits
 from rise_di_controller.schedule import ScheduleParams, airspeed_range
 
@@ -235,8 +235,11 @@ def header(
     reference: ReferenceModelConfig | None = None,
     *,
     float32: bool,
+    samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """The text of rise_di_parameters.h; without a reference model where `reference` is None."""
+    """The text of rise_di_parameters.h; without a reference model where `reference` is None.
+    `samples` of y and of y_m are kept.
+    """
     m, p, n, s, schedule = sizes(controller)
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
@@ -259,8 +262,8 @@ def header(
     single |= {
         "RELAXATION": RELAXATION,
         "EXCHANGE_LEAST": SMALL,
-        "TIMES": samples.TIMES,
-        "MEMORY": samples.MEMORY,
+        "TIMES": TIMES,
+        "MEMORY": MEMORY,
     }
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
@@ -292,12 +295,9 @@ def header(
             "pressure */"
         ),
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
-        f"#define RISE_DI_SAMPLES {SAMPLE_BUFFER_SIZE} /* samples kept of y and of y_m */",
-        f"#define RISE_DI_AGREEING {samples.AGREEING} /* samples in a row after a jump of y */",
-        (
-            f"#define RISE_DI_FIRST_NS {samples.FIRST_NS} /* after the first y, in which it may "
-            "jump */"
-        ),
+        f"#define RISE_DI_SAMPLES {samples} /* samples kept of y and of y_m */",
+        f"#define RISE_DI_AGREEING {AGREEING} /* samples in a row after a jump of y */",
+        (f"#define RISE_DI_FIRST_NS {FIRST_NS} /* after the first y, in which it may jump */"),
         *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
         f"#define RISE_DI_SWEEPS {SWEEPS}",
         f"#define RISE_DI_HALVINGS {HALVINGS}",

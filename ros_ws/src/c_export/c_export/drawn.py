@@ -33,7 +33,7 @@ from rise_di_controller import feedforward
 from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.feedforward import FeedforwardState
-from rise_di_controller.guard import DT_RANGE
+from rise_di_controller.guard import DT_RANGE, SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import saturate
 
@@ -42,7 +42,9 @@ EPOCH_NS = (
 )
 
 
-def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recording:
+def drawn_calls(
+    sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
+) -> Recording:
     """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new
     parameters, deactivation.
     """
@@ -55,7 +57,7 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
     airspeed = np.array(
         [0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs]
     )
-    recorder = Recorder(sets)
+    recorder = Recorder(sets, samples=samples)
     now_ns = EPOCH_NS
     y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
     jumps = _jumps(unit, np.random.default_rng([seed, 1]))

@@ -4,6 +4,7 @@
 faults, and of a log.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from flight_log.tape_reader import RecordedRun
 from rise_di_controller import guard, internals
 from rise_di_controller.control_law import fields
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.guard import TickInputs
+from rise_di_controller.guard import SAMPLE_BUFFER_SIZE, TickInputs
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(
@@ -104,15 +105,17 @@ class Recorder(Controller):
     may take, the first at first.
 
     `before_tick` is called with the recorder and the instant before each tick, and returns whether
-    the controller is active.
+    the controller is active. `samples` of y and of y_m are kept.
     """
 
     def __init__(
         self,
         sets: Sequence[RiseDiConfig],
         before_tick: Callable[["Recorder", int], bool] = lambda recorder, now_ns: True,
+        samples: int = SAMPLE_BUFFER_SIZE,
     ) -> None:
-        super().__init__(sets[0])
+        self._kept = samples
+        self._reset(sets[0])
         self.sets = sets
         self._before_tick = before_tick
         self.silent: frozenset[str] = frozenset()  # samples that get lost: y, y_m
@@ -123,6 +126,11 @@ class Recorder(Controller):
         self._none = np.zeros(len(sets[0].outputs))
         self._names = state_names(sets[0])
         self._add(START)
+
+    def _reset(self, parameters: RiseDiConfig) -> None:
+        super().__init__(parameters)
+        self._y = deque(maxlen=self._kept)
+        self._y_m = deque(maxlen=self._kept)
 
     def _add(
         self,
@@ -139,7 +147,7 @@ class Recorder(Controller):
 
     def begin(self) -> None:
         """A new controller with the first parameters."""
-        super().__init__(self.sets[0])
+        self._reset(self.sets[0])
         self._refused = 0
         self._add(START)
 
@@ -286,16 +294,20 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     return sets
 
 
-def flight_recordings(scenario: Scenario, sets: Sequence[RiseDiConfig]) -> Iterator[Recording]:
+def flight_recordings(
+    scenario: Scenario, sets: Sequence[RiseDiConfig], samples: int = SAMPLE_BUFFER_SIZE
+) -> Iterator[Recording]:
     """Flights in one process: as the scenario says, with a tenth of y lost, and with faults.
 
     Faults: new parameters, y or y_m lost within hold, within ramp and beyond, deactivation,
     engagement, tight limits.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
-    yield _flown("the flight", scenario, Recorder(sets))
-    yield _flown("a tenth of y lost", scenario.vary(aircraft={"sensors": sensors}), Recorder(sets))
-    yield _flown("faults", scenario, Recorder(sets, _faults(scenario.flight.duration, sets)))
+    yield _flown("the flight", scenario, Recorder(sets, samples=samples))
+    lossy = scenario.vary(aircraft={"sensors": sensors})
+    yield _flown("a tenth of y lost", lossy, Recorder(sets, samples=samples))
+    faults = _faults(scenario.flight.duration, sets)
+    yield _flown("faults", scenario, Recorder(sets, faults, samples))
 
 
 def _flown(name: str, scenario: Scenario, recorder: Recorder) -> Recording:

@@ -22,6 +22,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
+from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SOURCE = Path(str(files("c_export"))) / "source"
@@ -34,6 +35,7 @@ COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
 MAX_SETS = 64  # of proof.c
+LEAST_SAMPLES = 4  # kept: the slope of y_m spans two periods
 
 FLOAT32_BOUND = 2.0**-10
 """Largest difference of u in float32 along a flight, as a part of the range of u in the flight."""
@@ -75,19 +77,22 @@ def write_code(
     reference: ReferenceModelConfig | None = None,
     *,
     float32: bool,
+    samples: int = SAMPLE_BUFFER_SIZE,
 ) -> list[Path]:
     """Write the C code of a controller and of a reference model to a folder; remove the report and
     the unit of earlier code.
 
-    Raises ParameterError.
+    The controller keeps `samples` of y and of y_m. Raises ParameterError.
     """
+    require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (REPORT, FMU):
             (folder / name).unlink(missing_ok=True)
         for name in CODE:
             shutil.copyfile(SOURCE / name, folder / name)
-        write_file(folder / PARAMETERS, header(controller, scenario, reference, float32=float32))
+        text = header(controller, scenario, reference, float32=float32, samples=samples)
+        write_file(folder / PARAMETERS, text)
     return [folder / name for name in (*CODE, PARAMETERS)]
 
 

@@ -19,6 +19,7 @@ AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y and their axes of PX4: roll, pitch, yaw."""
 
 MODULE = "src/modules/rise_di_control"
+SAMPLES = 8  # kept: y_m is stepped past each y, so a tick needs the newest y and two of y_m
 SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed: where the dynamic pressure is clipped
 
 FILES = {
@@ -59,7 +60,14 @@ def write_px4(scenario: Scenario, folder: Path, *, float32: bool) -> list[Path]:
         "none: PX4 allocates the torque",
     )
     module = folder / MODULE
-    files = write_code(controller, scenario.name, module, scenario.reference_model, float32=float32)
+    files = write_code(
+        controller,
+        scenario.name,
+        module,
+        scenario.reference_model,
+        float32=float32,
+        samples=samples,
+    )
     message = MESSAGE.format(channels=", ".join(outputs), m=len(outputs))
     texts = {
         **FILES,

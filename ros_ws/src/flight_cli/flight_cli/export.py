@@ -51,6 +51,14 @@ def export(
     runner: Annotated[
         str, setting("runner", "Command that starts what the compiler makes, as qemu-aarch64.")
     ] = "",
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            "--set samples",
+            min=4,
+            help="Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.",
+        ),
+    ] = None,
     fmu: Annotated[
         bool,
         option("Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", "--fmu"),
@@ -82,6 +90,7 @@ def export(
             seed=seed,
             compiler=compiler or (),
             runner=runner,
+            samples=samples,
             fmu=fmu,
             px4=px4 is not None,
             proof=not without_proof,

@@ -11,7 +11,7 @@ from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import build_fmu
 from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
-from c_export.px4 import MODULE, write_px4
+from c_export.px4 import MODULE, SAMPLES, write_px4
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_path
@@ -19,6 +19,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.tape_reader import RecordedRun, read_run
+from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # drawn steps of a recording
@@ -52,6 +53,7 @@ def export(
     runner: str = "",
     fmu: bool = False,
     px4: bool = False,
+    samples: int | None = None,
     proof: bool = True,
 ) -> Exported:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
@@ -69,6 +71,8 @@ def export(
         runner: Command that starts a program of the compiler, as qemu-aarch64 for a cross compiler.
         fmu: Write a co-simulation unit of FMI 2.0 too.
         px4: Write the code as an external module of PX4.
+        samples: Samples of y and of y_m that the controller keeps, 4 or more; None: 8 of a module,
+            else 100.
         proof: Whether to prove.
 
     Returns:
@@ -89,12 +93,14 @@ def export(
     controller = exportable(chosen.controller)
     commands = compilers(compiler) if proof or fmu else []
     starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
+    kept = samples or (SAMPLES if px4 else SAMPLE_BUFFER_SIZE)
     if px4:
         code = folder / MODULE
-        files = write_px4(chosen, folder, float32=float32)
+        files = write_px4(chosen, folder, float32=float32, samples=kept)
     else:
         code = folder
-        files = write_code(controller, title, folder, chosen.reference_model, float32=float32)
+        model = chosen.reference_model
+        files = write_code(controller, title, folder, model, float32=float32, samples=kept)
     if fmu:
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU))
     if not proof:
@@ -103,9 +109,8 @@ def export(
     if run is None:
         length = min(chosen.flight.duration, LONGEST) if duration is None else duration
         sets = parameter_sets(controller)
-        recordings = _recordings(
-            chosen.vary(flight={"duration": length}), sets, 0 if float32 else drawn, seed
-        )
+        flight = chosen.vary(flight={"duration": length})
+        recordings = _recordings(flight, sets, 0 if float32 else drawn, seed, kept)
     else:
         sets, recording, equal = run_recording(
             run if isinstance(run, RecordedRun) else read_run(run)
@@ -122,15 +127,15 @@ def export(
 
 
 def _recordings(
-    scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int
+    scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
     """Flights, drawn commands; `drawn` steps and a tenth as many calls, in parts, so that a part
     fits in memory.
     """
-    yield from flight_recordings(scenario, sets)
+    yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)
     if drawn:
-        yield drawn_calls(sets, max(drawn // 10, 100), seed)
+        yield drawn_calls(sets, max(drawn // 10, 100), seed, samples)
         each = -(-drawn // len(sets))
         for index in range(len(sets)):
             for begin in range(0, each, PART):
