@@ -41,7 +41,12 @@ struct vehicle_rates_setpoint_s { uint64_t timestamp; float roll, pitch, yaw; };
 struct vehicle_thrust_setpoint_s { uint64_t timestamp, timestamp_sample; float xyz[3]; };
 struct vehicle_torque_setpoint_s { uint64_t timestamp, timestamp_sample; float xyz[3]; };
 struct manual_control_setpoint_s { uint64_t timestamp; float aux1, aux2, aux3, aux4, aux5, aux6; };
-struct rise_di_status_s { uint64_t timestamp, timestamp_sample; double y[3], y_m[3], e[3], u[3]; uint8_t mode, refusal; };
+struct rise_di_status_s {
+	uint64_t timestamp, timestamp_sample, parameters;
+	uint32_t number;
+	uint8_t mode, refusal;
+	double y[3], y_m[3], e[3], u[3], u_end[3], y_m_offset;
+};
 
 namespace px4
 {

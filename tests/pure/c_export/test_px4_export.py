@@ -8,18 +8,26 @@ import ctypes
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import typer
 from tests.conftest import REPOSITORY
 
-from c_export.proof import FLAGS, build
-from c_export.px4 import AXES, MODULE, write_px4
+from c_export.constants import exportable
+from c_export.events import flight_recordings
+from c_export.proof import FLAGS, PARAMETERS, build, write_code
+from c_export.px4 import AXES, MODULE, SAMPLES, write_px4
+from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.export import export
 from flight_core.parameters import ParameterError
+from flight_design.identification.module_log import STATUS, module_flight
+from flight_log.vehicle_log import Table, VehicleLog
+from rise_di_controller.internals import Saturation
+from rise_di_controller.params import ControllerConfig
 
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"
@@ -62,7 +70,14 @@ int host_run(rise_di_rates *rates, const rise_di_cycle *cycle, float *torque, do
         torque[k] = rates->torque[k];
         values[k] = (double)rates->y_m[k];
         values[3 + k] = (double)rates->controller.u[k];
+        values[6 + k] = (double)rates->controller.y[k];
+        values[9 + k] = (double)rates->controller.y_m[k];
+        values[12 + k] = (double)rates->controller.law.e[k];
+        values[15 + k] = (double)rates->u_end[k];
     }
+    values[18] = (double)rates->y_m_offset;
+    values[19] = (double)rates->number;
+    values[20] = (double)rates->y_us;
     return (int)rates->refusal;
 }
 """
@@ -78,7 +93,7 @@ class Shell:
         self._library.rise_di_rates_start(self._memory)
         self.now_us = 1_000_000
         self.torque = np.zeros(3, dtype=np.float32)
-        self.values = np.zeros(6)
+        self.values = np.zeros(21)  # y_m, u; then what rise_di_status has
         self.spare = (0.1, -0.2, 0.05)
         self.lost: set[str] = set()
 
@@ -103,10 +118,10 @@ class Shell:
         return [self.run(**changes) for _ in range(cycles)]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["double", "float"])
+def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     folder = tmp_path_factory.mktemp("px4")
-    write_px4(find_scenario(str(RATES)), folder, float32=False)
+    write_px4(find_scenario(str(RATES)), folder, float32=request.param == "float")
     return folder
 
 
@@ -157,7 +172,7 @@ def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
     shell.fly(500, enabled=False)
     assert shell.run() == FLIES
     assert shell.torque == pytest.approx(shell.spare, abs=0.02)
-    assert shell.values[3:] == pytest.approx(
+    assert shell.values[3:6] == pytest.approx(
         0.261799 * shell.torque[[1, 0, 2]], rel=1e-6
     )  # u in rad, q p r
 
@@ -279,6 +294,17 @@ def test_parameters_and_topics_are_those_of_the_source(folder: Path) -> None:
     assert set(re.findall(r"\tstatus\.(\w+)", source)) == set(fields)
 
 
+def test_flight_needs_no_more_samples_than_the_module_keeps(folder: Path) -> None:
+    """The u of a flight is that with the 100 samples of the stack."""
+    assert f"RISE_DI_SAMPLES {SAMPLES} " in (folder / MODULE / PARAMETERS).read_text("utf-8")
+    flight = find_scenario(str(RATES), 4.0)
+    sets = [exportable(flight.controller)]
+    few, many = (next(flight_recordings(flight, sets, kept)) for kept in (SAMPLES, 100))
+    assert few.reals.tobytes() == many.reals.tobytes()
+    with pytest.raises(ParameterError, match="samples: found 3, expected 4 or more"):
+        write_code(sets[0], "rates", folder / "few", float32=False, samples=3)
+
+
 def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
     def refused(scenario: Scenario, words: str) -> None:
         with pytest.raises(ParameterError, match=words):
@@ -296,3 +322,90 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
     with pytest.raises(typer.BadParameter, match="--c FOLDER or --px4 FOLDER"):
         export("osprey_servo")
     assert set(AXES) == set("pqr")
+
+
+def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
+    """rise_di_status of a flight: rates at twice the rate of the law with jitter, slow and fast, a
+    hand-back of 0.2 s.
+    """
+    rng = np.random.default_rng(7)
+    rows: list[dict[str, Any]] = []
+    for k in range(2400):
+        shell.now_us += int(rng.integers(-2300, -1700))
+        t = 0.002 * k
+        speed = 10.0 + 0.5 * np.sin(t) if k % 50 == 0 else rows[-1]["airspeed"] if rows else 11.5
+        setpoint = tuple(0.3 * np.sin(3.0 * t + np.arange(3.0)))
+        rates = tuple(0.8 * np.array(setpoint) + 0.05 * rng.normal(size=3))
+        rates = tuple(2.0 + rate for rate in rates) if 900 < k < 1200 else rates  # into the limits
+        enabled = not 1500 <= k < 1600
+        refusal = shell.run(
+            setpoint=setpoint, rates=rates, airspeed=speed, enabled=enabled, max_error=30.0
+        )
+        rows.append({"refusal": refusal, "airspeed": speed, "now": shell.now_us})
+        rows[-1]["values"] = shell.values.copy()
+    values = np.array([row["values"] for row in rows])
+    now_us = np.array([row["now"] for row in rows])
+    places = {"y": 6, "y_m": 9, "e": 12, "u": 3, "u_end": 15}
+    fields = {f"{name}[{i}]": values[:, k + i] for name, k in places.items() for i in range(3)}
+    fields |= {"y_m_offset": values[:, 18], "number": values[:, 19]}
+    fields |= {
+        "timestamp_sample": values[:, 20],
+        "refusal": np.array([row["refusal"] for row in rows]),
+    }
+    fields |= {"parameters": np.full(len(rows), float(controller.digest()))}
+    return Table(1000 * now_us, fields)
+
+
+def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> None:
+    """Python computes the u of each tick: from the y, y_m and limits of rise_di_status alone. After
+    a gap of the log it begins again with the next engagement.
+    """
+    controller = find_scenario(str(RATES)).controller
+    table = flown_table(shell, controller)
+    log = VehicleLog("a ULog", {STATUS: table}, {}, None)
+    if "RISE_DI_FLOAT32 1" in (folder / MODULE / PARAMETERS).read_text("utf-8"):
+        with pytest.raises(ParameterError, match="found u of --float32"):
+            module_flight(log, controller)
+        return
+    flight = module_flight(log, controller)
+    ticks = len(flight.tape["internals"].stamp_ns)
+    assert 1000 < ticks < 1200  # of 2400 cycles the law steps in every other one
+    assert flight.equal == ticks
+    assert flight.lost == 0
+    limited = flight.tape["internals"].group("limited").values
+    assert (limited == Saturation.MAGNITUDE).sum() > 100
+    assert len(flight.changes) > 20  # of the airspeed
+    replayed = replay(flight.tape, controller, changes=[change.values for change in flight.changes])
+    assert replayed.equal()
+    assert replayed.checked.sum() == ticks - 4  # the engagements: two of them after jumps of y
+    keep = np.ones(len(table.stamp_ns), dtype=bool)
+    keep[700:710] = False
+    fields = {name: values[keep] for name, values in table.fields.items()}
+    log = VehicleLog("a ULog", {STATUS: Table(table.stamp_ns[keep], fields)}, {}, None)
+    cut = module_flight(log, controller)
+    assert cut.lost > 90  # of the 100 up to the engagement
+    assert cut.equal == len(cut.tape["internals"].stamp_ns)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"parameters": 5.0}, "found 000000000005, expected"),
+        ({"u_end[2]": None}, r"found no u_end\[2\], expected"),
+        ({"refusal": 1.0}, "found no tick of RISE-DI, expected a flight with RDI_EN 1"),
+    ],
+)
+def test_log_of_another_module_is_refused(
+    shell: Shell, changes: dict[str, float | None], words: str
+) -> None:
+    controller = find_scenario(str(RATES)).controller
+    table = flown_table(shell, controller)
+    fields = dict(table.fields)
+    for name, value in changes.items():
+        if value is None:
+            del fields[name]
+        else:
+            fields[name] = np.full(len(table.stamp_ns), value)
+    log = VehicleLog("a ULog", {STATUS: Table(table.stamp_ns, fields)}, {}, None)
+    with pytest.raises(ParameterError, match=words):
+        module_flight(log, controller)

@@ -32,17 +32,23 @@ FILES = {
 MESSAGE = """# Rate controller of RISE-DI: a cycle, in the order {channels}
 uint8 ORB_QUEUE_LENGTH = 16  # the logger misses no tick
 uint64 timestamp         # [us]
-uint64 timestamp_sample  # [us] of the rates
+uint64 timestamp_sample  # [us] of y
+uint64 parameters        # digest of the scenario's
+uint32 number            # of the ticks since the law engaged
 uint8 mode               # rise_di_mode
 uint8 refusal            # rise_di_refusal; 0: RISE-DI flies
-float64[{m}] y           # [rad/s]
+float64[{m}] y           # [rad/s] that the law took; else the rates
 float64[{m}] y_m         # [rad/s] at the instant of y
 float64[{m}] e           # [rad/s] y - y_m
 float64[{m}] u           # units of the input
+float64[{m}] u_end       # abs(u) of the torque of 1 at this airspeed
+float64 y_m_offset       # [s] of the newest y_m after y
 """
 
 
-def write_px4(scenario: Scenario, folder: Path, *, float32: bool) -> list[Path]:
+def write_px4(
+    scenario: Scenario, folder: Path, *, float32: bool, samples: int = SAMPLES
+) -> list[Path]:
     """Write the module to a folder, for `make px4_sitl EXTERNAL_MODULES_LOCATION=FOLDER`. Raises
     ParameterError.
 

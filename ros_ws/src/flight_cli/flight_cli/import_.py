@@ -6,21 +6,27 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import typer
 from rich.console import Console
 
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import find_map, load_map
-from flight_analysis.report.run_folder import PROVENANCE
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.run_folder import PROVENANCE, attachments_for
 from flight_cli.output import new_table, say
 from flight_cli.words import argument, option, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
+from flight_core.outcome import IMPORT
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
 from flight_design.identification.log_import import PARAMETERS, Window, imported, kind_of_map
+from flight_design.identification.module_log import module_flight
 from flight_design.identification.parameter_agreement import Agreement
 from flight_log.bag import CHANNEL_UNITS, COMPARED, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
-from flight_log.tape_writer import write_run
+from flight_log.tape_writer import TapeWriter, write_run
 from flight_log.vehicle_log import Choice, read_foreign_log
 
 
@@ -29,8 +35,16 @@ def import_(
         Path, argument("DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.")
     ],
     map_name: Annotated[
-        str, option("Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP")
-    ],
+        str | None,
+        option("Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP"),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        option(
+            "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "
+            "replay."
+        ),
+    ] = None,
     output: Annotated[
         Path | None, option("Folder to create; by default runs/ with the name of the log.")
     ] = None,
@@ -59,12 +73,20 @@ def import_(
 
     By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`,
     `identify --bridge`, `report` and `watch` read the bag. u is the deviation from the median of
-    the stretch, `commands` is the whole.
+    the stretch, `commands` is the whole. With --scenario `replay` computes each tick of the module
+    again.
 
     Exit status: 0, or 2 bad input.
     """
     for name, value in (("from", start), ("until", stop)):
         require(value is None or value >= 0.0, name, value, "0 s or more")
+    if (map_name is None) == (scenario is None):
+        raise typer.BadParameter("expected --map MAP or --scenario SCENARIO")
+    folder = output or Path("runs") / log.stem
+    require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
+    if map_name is None:
+        _import_module(log, find_scenario(scenario or ""), folder)
+        return
     channel_map = load_map(map_name)
     console = Console()
 
@@ -84,8 +106,6 @@ def import_(
         log, Choice(system, _numbers(instances or []), kind_of_map(channel_map))
     )
     tape, parameters, notes = imported(channel_map, read, Window(start, stop), show, servos=servos)
-    folder = output or Path("runs") / log.stem
-    require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
     with writing("--output", folder, "a folder that can"):
         folder.mkdir(parents=True)
         write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
@@ -108,13 +128,7 @@ def import_(
     )
     for sentence in notes:
         warn(f"warning: {sentence}")
-    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"))
-    for topic, signal in tape.signals.items():
-        gaps = np.diff(signal.stamp_ns) / NANOSECONDS
-        rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
-        longest = float(gaps.max()) if len(gaps) else 0.0
-        table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
-    console.print(table)
+    _show_topics(console, f"{log.name}, {read.kind}", tape)
     begin = (
         tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     ) / NANOSECONDS
@@ -123,6 +137,38 @@ def import_(
         console,
         f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",
     )
+
+
+def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
+    """Write the ticks of a module of PX4 as a run of its scenario."""
+    read = read_foreign_log(log)
+    flight = module_flight(read, scenario.controller)
+    with writing("--output", folder, "a folder that can"):
+        folder.mkdir(parents=True)
+    attachments = attachments_for(scenario, folder)
+    with TapeWriter(folder, attachments, flight.tape.start_ns) as writer:
+        for change in flight.changes:
+            writer.write_changes(change.stamp_ns, "/controller", change.values)
+        writer.write(flight.tape.signals)
+        writer.add_outcome(IMPORT)
+    if flight.lost:
+        warn(f"warning: {flight.lost} ticks after a gap of the log left out")
+    console = Console()
+    _show_topics(console, f"{log.name}, {read.kind}", flight.tape)
+    ticks = len(flight.tape["internals"].stamp_ns)
+    said = f"{flight.equal} of {ticks} ticks have the u of Python to the bit"
+    say(console, f"{said}\nlog:   {display_path(writer.path)}")
+
+
+def _show_topics(console: Console, title: str, tape: Tape) -> None:
+    """Number, rate and gaps of the samples by topic."""
+    table = new_table(title, ("topic", "samples", "Hz", "longest gap, s"))
+    for topic, signal in tape.signals.items():
+        gaps = np.diff(signal.stamp_ns) / NANOSECONDS
+        rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
+        longest = float(gaps.max()) if len(gaps) else 0.0
+        table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
+    console.print(table)
 
 
 def _numbers(instances: list[str]) -> dict[str, int]:

@@ -163,15 +163,19 @@ void RiseDiControl::publish(bool flies)
 	_thrust_pub.publish(_spare_thrust);
 
 	status.timestamp = torque.timestamp;
-	status.timestamp_sample = _velocity.timestamp_sample;
+	status.timestamp_sample = flies ? _rates.y_us : _velocity.timestamp_sample;
 	status.mode = _rates.controller.mode;
 	status.refusal = _rates.refusal;
+	status.number = _rates.number;
+	status.parameters = _rates.parameters[0].digest;
+	status.y_m_offset = (double)_rates.y_m_offset;
 
 	for (int i = 0; i < RISE_DI_M; i++) {
-		status.y[i] = (double)_rates.y[i];
+		status.y[i] = (double)(flies ? _rates.controller.y[i] : _rates.y[i]);
 		status.y_m[i] = (double)_rates.controller.y_m[i];
 		status.e[i] = (double)_rates.controller.law.e[i];
 		status.u[i] = (double)_rates.controller.u[i];
+		status.u_end[i] = (double)_rates.u_end[i];
 	}
 
 	_status_pub.publish(status);

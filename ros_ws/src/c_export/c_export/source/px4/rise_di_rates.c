@@ -100,8 +100,27 @@ static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle) {
 /* The law begins with the u of the torque that flies. */
 static void engage(rise_di_rates *rates, rise_di_real scale) {
     rise_di_restart(&rates->controller);
+    rates->number = 0;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         rates->controller.u[i] = (rise_di_real)rates->mean[axis_of[i]] / (torque_per_u[i] * scale);
+    }
+}
+
+/* No u beyond the torque of 1 at this airspeed: other limits are other parameters. */
+static void limit(rise_di_rates *rates, rise_di_real scale) {
+    const rise_di_parameters *now = rates->controller.parameters;
+    rise_di_parameters *next = &rates->parameters[(now == &rates->parameters[0]) ? 1 : 0];
+    bool changed = false;
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real end = (rise_di_real)1 / (((torque_per_u[i] < (rise_di_real)0) ? -torque_per_u[i] : torque_per_u[i]) * scale);
+        rates->u_end[i] = end;
+        next->limits.lower[i] = (exported.limits.lower[i] < -end) ? -end : exported.limits.lower[i];
+        next->limits.upper[i] = (exported.limits.upper[i] > end) ? end : exported.limits.upper[i];
+        changed = changed || (next->limits.lower[i] < now->limits.lower[i]) || (next->limits.lower[i] > now->limits.lower[i]) ||
+                  (next->limits.upper[i] < now->limits.upper[i]) || (next->limits.upper[i] > now->limits.upper[i]);
+    }
+    if (changed) {
+        rise_di_retune(&rates->controller, next);
     }
 }
 
@@ -109,14 +128,14 @@ static void engage(rise_di_rates *rates, rise_di_real scale) {
 static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, rise_di_real scale, float *torque) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     rise_di_output output;
-    for (int32_t i = 0; i < RISE_DI_M; i++) { /* no u beyond the torque of 1 */
-        const rise_di_real end = (rise_di_real)1 / (((torque_per_u[i] < (rise_di_real)0) ? -torque_per_u[i] : torque_per_u[i]) * scale);
-        rates->parameters.limits.lower[i] = (exported.limits.lower[i] < -end) ? -end : exported.limits.lower[i];
-        rates->parameters.limits.upper[i] = (exported.limits.upper[i] > end) ? end : exported.limits.upper[i];
-    }
     if ((in_ns(cycle->rates_us - rates->tick_us) * 4) >= (exported.period_ns * 3)) { /* the rates may come faster */
         rates->tick_us = cycle->rates_us;
-        (void)rise_di_tick(&rates->controller, in_ns(cycle->now_us), true, &output);
+        limit(rates, scale);
+        if (rise_di_tick(&rates->controller, in_ns(cycle->now_us), true, &output)) {
+            rates->number = (output.dt > (rise_di_real)0) ? (rates->number + 1U) : 1U;
+            rates->y_us = (uint64_t)output.stamp_ns / 1000U;
+            rates->y_m_offset = output.y_m_offset;
+        }
     }
     if (rates->controller.mode > RISE_DI_ENGAGED) {
         refusal = RISE_DI_FAILSAFE;
@@ -136,8 +155,10 @@ static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, ri
 }
 
 void rise_di_rates_start(rise_di_rates *rates) {
-    rates->parameters = exported;
-    rates->started = rise_di_start(&rates->controller, &rates->parameters);
+    rates->parameters[0] = exported;
+    rates->parameters[1] = exported;
+    rates->parameters[1].digest = exported.digest + 1U;
+    rates->started = rise_di_start(&rates->controller, rates->parameters);
     rise_di_reference_start(&rates->reference, &model);
     rates->refusal = RISE_DI_OFF;
     rates->latched = RISE_DI_FLIES;
@@ -147,7 +168,11 @@ void rise_di_rates_start(rise_di_rates *rates) {
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         rates->y[i] = (rise_di_real)0;
         rates->y_m[i] = (rise_di_real)0;
+        rates->u_end[i] = (rise_di_real)0;
     }
+    rates->number = 0;
+    rates->y_us = 0;
+    rates->y_m_offset = (rise_di_real)0;
     for (int32_t k = 0; k < 3; k++) {
         rates->torque[k] = 0.0f;
         rates->mean[k] = 0.0f;

@@ -41,7 +41,7 @@ typedef struct {
 } rise_di_cycle;
 
 typedef struct {
-    rise_di_parameters parameters; /* of the scenario, with the limits of the present airspeed */
+    rise_di_parameters parameters[2]; /* of the scenario, with the limits of the present airspeed, in turn */
     rise_di_controller controller;
     rise_di_reference reference;
     bool started;
@@ -52,6 +52,10 @@ typedef struct {
     uint64_t reference_us;   /* start of the reference model */
     rise_di_real y[RISE_DI_M];
     rise_di_real y_m[RISE_DI_M];
+    uint32_t number;            /* of the ticks since the law engaged */
+    uint64_t y_us;              /* stamp of the y of the last tick: that of the rates, or of a sample before a lost one */
+    rise_di_real y_m_offset;    /* s, of the newest y_m after y, of the last tick */
+    rise_di_real u_end[RISE_DI_M]; /* abs(u) of the torque of 1 at the airspeed of the last tick */
     float torque[3];         /* to be sent */
     float mean[3];           /* torque of the spare, low-passed while it flies */
     float handover[3];       /* the last torque less that of the spare when it took over; fades */

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight of the exported controller inside PX4, from the topic rise_di_status of a ULog: the
+ticks as `internals`, so that replay computes them again.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.replay import vary
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS, seconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray, StampedVector
+from flight_log.vehicle_log import Table, VehicleLog
+from rise_di_controller import guard, internals
+from rise_di_controller.params import ControllerConfig
+
+STATUS = "rise_di_status"
+MICROSECONDS = 1000  # ns
+CHANNELS = ("y", "y_m", "e", "u", "u_end")
+EXPECTED = "a ULog of the module of `rise-di export --px4`, with rise_di_status in its topics"
+
+
+class Change(NamedTuple):
+    """Parameters of the controller that the module changed before a tick."""
+
+    stamp_ns: int
+    values: Mapping[str, Any]
+
+
+class ModuleFlight(NamedTuple):
+    """y, y_m, u and `internals` of the ticks of a module.
+
+    `equal` of the ticks have the u of Python to the bit, `lost` ticks follow a gap of the log.
+    """
+
+    tape: Tape
+    changes: tuple[Change, ...]
+    equal: int
+    lost: int
+
+
+def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight:
+    """The ticks of a module, each stretch from its engagement on.
+
+    Python steps the law from the u of the first tick of a stretch. e and u of `internals` are those
+    of the log, the states of the law those of Python. At low airspeed the torque of 1 limits u: a
+    change of the parameters. Raises ParameterError for a log without ticks, of other parameters, or
+    of a module in float.
+    """
+    require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
+    table = log.tables[STATUS]
+    ticks = _Ticks(table, controller)
+    flown = ticks.flown()
+    require(len(flown) > 0, "the log", "no tick of RISE-DI", "a flight with RDI_EN 1")
+    return ticks.computed(flown)
+
+
+class _Ticks:
+    """The rows of rise_di_status."""
+
+    def __init__(self, table: Table, controller: ControllerConfig) -> None:
+        m = len(controller.outputs)
+        names = [f"{channel}[{i}]" for channel in CHANNELS for i in range(m)]
+        names += ["timestamp_sample", "parameters", "number", "refusal", "y_m_offset"]
+        missing = ", ".join(name for name in names if name not in table.fields)
+        require(not missing, STATUS, f"no {missing}", "the message of this version of the export")
+        require(
+            f"y[{m}]" not in table.fields,
+            STATUS,
+            f"more than {m} channels",
+            f"those of the scenario: {', '.join(controller.outputs)}",
+        )
+        digests = np.unique(table.fields["parameters"])
+        same = len(digests) == 1 and digests[0] == controller.digest()
+        require(
+            same,
+            f"{STATUS}.parameters",
+            ", ".join(f"{digest:012x}" for digest in digests.astype(np.int64)),
+            f"{controller.digest():012x}, those of the scenario of the export",
+        )
+        self._controller = controller
+        self._now_ns = table.stamp_ns
+        self._stamp_ns = MICROSECONDS * table.fields["timestamp_sample"].astype(np.int64)
+        self._number = table.fields["number"].astype(np.int64)
+        flies = table.fields["refusal"] == 0.0
+        self._ticked = flies & (np.diff(self._stamp_ns, prepend=-1) != 0) & (self._number > 0)
+        self._offset_ns = np.round(table.fields["y_m_offset"] * NANOSECONDS).astype(np.int64)
+        self._values: dict[str, FloatArray] = {
+            channel: np.column_stack([table.fields[f"{channel}[{i}]"] for i in range(m)])
+            for channel in CHANNELS
+        }
+        u = self._values["u"][flies]
+        is_float = len(u) > 0 and bool((u == u.astype(np.float32)).all()) and bool(u.any())
+        require(
+            not is_float, STATUS, "u of --float32", "a module in double: Python computes in double"
+        )
+
+    def flown(self) -> list[list[int]]:
+        """The rows of the ticks by stretch, from an engagement of the law to a gap or the next."""
+        stretches: list[list[int]] = []
+        last: int | None = None  # number of the tick before; None: none to go on from
+        for k in np.flatnonzero(self._ticked).tolist():
+            number = int(self._number[k])
+            if number == 1:
+                stretches.append([k])
+                last = number
+            elif last is not None and number == last + 1:
+                stretches[-1].append(k)
+                last = number
+            else:
+                last = None
+        return stretches
+
+    def computed(self, stretches: list[list[int]]) -> ModuleFlight:
+        """The ticks with the states of Python."""
+        controller = self._controller
+        law = controller.tuned_law()
+        limits = controller.guard()
+        digest = controller.digest()
+        changes: list[Change] = []
+        rows: list[FloatArray] = []
+        equal = 0
+        number = 1  # the first tick of a stretch cannot be checked: its number leaves a gap
+        for stretch in stretches:
+            state = guard.initial_state(len(controller.inputs), None)
+            state = state._replace(u=self._values["u"][stretch[0]].copy())
+            number += 1
+            for k in stretch:
+                change = self._limits(k)
+                if any(getattr(controller, key) != value for key, value in change.items()):
+                    controller = vary(controller, change)
+                    changes.append(Change(int(self._stamp_ns[k]), change))
+                    new_law = controller.tuned_law()
+                    new_limits = controller.guard()
+                    state = guard.retune(state, law, new_law, (limits, new_limits))
+                    law = new_law
+                    limits = new_limits
+                    digest = controller.digest()
+                stamp_ns = int(self._stamp_ns[k])
+                y_m = [StampedVector(stamp_ns, self._values["y_m"][k])]
+                if self._offset_ns[k] > 0:
+                    y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + int(self._offset_ns[k])))
+                sample = StampedVector(stamp_ns, self._values["y"][k])
+                now_ns = int(self._now_ns[k])
+                state, used = guard.tick(state, now_ns, sample, y_m, limits, law, True)
+                if used is None:
+                    raise ParameterError(f"{STATUS}: found a tick in row {k} that the law refuses")
+                u = self._values["u"][k]
+                equal += state.u.tobytes() == u.tobytes()
+                age = seconds(now_ns - stamp_ns)
+                logged = state._replace(u=u)
+                rows.append(
+                    internals.values(logged, used, limits, 0.0, age, number, digest, np.zeros(0))
+                )
+                number += 1
+        return self._flight(stretches, rows, changes, equal)
+
+    def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
+        """The limits of u in a tick: those of the scenario, or the u of the torque of 1."""
+        end = self._values["u_end"][k]
+        exported = self._controller.guard().limits
+        return {
+            "lower": tuple(np.maximum(exported.lower, -end).tolist()),
+            "upper": tuple(np.minimum(exported.upper, end).tolist()),
+        }
+
+    def _flight(
+        self,
+        stretches: list[list[int]],
+        rows: list[FloatArray],
+        changes: list[Change],
+        equal: int,
+    ) -> ModuleFlight:
+        controller = self._controller
+        order = np.concatenate([np.array(stretch) for stretch in stretches])
+        stamps = self._stamp_ns[order]
+        groups = {"y": controller.outputs, "y_m": controller.outputs, "u": controller.inputs}
+        signals = {
+            name: Signal(stamps, channels, self._values[name][order])
+            for name, channels in groups.items()
+        }
+        names = internals.names(controller.logged_groups())
+        values = np.array(rows)
+        values[:, [names.index(f"e.{name}") for name in controller.outputs]] = self._values["e"][
+            order
+        ]
+        signals["internals"] = Signal(stamps, names, values)
+        lost = int(self._ticked.sum()) - len(order)
+        return ModuleFlight(Tape(signals, int(stamps[0])), tuple(changes), equal, lost)
