@@ -42,6 +42,8 @@ from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
+from flight_log.px4_parameters import rate_loop
+from rise_di_controller.margins import disk_gain, disk_phase
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
@@ -86,6 +88,14 @@ def gains(
     ] = None,
     delay: Annotated[
         float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")
+    ] = None,
+    px4: Annotated[
+        Path | None,
+        typer.Option(
+            "--set px4",
+            help="Parameter file of QGroundControl or ULog of PX4, for the module of export --px4: "
+            "rate and delay of the body rates.",
+        ),
     ] = None,
     inputs: Annotated[
         str | None,
@@ -228,6 +238,10 @@ def gains(
         "it alone",
         "--write beside it, without --observer",
     )
+    px4_origin = ""
+    if px4 is not None:
+        require(delay is None, "px4", "it beside --delay", "one of both")
+        rate, delay, px4_origin = rate_loop(px4, rate)
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     require_guarantee(check=check, guaranteed=guaranteed, worst=worst)
     promise: Guarantee | None = None
@@ -297,8 +311,8 @@ def gains(
         show_guarantee(console, promise, next(iter(answers.values())).margins)
         if not check and not observer and selection.engineering.has_requirement:
             _show_trade(console, selection)
-        if origin:
-            console.print(origin, highlight=False, soft_wrap=True)
+        for sentence in filter(None, (origin, px4_origin)):
+            console.print(sentence, highlight=False, soft_wrap=True)
         for key, path in (("gains", write), ("page", page), ("unstable aircraft", worst)):
             if path is not None:
                 console.print(f"{key}: {display_path(path)}", highlight=False, soft_wrap=True)

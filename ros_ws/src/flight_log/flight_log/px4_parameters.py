@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The loop of the body rates of PX4 from its parameters: rate, and delay by the gyro's filters.
+
+Sources: PX4 guide, "MC Filter Tuning and Control Latency", and parameter reference; the parameter
+file of QGroundControl: vehicle, component, name, value, type.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+from flight_core.files import read_file
+from flight_core.parameters import require
+from flight_log.file_kinds import file_kind
+from flight_log.vehicle_log import read_foreign_log
+
+DEFAULTS: Mapping[str, float] = MappingProxyType(
+    {
+        "IMU_GYRO_RATEMAX": 400.0,
+        "IMU_GYRO_CUTOFF": 40.0,
+        "IMU_GYRO_NF0_FRQ": 0.0,
+        "IMU_GYRO_NF0_BW": 20.0,
+        "IMU_GYRO_NF1_FRQ": 0.0,
+        "IMU_GYRO_NF1_BW": 20.0,
+    }
+)
+"""Values of PX4 1.16 for parameters that a file leaves out."""
+
+EXPECTED = "a parameter file of QGroundControl, or a ULog"
+COLUMNS = 5  # of a row of a parameter file
+
+
+class RateLoop(NamedTuple):
+    """Rate of the law, Hz, pure delay from the rates to the torque, s, and what both come from."""
+
+    rate: float
+    delay: float
+    origin: str
+
+
+def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
+    """The loop for a law at a rate, by default at that of the gyro.
+
+        delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate
+
+    with the cut-off f of a second-order Butterworth filter, the notches of frequency f_k and width
+    b_k, and a period of the law. Raises ParameterError.
+    """
+    values = {**DEFAULTS, **_read(path)}
+    fastest = values["IMU_GYRO_RATEMAX"]
+    chosen = fastest if rate is None else rate
+    require(
+        0.0 < chosen <= fastest,
+        "rate",
+        chosen,
+        f"at most IMU_GYRO_RATEMAX, {fastest:g} Hz",
+    )
+    cutoff = values["IMU_GYRO_CUTOFF"]
+    delay = 1.0 / (math.sqrt(2.0) * math.pi * cutoff) if cutoff > 0.0 else 0.0
+    words = f"cut-off {cutoff:g} Hz" if cutoff > 0.0 else "no cut-off"
+    for name in ("IMU_GYRO_NF0", "IMU_GYRO_NF1"):
+        frequency = values[f"{name}_FRQ"]
+        if frequency > 0.0:
+            width = values[f"{name}_BW"]
+            delay += width / (2.0 * math.pi * frequency**2)
+            words += f", notch {frequency:g} Hz"
+    delay += 1.0 / chosen
+    origin = f"{path.name}: gyro at {fastest:g} Hz, {words}; delay {1e3 * delay:.3g} ms"
+    return RateLoop(chosen, delay, origin)
+
+
+def _read(path: Path) -> dict[str, float]:
+    """The parameters that a file has, of DEFAULTS. Raises ParameterError."""
+    require(path.is_file(), "px4", f"no file {path}", EXPECTED)
+    if "ULog" in file_kind(path):
+        recorded = read_foreign_log(path).parameters
+        values = {name: records[-1].value for name, records in recorded.items()}
+    else:
+        lines = read_file(path, "px4", EXPECTED).decode("utf-8", "replace").splitlines()
+        rows = [line.split("\t") for line in lines if line and not line.startswith("#")]
+        is_table = bool(rows) and all(len(row) >= COLUMNS and _is_number(row[3]) for row in rows)
+        require(is_table, "px4", f"{path}, which has no rows of parameters", EXPECTED)
+        values = {row[2]: float(row[3]) for row in rows}
+    known = {name: value for name, value in values.items() if name in DEFAULTS}
+    require(bool(known), "px4", f"{path} without IMU_GYRO_ parameters", EXPECTED)
+    wrong = [f"{name} {value}" for name, value in known.items() if not 0.0 <= value < math.inf]
+    require(not wrong, "px4", ", ".join(wrong), "0 or more")
+    return known
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
