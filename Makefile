@@ -8,6 +8,7 @@
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make mutants   change the law, the guard, the decomposition and the account in many places: each change must fail a test
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
+# make source-proof   Frama-C and cppcheck on the exported C code; skipped where they are not installed
 # make foxglove   what `rise-di watch --foxglove` needs
 # make autopilot   what `rise-di import` and maps over MAVLink need
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
@@ -40,7 +41,7 @@ ifdef MOVED
 .PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
 endif
 
-.PHONY: fly test test-fast test-sitl mutants check docs evidence foxglove autopilot messages wheel setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl mutants check docs evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -81,6 +82,9 @@ docs: setup-all
 
 evidence: setup-all
 	@$(BIN)/python -m benchmarks.evidence $(ARGS)
+
+source-proof: setup-all
+	@$(BIN)/python -m tools.source_proof $(ARGS)
 
 messages: .venv/.messages
 	@$(if $(and $(PACKAGE),$(SOURCE)),,echo "error: say make messages PACKAGE=px4_msgs SOURCE=FOLDER" >&2; exit 2)

@@ -15,7 +15,7 @@ import numpy as np
 
 from flight_core.arithmetic import product
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.saturation import Limits, bounds
+from rise_di_controller.saturation import LEAST_DIVISOR, Limits, bounds
 
 SWEEPS = 10
 """Most sweeps over the effectors of an exchange."""
@@ -134,7 +134,7 @@ def _towards(
                 target = halfway
         step = target - u
         room = np.where(step > 0.0, high - u, low - u)
-        limited = np.abs(step) > np.abs(room)
+        limited = np.abs(step) > np.maximum(np.abs(room), LEAST_DIVISOR)
         last = float(
             np.min(np.where(limited, room, 1.0) / np.where(limited, step, 1.0), initial=1.0)
         )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
-from rise_di_controller.saturation import Limits, saturate
+from rise_di_controller.saturation import LEAST_DIVISOR, Limits, saturate
 
 # lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be
 # positive
@@ -230,7 +230,8 @@ def step_with_anti_windup(
     zero = xp.zeros_like(total)
     excess = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(change), zero), zero)
     size_Pi = xp.where(outward_Pi, xp.abs(change_Pi), zero)
-    kept = xp.maximum(size_Pi - excess, zero) / xp.where(size_Pi > 0, size_Pi, zero + 1.0)
+    divisor = xp.where(size_Pi > LEAST_DIVISOR, size_Pi, zero + 1.0)
+    kept = xp.maximum(size_Pi - excess, zero) / divisor
     after = after._replace(
         integral_e=xp.where(outward, state.integral_e, after.integral_e),
         Pi=xp.where(outward_Pi, state.Pi + kept * increment_Pi, after.Pi),

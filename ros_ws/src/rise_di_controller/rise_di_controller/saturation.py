@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
+LEAST_DIVISOR = 2.0**-126
+"""The least normal float32: a quotient by less could overflow."""
+
 
 class Limits(NamedTuple):
     """Saturation limits, as deviations from trim in units of u; infinite where there is no

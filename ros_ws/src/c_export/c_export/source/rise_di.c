@@ -38,6 +38,7 @@ typedef char rise_di_constants_are_double[(sizeof(1.0) == sizeof(double)) ? 1 : 
 #define ONE ((rise_di_real)1)
 #define TWO ((rise_di_real)2)
 #define SIX ((rise_di_real)6)
+#define LEAST_DIVISOR ((rise_di_real)FLT_MIN) /* a quotient by less could overflow */
 #define NANOSECONDS ((rise_di_real)1000000000)
 
 #if RISE_DI_FLOAT32
@@ -206,7 +207,7 @@ static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, co
         }
         if (outward_Pi) {
             const rise_di_real size = magnitude(change_Pi);
-            const rise_di_real kept = greater(size - excess, ZERO) / ((size > ZERO) ? size : ONE);
+            const rise_di_real kept = greater(size - excess, ZERO) / ((size > LEAST_DIVISOR) ? size : ONE);
             after->Pi[i] = before->Pi[i] + (kept * increment_Pi);
         }
         u_free[i] = u_trim[i] + control(p, scale, before, after, i);
@@ -553,7 +554,7 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
         for (int32_t j = 0; j < RISE_DI_P; j++) {
             const rise_di_real step = target[j] - u[j];
             const rise_di_real room = (step > ZERO) ? (high[j] - u[j]) : (low[j] - u[j]);
-            if (magnitude(step) > magnitude(room)) {
+            if (magnitude(step) > greater(magnitude(room), LEAST_DIVISOR)) {
                 last = lesser(last, room / step);
             }
         }
@@ -683,7 +684,7 @@ static bool align(const rise_di_parameters *p, const rise_di_samples *samples, i
     } else if (possible) {
         const uint64_t span_ns = elapsed_ns(second->stamp_ns, first->stamp_ns);
         const uint64_t passed_ns = elapsed_ns(stamp_ns, first->stamp_ns);
-        const rise_di_real fraction = (rise_di_real)passed_ns / (rise_di_real)span_ns;
+        const rise_di_real fraction = (rise_di_real)passed_ns / (rise_di_real)((span_ns > 0U) ? span_ns : 1U); /* it is: stamps increase */
         for (int32_t i = 0; i < RISE_DI_M; i++) {
             value[i] = first->value[i] + (fraction * (second->value[i] - first->value[i]));
         }
@@ -779,12 +780,14 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     rise_di_real u_trim[RISE_DI_M];
     rise_di_real u_free[RISE_DI_M];
     rise_di_real u[RISE_DI_M];
-    const rise_di_limits *limits = &p->limits;
     bool limited = false;
     bool finite;
 #if RISE_DI_P > 0
     rise_di_real effectors[RISE_DI_P];
     rise_di_limits given;
+    const rise_di_limits *limits = &given;
+#else
+    const rise_di_limits *limits = &p->limits;
 #endif
 #if RISE_DI_S > 0
     rise_di_law predicted = c->law;
@@ -819,7 +822,6 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     if (limited) {
 #if RISE_DI_P > 0
         reached(u_free, u, &given);
-        limits = &given;
 #endif
         tick_law(p, before, y->value, y_m, dt, u_trim, c->u, limits, &after, u_free, u);
 #if RISE_DI_P > 0
@@ -873,6 +875,7 @@ bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const ri
     rise_di_real dt = ZERO;
     bool fresh = false;
     bool published = true;
+    fill(reference, RISE_DI_M, ZERO);
     if ((y != (const rise_di_sample *)0) && (y_m->count > 0) && (c->parameters != (const rise_di_parameters *)0)) {
         const int64_t max_age_ns = c->parameters->max_age_ns;
         fresh = is_fresh(now_ns, y->stamp_ns, max_age_ns) && is_fresh(now_ns, sample_at(y_m, 0)->stamp_ns, max_age_ns) &&
