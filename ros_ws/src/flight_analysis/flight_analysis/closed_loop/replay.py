@@ -39,6 +39,8 @@ U_PREFIXES = (
 )  # prefixes of the channels of u, from `internals` and from the topic `u`
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
+SHOWN_CHANGES = 20  # of the parameters, in the notes
+
 Change = Mapping[
     str, Any
 ]  # parameters of the controller by dotted name that were changed in flight at one instant
@@ -276,7 +278,7 @@ def _replay(
             state = ticks.state(k, in_force.limits, in_force.law, state)
     notes = (
         (() if others is None else (OPEN_LOOP,))
-        + tuple(in_force.notes)
+        + _few(in_force.notes)
         + tuple(_coverage_notes(ticks, checked))
     )
     # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the
@@ -587,6 +589,13 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{unmatched} ticks have no sample on the topic y: y taken from internals"
     if unmatched := int((~ticks.u_found).sum()):
         yield f"{unmatched} ticks have no sample on the topic u: what was sent is not compared"
+
+
+def _few(notes: Sequence[str]) -> tuple[str, ...]:
+    """The first notes on changes of the parameters, and how many more there are."""
+    more = len(notes) - SHOWN_CHANGES
+    rest = (f"parameters changed {more} more times",) if more > 0 else ()
+    return (*notes[:SHOWN_CHANGES], *rest)
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
