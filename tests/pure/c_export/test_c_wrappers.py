@@ -185,6 +185,7 @@ FAST_MATH = (
     "-fno-signed-zeros",
     "-freciprocal-math -fno-signed-zeros -fno-trapping-math",  # as PX4 has them
 )
+CPU = Path("/proc/cpuinfo")
 MACROS = (
     "FAST_MATH",
     "ASSOCIATIVE_MATH",
@@ -252,6 +253,31 @@ def test_controller_does_not_start_under_flags_that_change_bits(flags: str, code
     """
     for level in ("-O1", "-O3"):
         assert started(code, ["gcc"], [level, *flags.split(), *WITHOUT_MACROS]) == 1
+
+
+WRONG_FLAGS = (
+    *FAST_MATH,
+    "-fno-trapping-math",
+    "-fsingle-precision-constant",
+    "-mfpmath=387",
+    "-Ofast",
+    "-mfma -ffp-contract=fast",
+)
+HAS_FMA = CPU.is_file() and " fma " in CPU.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not HAS_FMA, reason="no fused multiply-add on this processor")
+def test_twelve_of_twelve_wrong_flags_are_refused(code: Path) -> None:
+    """By the compiler, or by rise_di_start."""
+
+    def is_refused(flags: str) -> bool:
+        try:
+            return started(code, ["gcc"], flags.split()) == 1
+        except ParameterError:
+            return True
+
+    assert len(WRONG_FLAGS) == 12
+    assert [flags for flags in WRONG_FLAGS if not is_refused(flags)] == []
 
 
 def test_calls_before_the_start_are_refused(code: Path) -> None:
