@@ -238,10 +238,7 @@ def gains(
         "it alone",
         "--write beside it, without --observer",
     )
-    px4_origin = ""
-    if px4 is not None:
-        require(delay is None, "px4", "it beside --delay", "one of both")
-        rate, delay, px4_origin = rate_loop(px4, rate)
+    rate, delay, px4_origin = _loop_of_px4(px4, rate, delay)
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     require_guarantee(check=check, guaranteed=guaranteed, worst=worst)
     promise: Guarantee | None = None
@@ -319,6 +316,71 @@ def gains(
     unproved = promise is not None and not promise.holds
     if unproved or (check and failing(answers["scenario"].loop)):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def _require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> None:
+    """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
+    require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
+    require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
+
+
+def _write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
+    """Write the first unstable aircraft as an airframe and the scenario that flies it, if a folder
+    is named.
+    """
+    if folder is None:
+        return
+    chosen = find_scenario(scenario)
+    frame = load_airframe(airframe)
+    require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
+    fits = (
+        not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
+    )
+    require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
+    require(
+        chosen.controller.allocation is None,
+        "worst",
+        "an allocation",
+        "a scenario without one: the entries are those of the law's inputs",
+    )
+    assert promise.unstable is not None  # noqa: S101 - for mypy
+    with writing("--set worst", folder, "a folder that can"):
+        folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "airframe.yaml"
+    write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
+    flown = chosen.vary(aircraft={"airframe": str(path.absolute())})
+    write_text("worst", folder / "scenario.yaml", scenario_yaml(flown))
+
+
+def _show_guarantee(console: Console, promise: Guarantee | None, answer: Assessment) -> None:
+    """The guarantee in sentences, and a table of the disk margins."""
+    if promise is None:
+        return
+    for line in guarantee_text(promise):
+        console.print(line, highlight=False, soft_wrap=True)
+    margins = answer.margins
+    if not promise.holds or margins is None or margins.worst is None:
+        return
+    heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
+    title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
+    table = new_table(title, heads, left_aligned=("input",))
+    for name, disk, least in guarantee_rows(promise, margins):
+        size = np.array(disk)
+        values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
+        table.add_row(
+            name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
+        )
+    console.print(table)
+
+
+def _loop_of_px4(
+    px4: Path | None, rate: float | None, delay: float | None
+) -> tuple[float | None, float | None, str]:
+    """Rate and delay as given, or those of a parameter file, and what the latter come from."""
+    if px4 is None:
+        return rate, delay, ""
+    require(delay is None, "px4", "it beside --delay", "one of both")
+    return rate_loop(px4, rate)
 
 
 def _require_check_alone(selections: Mapping[str, object], loop: Mapping[str, object]) -> None:
