@@ -220,7 +220,10 @@ def test_option_that_is_a_setting_names_it() -> None:
     result = invoke("gains", "osprey", "--y-rate", "50")
     assert str(result.exception) == "--y-rate: found no option, expected --set y_rate"
     unknown = invoke("export", "osprey_servo", "--set", "rate=50")
-    assert str(unknown.exception) == "--set: found 'rate=50', expected one of drawn, runner, seed"
+    assert (
+        str(unknown.exception)
+        == "--set: found 'rate=50', expected one of drawn, runner, samples, seed"
+    )
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
