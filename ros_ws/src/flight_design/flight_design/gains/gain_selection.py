@@ -62,8 +62,8 @@ CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {
 """Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search:
 0.63 and 0.46 cost 36 and 26 degrees of phase at the crossover. Yaw has a margin for the dutch roll,
 speed for the engine. The integral, Lambda and the slope of the softened sign, costs more: the
-search makes the integral slower, and lowers the bandwidth, until the margins meet the
-requirement."""
+search makes the integral slower, and lowers the bandwidth where that is not enough, until the
+margins meet the requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
@@ -259,8 +259,8 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     Both have the same channels (the fastest first, so that the last has the smallest K), inputs
     scaled by 1 / abs(Omega_ii) and D from the minors. The theorem's set is `theorem_gains` with
     Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the slew
-    of the nominal airframe; behind servos, `within_requirement` makes the integral slower and the
-    bandwidth lower until the margins meet the setting's requirement, on the samples too. `omega` is
+    of the nominal airframe; behind servos, `within_requirement` finds the integrals and bandwidths
+    of the least error whose margins meet the setting's requirement, on the samples too. `omega` is
     the largest abs(Omega_ii) of the samples. Raises ParameterError as `require_channels` does, and
     for parameters that the controller does not accept.
     """
@@ -327,7 +327,9 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     )
     behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
     chosen = (
-        within_requirement(engineering, setting.requirement) if behind_servos else first
+        within_requirement(engineering, setting.requirement, study.u_dot[:, 0][:, columns])
+        if behind_servos
+        else first
     ).controller
     chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
     return Selection(study, setting, literal, chosen)

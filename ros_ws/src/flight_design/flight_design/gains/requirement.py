@@ -11,18 +11,20 @@ Systems", 12.3.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
 from flight_core.arguments import as_number
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
+from flight_design.gains.constrained_search import STEP, Assess, Place, Trial, descend, exponent
 from flight_design.gains.gain_conditions import Condition, failing
-from rise_di_controller.linear_loop import LinearPlant
+from flight_design.gains.linear_error import linear_error
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant
 from rise_di_controller.margins import Margins, loop_margins
 from rise_di_controller.params import ControllerConfig
 
@@ -35,9 +37,14 @@ PHASE_MARGINS = (
     80.0,
 )  # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
 
-STEP = 1.05  # factor of the integral, and of the bandwidth, in a step of the search
-MAX_SLOWER = 4.0  # largest factors of the search
+MAX_SLOWER = 64.0  # largest factors of the search
 MAX_LOWER = 18.0  # by which the integral and the bandwidth fall
+FURTHER_STARTS = (
+    (exponent(8.0), 0),
+    (exponent(2.0), exponent(2.0)),
+    (exponent(8.0), exponent(8.0)),
+)  # exponents of `slower` and `lower` of all channels
+NO_ERROR = 1e-12  # SI: an error below it costs nothing
 WORST_STEP = math.radians(
     2.5
 )  # by which the nominal phase margin rises while the worst aircraft has too little
@@ -174,73 +181,144 @@ class Candidate(NamedTuple, Generic[Controller]):
 
 
 def within_requirement(
-    build: Callable[[FloatArray, FloatArray], Candidate[Controller]], needed: Requirement
-) -> Candidate[Controller]:
-    """The first candidate whose measured margins meet a requirement; the nearest where none does.
-
-    `build(slower, lower)` gives a controller with the integral slower by both factors, the
-    bandwidth lower by the second, a factor a channel, (m,).
-    A channel with too little phase margin or too large a sensitivity gets a slower integral by
-    steps of 5 %, down to a fourth; one with too little gain margin, or with the slowest integral, a
-    lower bandwidth. Too little damping counts for the channel with the smallest phase margin. While
-    the worst uncertain aircraft has less than `worst_phase`, the nominal loop has to have 2.5
-    degrees more.
-    """
-    target = needed
-    best = _nominal_search(build, target)
-    for _ in range(MAX_WORST_STEPS):
-        if best.fraction < 1.0 or _worst_phase(best.candidate.loop) >= needed.uncertain_phase:
-            break
-        target = target._replace(phase=target.phase + WORST_STEP)
-        following = _nominal_search(build, target, best.slower, best.lower)
-        if following.fraction < 1.0:
-            break
-        best = following
-    return best.candidate
-
-
-class _Reached(NamedTuple, Generic[Controller]):
-    candidate: Candidate[Controller]
-    slower: FloatArray  # (m,)
-    lower: FloatArray  # (m,)
-    fraction: float  # `least_fraction`
-
-
-def _nominal_search(
     build: Callable[[FloatArray, FloatArray], Candidate[Controller]],
     needed: Requirement,
-    slower: FloatArray | None = None,
-    lower: FloatArray | None = None,
-) -> _Reached[Controller]:
-    slower = np.ones(1) if slower is None else slower
-    lower = np.ones(1) if lower is None else lower
-    best: _Reached[Controller] | None = None
-    while True:
-        candidate = build(slower, lower)
-        margins = loop_margins(
-            candidate.loop.nominal, candidate.loop.law, candidate.loop.loop, together=False
-        )
-        fraction = least_fraction(margins, needed)
-        if best is None or fraction > best.fraction:
-            best = _Reached(candidate, slower, lower, fraction)
-        if fraction >= 1.0 or lower.max() > MAX_LOWER:
-            return best
-        slower = np.broadcast_to(slower, margins.phase.shape)
-        lower = np.broadcast_to(lower, margins.phase.shape)
-        integral, bandwidth = _short(margins, needed)
-        bandwidth |= integral & (slower >= MAX_SLOWER)
-        slower = np.where(integral & ~bandwidth, STEP * slower, slower)
-        lower = np.where(bandwidth, STEP * lower, lower)
+    u_dot: FloatArray,
+) -> Candidate[Controller]:
+    """The candidate of the least error whose measured margins meet a requirement; where the search
+    finds none, the candidate that lacks least.
+
+    `build(slower, lower)` gives a controller with the integral slower by both factors, the
+    bandwidth lower by the second, a factor a channel, (m,), 1 by the rule at the least. The error
+    is the product over the outputs of `linear_error` along `u_dot` (T, m), inputs in the law's
+    order. The damping asked for is that of `above_zeros`. The search begins with the bandwidths of
+    the rule and the fastest integrals that have the margins of their own channel, and tries further
+    starts where its end lacks a margin. While the worst uncertain aircraft has less than
+    `worst_phase`, the nominal loop has to have 2.5 degrees more.
+    """
+    loops = _Loops(build, u_dot)
+    target = above_zeros(needed, loops.start.loop.nominal)
+    best = loops.search(target)
+    for _ in range(MAX_WORST_STEPS):
+        if best.shortage or _worst_phase(best.content.candidate.loop) >= needed.uncertain_phase:
+            break
+        target = target._replace(phase=target.phase + WORST_STEP)
+        following = loops.search(target)
+        if following.shortage:
+            break
+        best = following
+    return best.content.candidate
 
 
-def _short(margins: Margins, needed: Requirement) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Channels that need a slower integral, and channels that need a lower bandwidth, (m,)."""
-    phase, gain, damping = fractions(margins, needed)
-    integral = phase < 1.0
-    bandwidth = gain < 1.0
-    if damping < 1.0 and not (integral | bandwidth).any():
-        integral = np.arange(len(phase)) == int(np.argmin(phase))
-    return np.asarray(integral), np.asarray(bandwidth)
+class _Measured(NamedTuple, Generic[Controller]):
+    candidate: Candidate[Controller]
+    reached: FloatArray  # (m,) found over needed of each channel by itself
+
+
+class _Loops(Generic[Controller]):
+    """The loops of a search, each built and measured once. A place has the exponents of `slower`,
+    then those of `lower`.
+    """
+
+    def __init__(
+        self, build: Callable[[FloatArray, FloatArray], Candidate[Controller]], u_dot: FloatArray
+    ) -> None:
+        self._build = build
+        self._u_dot = u_dot
+        self._measured: dict[Place, tuple[Candidate[Controller], Margins]] = {}
+        self._costs: dict[Place, float] = {}
+        self.start = build(np.ones(1), np.ones(1))
+        self.m = self.start.loop.law.D.shape[-2]
+        self.highest = np.repeat([[exponent(MAX_SLOWER)], [exponent(MAX_LOWER)]], self.m, axis=1)
+
+    def search(self, needed: Requirement) -> Trial[_Measured[Controller]]:
+        """The trial with the least cost that meets a requirement, or the least shortage."""
+        assess = partial(self.assess, needed)
+        best = descend(assess, self._fastest_integrals(assess), self.highest)
+        for slower, lower in FURTHER_STARTS:
+            if best.shortage == 0.0:
+                break
+            (start,) = assess([(*(slower,) * self.m, *(lower,) * self.m)])
+            reached = descend(assess, start, self.highest)
+            best = reached if reached.is_better(best) else best
+        return best
+
+    def assess(
+        self, needed: Requirement, places: Sequence[Place]
+    ) -> list[Trial[_Measured[Controller]]]:
+        """The trials at some places."""
+        self._measure([place for place in dict.fromkeys(places) if place not in self._measured])
+        measured = []
+        shortages = []
+        for place in places:
+            candidate, margins = self._measured[place]
+            phase, gain, damping = fractions(margins, needed)
+            reached = np.where(margins.stable, np.minimum(phase, gain), 0.0)
+            goals = np.append(reached, damping if margins.stable else 0.0)
+            measured.append(_Measured(candidate, reached))
+            shortages.append(float(np.maximum(1.0 - goals, 0.0).sum()))
+        met = [place for place, shortage in zip(places, shortages, strict=True) if not shortage]
+        self._count_costs([place for place in dict.fromkeys(met) if place not in self._costs])
+        return [
+            Trial(place, shortage, math.inf if shortage else self._costs[place], row)
+            for place, shortage, row in zip(places, shortages, measured, strict=True)
+        ]
+
+    def _measure(self, places: Sequence[Place]) -> None:
+        factors = [STEP ** np.reshape(place, (2, self.m)) for place in places]
+        candidates = [self._build(slower, lower) for slower, lower in factors]
+        if candidates:
+            loop = _stacked(candidates)
+            margins = loop_margins(loop.nominal, loop.law, loop.loop, together=False)
+            for k, (place, candidate) in enumerate(zip(places, candidates, strict=True)):
+                self._measured[place] = candidate, Margins(*(values[k] for values in margins))
+
+    def _count_costs(self, places: Sequence[Place]) -> None:
+        if places:
+            loop = _stacked([self._measured[place][0] for place in places])
+            errors = np.log(linear_error(loop, self._u_dot) + NO_ERROR)
+            self._costs.update(zip(places, errors.sum(axis=-1).tolist(), strict=True))
+
+    def _fastest_integrals(
+        self, assess: Assess[_Measured[Controller]]
+    ) -> Trial[_Measured[Controller]]:
+        """The trial with the bandwidths of the rule and the fastest integrals with which each
+        channel has its own margins; by the rule in a channel without such an integral.
+
+        All channels double and bisect their exponents at once, since channels couple little. Where
+        the result lacks a margin, its channel gets a slower integral, step by step.
+        """
+        highest = self.highest[0]
+        rule = np.zeros(self.m, dtype=np.int64)
+        short = rule - 1  # the largest exponents that lack a margin
+        met = highest + 1  # the least that have all
+        tried = rule
+        while True:
+            (trial,) = assess([(*tried.tolist(), *rule.tolist())])
+            has = trial.content.reached >= 1.0
+            met = np.where(has, np.minimum(met, tried), met)
+            short = np.where(has, short, np.maximum(short, tried))
+            unknown = met - short > 1
+            if not unknown.any():
+                break
+            doubled = np.minimum(2 * np.maximum(short, 0) + 1, highest)
+            bisected = np.where(unknown, (short + met) // 2, met)
+            tried = np.where(met > highest, doubled, bisected)
+        slower = np.where(met > highest, 0, met)
+        (best,) = assess([(*slower.tolist(), *rule.tolist())])
+        while (lacking := (best.content.reached < 1.0) & (met <= highest)).any():
+            slower = np.minimum(slower + lacking, highest)
+            (following,) = assess([(*slower.tolist(), *rule.tolist())])
+            if not following.is_better(best):
+                break
+            best = following
+        return best
+
+
+def _stacked(candidates: Sequence[Candidate[Controller]]) -> LinearLoop:
+    """The loops of candidates around one aircraft as one, with a law each."""
+    laws = zip(*(candidate.loop.law for candidate in candidates), strict=True)
+    return candidates[0].loop._replace(law=LinearLaw(*(np.stack(matrices) for matrices in laws)))
 
 
 def _worst_phase(loop: LinearLoop) -> float:

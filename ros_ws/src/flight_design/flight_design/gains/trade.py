@@ -8,13 +8,11 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
-from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, linear_loop
+from flight_analysis.closed_loop.loop_margins import law_order, linear_loop
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_selection import Selection, select_gains
-from flight_design.gains.ideal_control import STEP, Study
-from rise_di_controller.linear_loop import closed_loop, zero_order_hold
+from flight_design.gains.ideal_control import Study
+from flight_design.gains.linear_error import linear_error
 
 TRADED_PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg
 
@@ -55,27 +53,3 @@ def _nominal(study: Study) -> Study:
     return study._replace(
         A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1]
     )
-
-
-def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
-    """Rms of e of the nominal linear loop that has to give the ideal control u*, (m,), SI.
-
-    u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the
-    aircraft, from trim on. `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
-    """
-    period = loop.loop.period
-    u = np.concatenate(
-        [np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)]
-    )
-    t = period * (np.arange(int((len(u) - 1) * STEP / period)) + 0.5)
-    held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
-    step = closed_loop(loop.nominal, loop.law, loop.loop, np.zeros(u.shape[1]))
-    _, drive = zero_order_hold(loop.nominal.A, loop.nominal.B, period)
-    n = len(loop.nominal.A)
-    state = np.zeros(len(step))
-    total = np.zeros(len(loop.nominal.C))
-    for disturbance in -(held @ drive.T):
-        state = step @ state
-        state[:n] += disturbance
-        total += (loop.nominal.C @ state[:n]) ** 2
-    return np.asarray(np.sqrt(total / max(len(t), 1)))

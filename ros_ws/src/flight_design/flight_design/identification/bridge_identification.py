@@ -21,7 +21,12 @@ from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationConfig
-from flight_analysis.closed_loop.loop_margins import LoopMargins, linear_loop, loop_assessment
+from flight_analysis.closed_loop.loop_margins import (
+    LoopMargins,
+    law_order,
+    linear_loop,
+    loop_assessment,
+)
 from flight_core.files import comment, dump_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -31,7 +36,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.gain_conditions import bandwidths
 from flight_design.gains.gain_selection import LoopSetting
-from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre
+from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
 from flight_design.gains.requirement import (
     REQUIREMENT,
     Candidate,
@@ -443,7 +448,7 @@ def flying_scenario(
 
     airframe = airframe_yaml(channel_map, pairing, channels, speed, "identified in flight")
     frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
-    slew = ideal_control.study_airframe(frame, manoeuvre, samples=1).slew
+    flying = ideal_control.study_airframe(frame, manoeuvre, samples=1)
     none = channels._replace(
         damping=0.0 * channels.damping, stiffness=0.0 * channels.stiffness, zero=0.0 * channels.zero
     )
@@ -452,13 +457,13 @@ def flying_scenario(
     )
     # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
     studied = ideal_control.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
-    studied = studied._replace(slew=np.maximum(slew, range_rate))
+    studied = studied._replace(slew=np.maximum(flying.slew, range_rate))
     setting = LoopSetting(
         base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed
     )
     selection = gain_selection.select_gains(studied, setting)
     flown, margins = _within_margins(
-        _with_integrals(selection.chosen, pairing, channels, loop), frame, needed
+        _with_integrals(selection.chosen, pairing, channels, loop), flying, needed
     )
     turning = (
         channels if commands["coordinated_turn"] is None else _without_sideslip(channels, pairing)
@@ -485,16 +490,18 @@ def flying_scenario(
 
 
 def _within_margins(
-    controller: RiseDiConfig, airframe: Airframe, needed: Requirement
+    controller: RiseDiConfig, study: Study, needed: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """The controller with slower integrals and lower bandwidths where the loop around an airframe
-    lacks margins; the margins.
+    """The controller with slower integrals and lower bandwidths where the loop around the airframe
+    of a study lacks margins; the margins.
 
     A bandwidth falls with the input scale: K of (22) stays.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
+    airframe = study.airframe
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, SAMPLES, 1)
+    _, columns = law_order(airframe, controller)
 
     def build(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
         ones = np.ones(len(controller.outputs))
@@ -509,7 +516,7 @@ def _within_margins(
         chosen = RiseDiConfig.validate_mapping(values, "controller")
         return Candidate(chosen, linear_loop(chosen, airframe, A, B))
 
-    chosen = within_requirement(build, needed)
+    chosen = within_requirement(build, needed, study.u_dot[:, 0][:, columns])
     return chosen.controller, loop_assessment(chosen.loop)
 
 
