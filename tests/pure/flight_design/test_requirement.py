@@ -27,10 +27,13 @@ from flight_cli.words import Command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
+from flight_design.gains import requirement as requirement_module
 from flight_design.gains.constrained_search import Place, Trial, descend
 from flight_design.gains.gain_design import select_gains
+from flight_design.gains.gain_yaml import as_yaml
 from flight_design.gains.ideal_control import Manoeuvre
 from flight_design.gains.linear_error import linear_error
+from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import (
     NAMES,
     Requirement,
@@ -90,7 +93,7 @@ def selected(phase_margin: float, V_product: float = 0.46) -> RiseDiConfig:
         lag=LAG, delay=0.0, rate_limit={}, requirement=requirement(phase_margin, accept=True)
     )
     setting = setting._replace(
-        crossover_lag_products=gain_selection.CROSSOVER_LAG_PRODUCTS | {"V": V_product}
+        crossover_lag_products={**gain_selection.CROSSOVER_LAG_PRODUCTS, "V": V_product}
     )
     return gain_selection.select_gains(studied, setting).chosen
 
@@ -256,6 +259,24 @@ def test_trade_predicts_the_flight() -> None:
     rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
     np.testing.assert_allclose(row.rms, rms, rtol=0.05)
     assert row.reached >= row.phase_margin
+
+
+def test_a_refusal_names_bound_and_change_and_the_file_is_marked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Without its slow integrals the search ends at 42 deg of V
+    for name, factor in (("MAX_SLOWER", 2.0), ("MAX_LOWER", 1.0)):
+        monkeypatch.setattr(requirement_module, name, factor)
+    selection = select_gains("osprey", "osprey_servo", samples=0)
+    assert lacking(selection, options=("lag", "delay", "rate")) == (
+        "phase margin (deg) of V: found 41.99, expected at least 45: the best of the search, bound "
+        "by phase margin (deg) of V; met with --set phase_margin=41"
+    )
+    eased = select_gains("osprey", "osprey_servo", samples=0, phase_margin=41.0)
+    assert not eased.engineering.unmet
+    assert lacking(eased) == ""
+    assert as_yaml(selection).startswith("# Margins below the requirement: phase margin (deg) of V")
+    assert "Margins below" not in as_yaml(eased)
 
 
 def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:

@@ -40,6 +40,7 @@ from flight_design.gains.gain_conditions import Condition, failing
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
+from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
 from flight_log.px4_parameters import rate_loop
@@ -293,7 +294,8 @@ def gains(
                 else {"theorem": selection.theorem, "engineering": engineering}
             )
             if write is not None:
-                _require_margins(selection.theorem if theorem else selection.engineering, accept)
+                if not accept:
+                    _require_margins(selection, theorem=theorem)
                 write_text(
                     "--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem)
                 )
@@ -411,15 +413,14 @@ def _write_page(path: Path, answer: Assessment) -> None:
         write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
-def _require_margins(assessment: Assessment, accept: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement, unless
-    accepted.
-    """
-    if assessment.unmet and not accept:
-        lacking = "; ".join(
-            condition.sentence(assessment.controller.outputs) for condition in assessment.unmet
-        )
-        raise ParameterError(f"--write: {lacking}; --set accept writes them all the same")
+def _require_margins(selection: Selection, *, theorem: bool) -> None:
+    """Raises ParameterError for gains whose margins fall short of the requirement."""
+    assessed = selection.theorem if theorem else selection.engineering
+    short = "; ".join(row.sentence(assessed.controller.outputs) for row in assessed.unmet)
+    if short and not theorem and assessed.controller.observer is None:
+        short = lacking(selection, options=("lag", "delay", "rate"))
+    if short:
+        raise ParameterError(f"--write: {short}; --set accept writes them all the same")
 
 
 def _show_trade(console: Console, selection: Selection) -> None:

@@ -54,6 +54,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_design.gains.gain_design import observed
 from flight_design.gains.ideal_control import ChannelPairing
+from flight_design.gains.relaxation import lacking as what_lacks
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording
@@ -158,7 +159,7 @@ def identify(
         bool,
         setting(
             "accept",
-            "Accept a phase margin below 40 deg, and write gains whose margins fall short.",
+            "Accept a phase margin below 40 deg, and gains whose margins fall short.",
         ),
     ] = False,
     commands: Annotated[
@@ -350,14 +351,6 @@ def _identify_by_steps(
     except FlightEnded as error:
         warn(f"error: {error}")
         raise typer.Exit(CANNOT_FLY) from None
-    chosen = identified.selection.engineering
-    lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
-    require(
-        accept or not lacking,
-        "identify",
-        lacking,
-        "the margins, or --set accept, which writes the gains all the same",
-    )
     write_text("write", path, identified.text)
     if as_json:
         print_json(identified_as_json(identified, path))
@@ -367,6 +360,9 @@ def _identify_by_steps(
     if identified.failure:
         warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
         raise typer.Exit(CANNOT_FLY)
+    if lacking := "" if accept else what_lacks(identified.selection):
+        shown = f"{display_path(path)}, which says so in its first line; --set accept takes it"
+        raise ParameterError(f"identify: {lacking}; the gains are in {shown}")
 
 
 class _Source(NamedTuple):

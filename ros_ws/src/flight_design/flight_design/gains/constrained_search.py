@@ -65,7 +65,8 @@ def descend(assess: Assess[Content], start: Trial[Content], highest: IntArray) -
         if reach > REACH:
             return best
         places = [place for i in channels for place in _moved(best.place, i, reach, MOVES, highest)]
-        nearest = min(assess(places), key=lambda trial: (trial.shortage, trial.cost))
+        trials = assess(places)
+        nearest = min(trials, key=lambda trial: (trial.shortage, trial.cost), default=best)
         if nearest.is_better(best):
             best = nearest
         else:

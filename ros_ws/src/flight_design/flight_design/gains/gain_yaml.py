@@ -4,7 +4,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from flight_core.arguments import as_instance
 from flight_core.files import parse_yaml
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
+from flight_design.gains.gain_conditions import Condition
 from flight_design.gains.gain_selection import Selection, response
 from rise_di_controller.law import Sign
 from rise_di_controller.model_sections import (
@@ -85,6 +86,9 @@ CONTROLLER_YAML = yaml_template("""\
 {% endif %}
 {% endfor %}
 {% endmacro %}
+{% if below %}
+# {{ below }}
+{% endif %}
 # Gains for the airframe {{ airframe }} {{ origin }}.
 {%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
 {%- if margins %}
@@ -176,7 +180,9 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
         if has_observer
         else "by the engineering procedure"
     )
-    return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
+    return section_yaml(
+        controller, study.airframe, assessed.margins, origin, comments, assessed.unmet
+    )
 
 
 def section_yaml(
@@ -185,9 +191,10 @@ def section_yaml(
     margins: LoopMargins | None,
     origin: str,
     comments: Mapping[str, str],
+    unmet: Sequence[Condition] = (),
 ) -> str:
     """A controller as the section `/**/controller` of a scenario file; the description of a
-    parameter without a comment.
+    parameter without a comment. `unmet` margins are named first.
     """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
@@ -200,10 +207,17 @@ def section_yaml(
         airframe=airframe.name,
         origin=origin,
         delay_margin=None if margins is None else margins.delay,
+        below=below_requirement(unmet, controller.outputs),
         margins=margins_sentence(controller, margins),
         parameters=parameters,
         sections=_sections(controller, airframe),
     )
+
+
+def below_requirement(unmet: Sequence[Condition], outputs: Sequence[str]) -> str:
+    """The first line of a file whose margins fall short; "" where none does."""
+    lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
+    return f"Margins below the requirement: {lacking}." if lacking else ""
 
 
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:

@@ -238,7 +238,8 @@ class _Loops(Generic[Controller]):
         for slower, lower in FURTHER_STARTS:
             if best.shortage == 0.0:
                 break
-            (start,) = assess([(*(slower,) * self.m, *(lower,) * self.m)])
+            place = np.minimum([[slower], [lower]], self.highest)
+            (start,) = assess([tuple(place.ravel().tolist())])
             reached = descend(assess, start, self.highest)
             best = reached if reached.is_better(best) else best
         return best

@@ -639,6 +639,9 @@ SCENARIO_YAML = gain_yaml.yaml_template("""\
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
+{% if below %}
+# {{ below }}
+{% endif %}
 # JSBSim's {{ condition.name | line }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
 {{ "guidance turns and climbs" if guided else "commands on every channel" }}, \
 {{ "moderate turbulence. It learns A and B in flight: docs/learning.md" if learns else "a gust from above" }}.
@@ -722,8 +725,10 @@ def _text(
     stall: float | None,
 ) -> str:
     """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
+    assessed = selection.engineering
     return SCENARIO_YAML.render(
         condition=condition,
+        below=gain_yaml.below_requirement(assessed.unmet, assessed.controller.outputs),
         named={
             name: " ".join(f"{path}={at_one!r}" for path, at_one in paths)
             for name, paths in condition.named

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a loop without the margins of its requirement lacks, and what gives the margins."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flight_design.gains.gain_conditions import Condition
+from flight_design.gains.gain_selection import LoopSetting, Selection, select_gains
+from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
+
+
+def binding(selection: Selection) -> Condition:
+    """The condition of the requirement that the engineering gains are farthest from."""
+    return min(selection.engineering.unmet, key=lambda condition: condition.margin)
+
+
+def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
+    """The bound that binds the best gains of the search, each unmet condition, and each change of
+    the loop that gives the margins, in sentences; "" where nothing is unmet.
+
+    A change is a smaller goal, half of the lags, no delay or twice the rate, and each is searched.
+    `options` are the settings of the command that calls, of phase_margin, lag, delay and rate: a
+    change is named by its option, where it has one.
+    """
+    assessed = selection.engineering
+    if not assessed.unmet:
+        return ""
+    outputs = assessed.controller.outputs
+    rows = "; ".join(condition.sentence(outputs) for condition in assessed.unmet)
+    relaxed = [
+        text
+        for text, setting in _relaxed(selection, options).items()
+        if not select_gains(selection.study, setting).engineering.unmet
+    ]
+    mend = f"met with {' or with '.join(relaxed)}" if relaxed else "met with no single change"
+    bound = binding(selection)
+    where = "the loop" if bound.channel is None else outputs[bound.channel]
+    return f"{rows}: the best of the search, bound by {bound.name} of {where}; {mend}"
+
+
+def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
+    """The relaxed settings of a loop by the words of the change."""
+    setting = selection.setting
+    changes: dict[str, LoopSetting] = {}
+    margins = selection.engineering.margins
+    if margins is not None:
+        least = min(float(margins.nominal.phase.min()), setting.requirement.phase)
+        phase = math.floor(np.degrees(least) + 1e-6)
+        if PHASE_MARGINS[0] <= phase < np.degrees(setting.requirement.phase) - 1e-6:
+            accept = " --set accept" if phase < ACCEPTED_PHASE_MARGIN else ""
+            needed = setting.requirement._replace(phase=math.radians(phase))
+            changes[f"--set phase_margin={phase}{accept}"] = setting._replace(requirement=needed)
+    halved = {name: lag / 2.0 for name, lag in setting.lag.items()}
+    lags = ",".join(f"{halved.get(name, 0.0):.4g}" for name in selection.study.airframe.inputs)
+    words = {
+        "lag": (f"--lag {lags}", "actuators of half the lag"),
+        "delay": ("--delay 0", "no delay"),
+        "rate": (f"--set rate={2.0 * setting.rate:g}", f"a law at {2.0 * setting.rate:g} Hz"),
+    }
+    settings = {
+        "lag": setting._replace(lag=halved),
+        "delay": setting._replace(delay=0.0),
+        "rate": setting._replace(rate=2.0 * setting.rate),
+    }
+    changes |= {words[key][key not in options]: row for key, row in settings.items()}
+    return changes
