@@ -7,10 +7,11 @@ a new airframe.
 from pathlib import Path
 from typing import Annotated, Any
 
+import typer
 from rich.console import Console
 
 from flight_cli.output import new_table, parse_numbers, print_json
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import AsJson, argument, option, setting, warn
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains.airframe_properties import (
@@ -23,6 +24,7 @@ from flight_design.gains.airframe_properties import (
 from rise_di.own_airframe import NewAirframe, new_airframe
 
 ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
+FALLS_SHORT = 3  # exit status: an input at its stop in the first flight, or no end as planned
 
 
 def airframes(
@@ -94,7 +96,7 @@ def airframes(
     NAME_flight.yaml, a scenario with selected gains. It has been flown once in this process:
     rise-di fly NAME_flight.yaml --in-process.
 
-    Exit status: 0, or 2 for a file with a mistake.
+    Exit status: 0, 2 for a file with a mistake, or 3 for files whose first flight falls short.
     """
     if write is not None:
         require(
@@ -166,6 +168,9 @@ def _show_draft(draft: NewAirframe) -> None:
     print(f"airframe: {display_path(draft.airframe_file)}")
     print(f"scenario: {display_path(draft.scenario_file)}")
     print(f"fly it:   rise-di fly {display_path(draft.scenario_file)} --in-process")
+    if draft.shortfall:
+        warn(f"error: {draft.shortfall}")
+        raise typer.Exit(FALLS_SHORT)
 
 
 def _signs(facts: AirframeFacts) -> tuple[str, str, str]:

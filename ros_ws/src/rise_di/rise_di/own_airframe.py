@@ -9,22 +9,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.airframe_import import Named, import_airframe
+from aircraft_sim.disturbance import AIR_STATE
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.outcome import COMPLETED
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import require
+from flight_core.tape import Tape
 from flight_design.gains import first_flight, gain_yaml
 from flight_design.gains.gain_design import lags_by_input, select_gains
 
 SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
 CLEAR = 0.9  # part of an end stop that u reaches at most
+ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # of a gust over V0
 SAMPLES = 20  # uncertain airframes for the bounds of the theorem
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
@@ -36,13 +40,17 @@ class NewAirframe(NamedTuple):
         airframe_file: Path of the airframe file.
         scenario_file: Path of the scenario file.
         airframe: The airframe.
-        note: The source of the airframe, a sentence.
+        note: The source of the airframe, and a pairing of inputs and outputs that is not their
+            order, in sentences.
+        shortfall: What the first flight lacks, as the first line of the scenario file says; ""
+            where the flight ends as planned, clear of the end stops.
     """
 
     airframe_file: Path
     scenario_file: Path
     airframe: Airframe
     note: str
+    shortfall: str
 
 
 def new_airframe(
@@ -90,8 +98,7 @@ def new_airframe(
         The paths of the files, the airframe, and a note on the source.
 
     Raises:
-        ParameterError: The model contradicts physics, no gains fly the aircraft, or a file cannot
-            be written.
+        ParameterError: The model contradicts physics, or a file cannot be written.
 
     Examples:
         >>> A = [[-0.045, 0.036, 0.0, -9.81], [-0.369, -2.02, 53.64, 0.0]]
@@ -140,25 +147,40 @@ def new_airframe(
     text_of_airframe = LICENCE + as_yaml(airframe)
     with tempfile.TemporaryDirectory() as trial:
         (Path(trial) / files[0].name).write_text(text_of_airframe, encoding="utf-8")
-        scenario = _flying(airframe, Path(trial) / files[0].name, files, lags)
+        scenario, shortfall = _flying(airframe, Path(trial) / files[0].name, files, lags)
     with writing("folder", place, "a folder that can"):
         place.mkdir(parents=True, exist_ok=True)
         if not source_is_target:
             write_file(files[0], text_of_airframe)
-        write_file(files[1], LICENCE + "#\n" + scenario)
-    return NewAirframe(*files, airframe, note)
+        marked = f"# {shortfall}\n" if shortfall else ""
+        write_file(files[1], LICENCE + "#\n" + marked + scenario)
+    note = "; ".join(filter(None, (note, _pairing_sentence(airframe))))
+    return NewAirframe(*files, airframe, note, shortfall)
 
 
-def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]) -> str:
+def _pairing_sentence(airframe: Airframe) -> str:
+    """The pairing of inputs and outputs where an output has not the input of its place, else ""."""
+    places = first_flight.pairing(airframe)
+    if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
+        return ""
+    inputs = list(airframe.inputs)
+    pairs = (f"{name} by {inputs[j]}" for name, j in zip(airframe.outputs, places, strict=True))
+    return f"paired by C B: {', '.join(pairs)}"
+
+
+def _flying(
+    airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
+) -> tuple[str, str]:
     """The text of a scenario with selected gains whose flight ends as planned, clear of the end
-    stops.
+    stops, and ""; else that of the least commands, and what its flight lacks.
 
     `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text
     names them.
     """
     square = len(airframe.inputs) == len(airframe.outputs)
     inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)] if square else []
-    reached = ""
+    shortfall = ""
+    scenario = ""
     controller = first_flight.placeholder(airframe, lag)
     for size in SIZES:
 
@@ -173,17 +195,55 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
         section = gain_yaml.as_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)
-        stops = zip(airframe.inputs, flown.aircraft.actuators.upper, strict=True)
-        used = {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
+        used = _used(flown, tape)
+        scenario = text(files[0], section)
         if tape.outcome == COMPLETED and max(used.values()) <= CLEAR:
-            return text(files[0], section)
+            return scenario, ""
         hardest = max(used, key=lambda key: used[key])
-        reached = (
-            f"outcome {tape.outcome}, {hardest} at {100.0 * used[hardest]:.0f} % of its end stop"
-        )
-    raise ParameterError(
-        f"airframe {airframe.name}: found {reached}, expected a flight: give the lags of its "
-        "actuators with lag"
+        if size == SIZES[-1]:
+            shortfall = _shortfall(flown, tape, hardest)
+    return scenario, shortfall
+
+
+def _used(flown: Scenario, tape: Tape) -> dict[str, float]:
+    """The largest command of each input over its end stop."""
+    stops = zip(flown.aircraft.channels().inputs, flown.aircraft.actuators.upper, strict=True)
+    return {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
+
+
+def _shortfall(flown: Scenario, tape: Tape, hardest: str) -> str:
+    """What the flight of a scenario lacks: the input that reaches its stop, whether commands or
+    gusts ask for it, the state or gust that asks most of it, and how much.
+
+    The input that holds y is u = -Omega^+ C (A x + f), f with the gusts.
+    """
+    airframe = flown.aircraft.load()[0]
+    calm = simulate(flown.vary(aircraft={"gusts": {}}))
+    cause = "the commands" if _used(flown, calm)[hardest] > CLEAR else "the gusts"
+    C = airframe.matrix_c()
+    inverse = np.linalg.pinv(C @ airframe.matrix_b())[list(airframe.inputs).index(hardest)] @ C
+    truth = tape["truth"]
+    asked = dict(zip(airframe.states, np.abs(inverse @ airframe.matrix_a()).tolist(), strict=True))
+    reached = {name: float(np.abs(truth[f"x.{name}"]).max()) for name in asked}
+    units = dict(airframe.states)
+    for axis, state in AIR_STATE.items():
+        if axis in flown.aircraft.gusts:
+            name = ANGLE_OF_GUST.get(axis, state)
+            speed = airframe.speed if axis in ANGLE_OF_GUST else 1.0
+            asked[name] = float(abs(inverse @ airframe.gust_direction(axis))) * speed
+            reached[name] = float(np.abs(truth[f"gust.{axis}"]).max()) / speed
+            units[name] = "rad" if axis in ANGLE_OF_GUST else "m/s"
+    most = max(asked, key=lambda name: asked[name] * reached[name])
+    input_unit = airframe.inputs[hardest].unit
+    each = f"1 {units[most]} of {most} asks {asked[most]:.3g} {input_unit} of {hardest}"
+    size = f"{reached[most]:.2g} {units[most]}"
+    if {units[most], input_unit} == {"rad"}:
+        each = f"a degree of {most} asks {asked[most]:.3g} degrees of {hardest}"
+        size = f"{np.degrees(reached[most]):.2g} degrees"
+    ended = "" if tape.outcome == COMPLETED else f", and ends: {tape.outcome}"
+    return (
+        f"The first flight has {hardest} at {100.0 * _used(flown, tape)[hardest]:.0f} % of its end "
+        f"stop{ended}: {cause} ask for it; {each}, and {most} reaches {size}."
     )
 
 

@@ -14,6 +14,7 @@ from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
+from flight_design.gains.gain_selection import MAX_COUPLING
 from rise_di_controller.decomposition import search
 from rise_di_controller.model_sections import AllocationConfig
 
@@ -256,8 +257,10 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 
 
 def pairing(airframe: Airframe) -> tuple[int, ...]:
-    """The input of each output, as the smallest change that gives D = I, else in their order."""
-    best = search(airframe.matrix_c() @ airframe.matrix_b())
+    """The input of each output, as the smallest change that gives D = I within MAX_COUPLING, else
+    in their order.
+    """
+    best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:
         return tuple(range(len(airframe.outputs)))
     return tuple(j for _, j in sorted(zip(best.outputs, best.inputs, strict=True)))
