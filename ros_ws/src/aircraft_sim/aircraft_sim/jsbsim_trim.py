@@ -85,10 +85,16 @@ TOLERANCE = np.array(
     [0.02, 0.02, 0.02, 0.002, 0.002, 0.002]
 )  # m/s^2, rad/s^2: a tenth of a degree of attitude
 
+NOT_BALANCED = "are left at best"  # words of a trim that the solver does not reach
+AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")
+NEIGHBOURS = ((0.9, 1.0), (1.1, 1.0), (0.75, 1.0), (1.35, 1.0), (1.0, 0.5), (0.75, 0.5))
+"""Factors on speed and altitude of the conditions tried beside one without a trim, by distance."""
+
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
 PROBE_SIZE = 0.02  # how far the test flight moves each command
 # s of processor time for trim and test flight; every aircraft that trims needs less than one
 TIMEOUT = 30.0
+NEAR_TIMEOUT = 3.0  # the same for a condition beside one without a trim
 
 TrimSolution = tuple[float, ...] | None
 """The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None
@@ -125,7 +131,7 @@ class _Log(jsbsim.FGLogger):
 
 
 @cache
-def trim_solution(condition: FlightCondition) -> TrimSolution:
+def trim_solution(condition: FlightCondition, timeout: float = TIMEOUT) -> TrimSolution:
     """Find the trim and make a short test flight in an isolated process, where JSBSim may crash or
     hang.
 
@@ -133,7 +139,7 @@ def trim_solution(condition: FlightCondition) -> TrimSolution:
     """
     try:
         foreign = foreign_model(condition.name) is not None
-        unknowns = isolated.call(solve_and_probe, *condition, timeout=TIMEOUT, foreign=foreign)
+        unknowns = isolated.call(solve_and_probe, *condition, timeout=timeout, foreign=foreign)
     except isolated.IsolatedCallError as error:
         raise FlightEnded(f"{condition.title} cannot be flown: JSBSim {error}") from None
     return None if unknowns is None else tuple(unknowns)
@@ -489,14 +495,43 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
         for i in engines
         if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0
     ]
-    if stopped:
+    if stopped and not _engines_start(condition):
         return f"engine {', '.join(stopped)} cannot be started"
-    linear, angular = np.abs(residuals(fdm)).reshape(2, 3).max(axis=1)
+    left = residuals(fdm)
+    axis = AXES_OF_RESIDUALS[int(np.argmax(np.abs(left) / TOLERANCE))]
+    linear, angular = np.abs(left).reshape(2, 3).max(axis=1)
     _, lower, upper = commands_and_limits(fdm, condition.commands().values())
     stopped_inputs = [
         name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high
     ]
     at_stops = f", with {' and '.join(stopped_inputs)} beyond the stops" if stopped_inputs else ""
+    idle_text = f"; engine {', '.join(stopped)} gives no thrust there" if stopped else ""
     return (
-        f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
+        f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 {NOT_BALANCED}, most "
+        f"{axis}{at_stops}{idle_text}"
     )
+
+
+def _engines_start(condition: FlightCondition) -> bool:
+    """Whether every engine runs or gives thrust at half of the speed at sea level."""
+    fdm = _load(condition._replace(speed=0.5 * condition.speed, altitude=0.0))
+    _start_engines(fdm, condition)
+    return all(
+        fdm[running_property(i)] or fdm[thrust_property(i)] > 0.0 for i in range(engine_count(fdm))
+    )
+
+
+def nearest_trim(condition: FlightCondition) -> str:
+    """The nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words; "" for
+    none.
+    """
+    for speed, altitude in NEIGHBOURS:
+        near = condition._replace(
+            speed=speed * condition.speed, altitude=altitude * condition.altitude
+        )
+        try:
+            trim_solution(near, NEAR_TIMEOUT)
+        except FlightEnded:
+            continue
+        return f"it trims at {near.speed:.4g} m/s and {near.altitude:.4g} m"
+    return ""

@@ -26,14 +26,16 @@ from aircraft_sim.jsbsim_aircraft import (
     NamedProperties,
     Trim,
     WindModel,
+    require_aircraft,
 )
 from aircraft_sim.jsbsim_model import JsbsimModel
-from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
+from aircraft_sim.jsbsim_trim import NOT_BALANCED, nearest_trim, sideslip_zero, trim_solution
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
 from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
@@ -385,9 +387,9 @@ def identify(
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
     """
-    condition = FlightCondition(name, speed, altitude, nanoseconds(STEP), named)
+    condition = FlightCondition(require_aircraft(name), speed, altitude, nanoseconds(STEP), named)
     progress("trim")
-    trim = _vehicle(condition).trim
+    trim = _trim(condition, progress)
     stall = slowest_trim(condition) if guided else None
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
@@ -407,7 +409,11 @@ def identify(
     )
     commands = reference_parameters(speed, float(authority))
     scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
-    gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
+    try:
+        gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
+    except ParameterError as error:
+        weak = _too_weak(measured.Omega, trim, outputs, inputs)
+        raise ParameterError(f"{error}{weak}") from None
     studied = _study(condition, measured.Omega, commands)
     V_bandwidth = airspeed_bandwidth(float(authority), float(measured.lag[throttle]))
     setting = _setting(trim, measured.lag, V_bandwidth)._replace(requirement=needed)
@@ -437,6 +443,37 @@ def identify(
     return IdentifiedAircraft(
         condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights
     )
+
+
+def _trim(condition: FlightCondition, progress: Callable[[str], None]) -> Trim:
+    """The trim of an aircraft. Raises FlightEnded, with the nearest condition that has a trim."""
+    try:
+        return _vehicle(condition).trim
+    except FlightEnded as error:
+        if NOT_BALANCED not in str(error):
+            raise
+        progress("trim beside the condition")
+        nearest = nearest_trim(condition) or "no speed or altitude near it has a trim"
+        raise FlightEnded(f"{error}; {nearest}") from None
+
+
+def _too_weak(Omega: FloatArray, trim: Trim, outputs: Sequence[str], inputs: Sequence[str]) -> str:
+    """The outputs whose own input, at full travel, moves the output less than a tenth of what
+    another input does, in sentences after a "; ".
+    """
+    reach = Omega * np.minimum(-trim.lower, trim.upper)
+    sentences = []
+    for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
+        if abs(reach[i, i]) < 0.1 * np.abs(reach[i]).max():
+            unit = "m/s^2" if output == "V" else "rad/s^2"
+            row = ", ".join(
+                f"{key} {value:.2g}" for key, value in zip(inputs, reach[i], strict=True)
+            )
+            sentences.append(
+                f"; {name} moves {output} by {reach[i, i]:.2g} {unit} at full travel, too weak at "
+                f"this speed ({row})"
+            )
+    return "".join(sentences)
 
 
 def slowest_trim(condition: FlightCondition) -> float:
