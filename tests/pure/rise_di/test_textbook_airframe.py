@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The lateral motion of the Boeing 747 of NASA CR-2144 (Heffley, Jewell; Mach 0.8, 40 000 ft),
+typed in as its tables print it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import StateSpace
+
+from rise_di import own_airframe
+
+A = np.array(
+    [
+        [-0.0558, -0.9968, 0.0802, 0.0415],
+        [0.598, -0.115, -0.0318, 0.0],
+        [-3.05, 0.388, -0.465, 0.0],
+        [0.0, 0.0805, 1.0, 0.0],
+    ]
+)  # of beta, r, p, phi in rad and s
+B = np.array([[0.00729, 0.0], [-0.475, 0.00775], [0.153, 0.143], [0.0, 0.0]])  # rudder, aileron
+
+
+def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The dihedral is -3.05 1/s^2, the aileron 0.143: a degree of sideslip asks 3.05 / 0.143 = 21
+    # degrees of aileron, and some for the roll of the rudder that holds r. A gust of 3 % of V0 is
+    # 1.7 degrees of sideslip. One size of the commands and no samples: a quarter of the time.
+    monkeypatch.setattr(own_airframe, "SIZES", (0.125,))
+    monkeypatch.setattr(own_airframe, "SAMPLES", 0)
+    made = own_airframe.new_airframe(
+        StateSpace(A, B, np.eye(4), np.zeros((4, 2))),
+        folder=tmp_path,
+        name="b747",
+        speed="774 ft/s",
+        states="beta: rad, r: rad/s, p: rad/s, phi: rad",
+        inputs="rudder: rad nose left, aileron: rad roll right",
+        outputs="p, r",
+        text="NASA CR-2144",
+    )
+    assert made.note.endswith("paired by C B: p by aileron, r by rudder")
+    assert "The first flight has aileron at 100 % of its end stop: the gusts ask for it" in (
+        made.shortfall
+    )
+    assert "a degree of sideslip asks " in made.shortfall
+    assert made.scenario_file.read_text(encoding="utf-8").count(f"# {made.shortfall}\n") == 1
