@@ -294,8 +294,7 @@ def gains(
                 else {"theorem": selection.theorem, "engineering": engineering}
             )
             if write is not None:
-                if not accept:
-                    _require_margins(selection, theorem=theorem)
+                _require_margins(selection, theorem=theorem, accept=accept)
                 write_text(
                     "--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem)
                 )
@@ -413,8 +412,12 @@ def _write_page(path: Path, answer: Assessment) -> None:
         write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
-def _require_margins(selection: Selection, *, theorem: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement."""
+def _require_margins(selection: Selection, *, theorem: bool, accept: bool) -> None:
+    """Raises ParameterError for gains whose margins fall short of the requirement, unless
+    accepted.
+    """
+    if accept:
+        return
     assessed = selection.theorem if theorem else selection.engineering
     short = "; ".join(row.sentence(assessed.controller.outputs) for row in assessed.unmet)
     if short and not theorem and assessed.controller.observer is None:
