@@ -156,7 +156,7 @@ def test_options_in_the_text_of_pages_exist() -> None:
 def test_quick_commands_of_pages_run_as_they_stand(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for run in ("latest", "A", "B"):
+    for run in ("latest", "A", "B", "module"):
         shutil.copytree(recorded, tmp_path / "runs" / run)
     monkeypatch.chdir(tmp_path)
     indented = [line for page in PAGES for line in INDENTED.findall(page.read_text())]

@@ -196,12 +196,13 @@ def _as_published(actuators: dict[str, Any], scenario: Scenario) -> None:
 
 
 def _airframe(scenario: Scenario) -> dict[str, Any]:
-    """The airframe as the sets fly it: they lose no thrust, so where an input gives none is left
-    out.
+    """The airframe as the sets fly it: no thrust is lost and no gust turns the aircraft, so what an
+    airframe states of both is left out.
     """
     airframe = load_airframe(scenario.aircraft.airframe).model_dump(
         mode="json", exclude_defaults=True
     )
     for described in airframe["inputs"].values():
         described.pop("no_thrust", None)
+    airframe.pop("span", None)
     return airframe

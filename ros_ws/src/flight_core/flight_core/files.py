@@ -167,8 +167,9 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     expected = f"one of {', '.join(names_in(library))}, or the path of {kind} (.yaml)"
     text = os.fspath(as_path(name, key, expected))
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
-    searched = f", no file in {Path.cwd()}" if text.endswith(".yaml") and text[:1] != "/" else ""
-    require(is_file(path), key, f"{text!r}{searched}", expected)
+    if text.endswith(".yaml") and not path.is_absolute():
+        expected = f"{expected}, from the folder {Path.cwd()}"
+    require(is_file(path), key, repr(text), expected)
     return path
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import AIR_STATE
+from aircraft_sim.disturbance import AIR_STATE, AXES
 from aircraft_sim.jsbsim_aircraft import INPUTS
 from aircraft_sim.uncertainty import KINEMATIC
 from flight_core.parameters import require
@@ -146,7 +146,8 @@ def _airframe(
 ) -> Airframe:
     """The airframe of matrices in SI."""
     gusts = {}
-    for axis, state in AIR_STATE.items():
+    for axis in AXES:
+        state = AIR_STATE[axis]
         if state in states:
             column = A[:, list(states).index(state)] * (speed if state == "V" else 1.0)
             effect = zip(states, (-column).tolist(), strict=True)
