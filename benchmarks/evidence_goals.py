@@ -151,6 +151,7 @@ SECTIONS = {
     | {"guidance-route": "another route, other aircraft"}
     | {f"guidance-grid-{name}": f"off the design point, {name}" for name in ("c172p", "737", "f16")}
     | {"guidance-rates": "errors of rates with guidance over those without"}
+    | {"guidance-laws": "the path law beside L1, with and without the lead of the curvature"}
     | {f"guidance-routes-{name}": f"hard routes, {name}" for name in ROUTE_AIRCRAFT}
     | {
         f"guidance-fence-{name}": f"fences in wind, {name}"

@@ -119,11 +119,11 @@ def test_flight_without_matched_nodes_never_begins(
     monkeypatch.setattr(processes, "READY_TIMEOUT", 0.05)
     given: list[float] = []
     state = {"controller": {"ready"}, "aircraft": {"ready", "matched"}, "recorder": set[str]()}
-    monitor = SimpleNamespace(**vars(SILENT_MONITOR))
+    monitor: Any = SimpleNamespace(**vars(SILENT_MONITOR))
     monitor.is_ready = lambda name, _: "ready" in state[name]
     monitor.is_matched = lambda name, _: "matched" in state[name]
     monitor.start = given.append
-    flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)  # type: ignore[arg-type]
+    flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)
     popen = SimpleNamespace(pid=1, poll=lambda: None)
     flight.processes = [SimpleNamespace(node=NodeSpec("fake", name), popen=popen) for name in state]  # type: ignore[misc]
     late = "controller has an input without a publisher; recorder not ready after 0.05 s"
@@ -139,7 +139,7 @@ def test_flight_by_a_clock_that_never_comes_is_told_so(
 ) -> None:
     only_stage.write_text("import time\ntime.sleep(60)\n", encoding="utf-8")
     monkeypatch.setattr(processes, "READY_TIMEOUT", 0.5)
-    monitor = SimpleNamespace(**vars(SILENT_MONITOR))
+    monitor: Any = SimpleNamespace(**vars(SILENT_MONITOR))
     monitor.is_ready = lambda *_: True
     monitor.has_time = lambda: False
     expected = "/clock: no message of a simulator after 0.5 s"

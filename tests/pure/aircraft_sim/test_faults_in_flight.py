@@ -46,7 +46,7 @@ THRUST = {"osprey_gust": "thrust", "jsbsim_c172p": "throttle"}
 
 @pytest.mark.parametrize("name", THRUST)
 @pytest.mark.parametrize(
-    "now, scheduled",
+    "sentences",
     [
         ("elevator stuck {}", "aileron stuck {}"),
         ("elevator lost {}",),

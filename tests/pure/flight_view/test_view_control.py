@@ -180,15 +180,12 @@ async def test_commands_reach_guidance(desk: Desk) -> None:
 async def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
     state = await desk.ask("state")
     assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
-    stuck: list[float | None] = [0, None, None, None]
-    changed = await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+    stuck = ["elevator stuck 0"]
+    changed = await desk.ask("fault", values={"actuators.faults": stuck, "sensors.dropout": 0.2})
     assert changed["faults"]["sensors.dropout"] == 0.2
-    assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [
-        0.0,
-        math.inf,
-        math.inf,
-        math.inf,
-    ]
+    assert desk.nodes.values["aircraft"]["actuators.faults"] == stuck
+    await desk.ask("fault", values={"actuators.faults": []})
+    assert desk.nodes.values["aircraft"]["actuators.faults"] == []
     assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
     desk.nodes.values["aircraft"]["sensors.bias"] = [0.0, 0.0, 0.0, 0.3]  # by another program
     assert (await desk.ask("state"))["faults"]["sensors.bias"] == [0.0, 0.0, 0.0, 0.3]

@@ -372,12 +372,8 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     definition = Definition.model_validate_json(text)
     part = definition.uncertainty
     scenario, course, vehicle, law, mission = _prepare(text, case)
-    # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft
-    # are dropped.
     airframe = scenario.aircraft.nominal_airframe()
-    A, B = sampled_matrices(
-        airframe, part, part, definition.seed, first, definition.chunk, definition.spread
-    )
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, size, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, size)
     late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)

@@ -21,6 +21,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
 from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
 
 if TYPE_CHECKING:

@@ -93,6 +93,17 @@ def identify_behind_bridge(
         trims, response, channels = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
         raise ParameterError(sentences(str(error), ended)) from None
+    if COMMANDS in tape:
+        later = channel_map.link_delay if link_delay is None else link_delay
+        channels = over_link(channels, later or 0.0)
+        _show_link(console, channel_map, later)
+    else:
+        require(
+            link_delay is None,
+            "link_delay",
+            link_delay,
+            "a log of rise-di import: an experiment over the link contains its delay",
+        )
     channel_map, narrower = within_range(channel_map, trims)
     for sentence in narrower:
         say(console, sentence)
@@ -343,7 +354,7 @@ def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | No
             f"The log is of the autopilot's board. Gains and margins are for {1e3 * link_delay:.0f}"
             " ms of further delay over the link (link_delay)."
         )
-    console.print(sentence, highlight=False, soft_wrap=True)
+    say(console, sentence)
 
 
 def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:

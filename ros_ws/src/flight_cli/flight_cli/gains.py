@@ -44,7 +44,6 @@ from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
 from flight_log.px4_parameters import rate_loop
-from rise_di_controller.margins import disk_gain, disk_phase
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
@@ -294,10 +293,7 @@ def gains(
                 else {"theorem": selection.theorem, "engineering": engineering}
             )
             if write is not None:
-                _require_margins(selection, theorem=theorem, accept=accept)
-                write_text(
-                    "--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem)
-                )
+                _write_gains(write, selection, theorem=theorem, accept=accept)
     study = next(iter(answers.values())).study
     if page is not None:
         _write_page(page, [*answers.values()][-1])
@@ -319,59 +315,11 @@ def gains(
         raise typer.Exit(CONDITION_FAILS)
 
 
-def _require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> None:
-    """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
-    require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
-    require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
-
-
-def _write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
-    """Write the first unstable aircraft as an airframe and the scenario that flies it, if a folder
-    is named.
-    """
-    if folder is None:
-        return
-    chosen = find_scenario(scenario)
-    frame = load_airframe(airframe)
-    require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
-    fits = (
-        not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
-    )
-    require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
-    require(
-        chosen.controller.allocation is None,
-        "worst",
-        "an allocation",
-        "a scenario without one: the entries are those of the law's inputs",
-    )
-    assert promise.unstable is not None  # noqa: S101 - for mypy
-    with writing("--set worst", folder, "a folder that can"):
-        folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "airframe.yaml"
-    write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
-    flown = chosen.vary(aircraft={"airframe": str(path.absolute())})
-    write_text("worst", folder / "scenario.yaml", scenario_yaml(flown))
-
-
-def _show_guarantee(console: Console, promise: Guarantee | None, answer: Assessment) -> None:
-    """The guarantee in sentences, and a table of the disk margins."""
-    if promise is None:
-        return
-    for line in guarantee_text(promise):
-        console.print(line, highlight=False, soft_wrap=True)
-    margins = answer.margins
-    if not promise.holds or margins is None or margins.worst is None:
-        return
-    heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
-    title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
-    table = new_table(title, heads, left_aligned=("input",))
-    for name, disk, least in guarantee_rows(promise, margins):
-        size = np.array(disk)
-        values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
-        table.add_row(
-            name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
-        )
-    console.print(table)
+def _write_gains(path: Path, selection: Selection, *, theorem: bool, accept: bool) -> None:
+    """Write the chosen gains; without `accept` those that have the margins alone."""
+    if not accept:
+        _require_margins(selection, theorem=theorem)
+    write_text("--write", path, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem))
 
 
 def _loop_of_px4(
@@ -412,12 +360,8 @@ def _write_page(path: Path, answer: Assessment) -> None:
         write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
-def _require_margins(selection: Selection, *, theorem: bool, accept: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement, unless
-    accepted.
-    """
-    if accept:
-        return
+def _require_margins(selection: Selection, *, theorem: bool) -> None:
+    """Raises ParameterError for gains whose margins fall short of the requirement."""
     assessed = selection.theorem if theorem else selection.engineering
     short = "; ".join(row.sentence(assessed.controller.outputs) for row in assessed.unmet)
     if short and not theorem and assessed.controller.observer is None:

@@ -64,6 +64,9 @@ def learn(
     for step in result.steps:
         lead = "" if step.proposed else "no model: "
         say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
+    account = log_account(recorded)
+    over = "" if account is None else account.over("internals")
+    part = f", {over}" if over else ""
     if result.entries:
         console.print(entry_table(f"A and B of the last identification{part}", result.entries))
     if models := [span._asdict() for span in errors_by_model(recorded.tape)]:

@@ -6,7 +6,7 @@ of several, what it lacks.
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
@@ -23,14 +23,8 @@ LogScenario = Annotated[
     option("Scenario of the flight, a name or a file; by default that in the log.", "--scenario"),
 ]
 
-LogRemaps = Annotated[
-    list[str] | None,
-    option(
-        "A topic of remapped nodes, as in y:=/sensors/y; may be repeated.",
-        "--remap",
-        metavar="NAME:=TOPIC",
-    ),
-]
+REMAP = "A topic of remapped nodes, as in y:=/sensors/y; may be repeated."
+LogRemaps = Annotated[list[str] | None, option(REMAP, "--remap", metavar="NAME:=TOPIC")]
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:

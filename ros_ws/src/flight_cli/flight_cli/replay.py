@@ -47,7 +47,8 @@ def replay(
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     csv_file: Annotated[
-        Path | None, option("CSV file for u as recorded and as computed.", "--csv")
+        Path | None,
+        option("CSV file for u as recorded and as computed; - for standard output.", "--csv"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

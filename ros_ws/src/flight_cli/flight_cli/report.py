@@ -15,7 +15,7 @@ from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_over
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, new_table, print_json, say, show_flight
+from flight_cli.output import LATEST, STDOUT, new_table, print_json, say, show_flight, stdout_for
 from flight_cli.repair import repair_log
 from flight_cli.words import AsJson, argument, option, setting
 from flight_core.files import display_path
@@ -39,7 +39,11 @@ def report(
     ] = None,
     png: Annotated[Path | None, option("Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
-        Path | None, option("Write all signals as CSV, one row an instant, one column a channel.")
+        Path | None,
+        option(
+            "Write all signals as CSV, one row an instant, one column a channel; - for standard "
+            "output."
+        ),
     ] = None,
     parquet: Annotated[Path | None, option("Write the same table as Parquet.")] = None,
     repair: Annotated[

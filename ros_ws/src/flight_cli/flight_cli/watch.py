@@ -95,7 +95,7 @@ def watch(
             "Namespace of the aircraft: by default the first in the log, with --control the root."
         ),
     ] = None,
-    remap: Annotated[list[str] | None, typer.Option("--set remap", **REMAP)] = None,
+    remap: Annotated[list[str] | None, setting("remap", REMAP, metavar="NAME:=TOPIC")] = None,
     background: Annotated[
         Path | None,
         setting(

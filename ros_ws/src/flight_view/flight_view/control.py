@@ -423,7 +423,10 @@ class Control:
         values = _mapping(request, "values")
         for name in values:
             _require_known(name, known, "fault")
-        chosen = {name: _numbers(name, value) for name, value in values.items()}
+        chosen = {
+            name: value if _is_sentences(value) else _numbers(name, value)
+            for name, value in values.items()
+        }
         if not (refusal := self._link.set_parameters("aircraft", chosen)):
             self._faults |= chosen
         return refusal
