@@ -23,6 +23,7 @@ from typing import Self, TypeVar
 import psutil
 import pytest
 from _pytest.runner import runtestprotocol
+from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from tests.conftest import REPOSITORY
 from tests.ros.peer import Peer, peer
@@ -221,6 +222,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if lines:
         terminalreporter.section("inconclusive attempts")
         terminalreporter.write_line("\n".join(lines))
+
+
+def is_closed(run: Path) -> bool:
+    """Whether the recorder of a run has closed its file, by the reader of mcap: the file has its
+    summary. Notes of a log say besides what a busy host left out, and do not serve.
+    """
+    with next(run.glob("*.mcap")).open("rb") as stream:
+        return make_reader(stream).get_summary() is not None
 
 
 def settable_clock(folder: Path) -> Path:
