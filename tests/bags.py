@@ -110,7 +110,7 @@ def write_metadata(
         "files": [{"path": name, "message_count": len(messages)} for name in names],
     }
     text = yaml.safe_dump({"rosbag2_bagfile_information": content | information})
-    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+    (folder / "metadata.yaml").write_text(text)
 
 
 def write_mcap(

@@ -6,6 +6,7 @@ import math
 import struct
 
 import pytest
+from pytest import approx
 
 from flight_bringup.flightgear import packet
 from flight_guidance.route_file import Origin, geographic, local
@@ -51,9 +52,9 @@ def fields(raw: bytes) -> dict[str, float]:
 def test_packet_has_fields_in_places_and_units_of_flightgear() -> None:
     found = fields(packet(FLOWN, ORIGIN, 400.0, 1_700_000_000))
     north, east = local(math.degrees(found["latitude"]), math.degrees(found["longitude"]), ORIGIN)
-    assert (north, east, found["altitude"]) == pytest.approx((300.0, -40.0, 450.0), abs=1e-6)
-    assert (found["phi"], found["theta"], found["psi"]) == pytest.approx((0.1, 0.2, -1.0))
-    assert (found["climb"], found["v_north"]) == pytest.approx((10.0, 18.52 / 0.3048))  # ft/s
+    assert (north, east, found["altitude"]) == approx((300.0, -40.0, 450.0), abs=1e-6)
+    assert (found["phi"], found["theta"], found["psi"]) == approx((0.1, 0.2, -1.0))
+    assert (found["climb"], found["v_north"]) == approx((10.0, 18.52 / 0.3048))  # ft/s
     numbers = {
         name: found[name]
         for name in ("version", "engines", "tanks", "wheels", "time", "visibility")
@@ -71,6 +72,4 @@ def test_packet_has_fields_in_places_and_units_of_flightgear() -> None:
 @pytest.mark.parametrize("origin", [ORIGIN, Origin(-75.0, 179.99), Origin(0.0, 0.0)])
 def test_geographic_is_inverse_of_local(origin: Origin) -> None:
     there = geographic(20_000.0, -30_000.0, origin)
-    assert local(there.latitude, there.longitude, origin) == pytest.approx(
-        (20_000.0, -30_000.0), abs=1e-3
-    )
+    assert local(there.latitude, there.longitude, origin) == approx((20_000.0, -30_000.0), abs=1e-3)

@@ -105,10 +105,10 @@ def test_other_law_flies_in_lockstep_as_in_one_process(law: str, tmp_path: Path)
             aircraft=ROUGH,
             flight={"duration": 2.0},
         )
-        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
+        tree = yaml.safe_load(file.read_text())
         tree["/**/controller"]["ros__parameters"] = SECTIONS[law]
         tree["/**/reference_model"]["ros__parameters"]["pulses"] = PULSES
-        file.write_text(yaml.safe_dump(tree), encoding="utf-8")
+        file.write_text(yaml.safe_dump(tree))
         scenario = load_scenario(file)
         require_equal(flown(scenario, tmp_path), scenario)
 

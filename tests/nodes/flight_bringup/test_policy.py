@@ -27,4 +27,4 @@ def test_policy_allows_no_service_request_but_those_of_bridge_to_controller_and_
 
 def test_policy_and_page_are_those_of_the_table_of_topics() -> None:
     for path, text in ((topics.POLICY, topics.policy()), (topics.PAGE, topics.page())):
-        assert path.read_text(encoding="utf-8") == text, "python -m tools.topics writes it again"
+        assert path.read_text() == text, "python -m tools.topics writes it again"

@@ -10,13 +10,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tests.conftest import refusing
 from tests.ros.waiting import HANG, until
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes
 from flight_bringup.graph import NodeSpec
 from flight_bringup.processes import FlightProcesses, NotReadyError
-from flight_core.parameters import ParameterError
 
 SILENT_MONITOR: Any = SimpleNamespace(
     is_ready=lambda *_: False,
@@ -49,11 +49,8 @@ def test_log_line_does_not_start_flight(
     only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     code = "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n"
-    only_stage.write_text(code, encoding="utf-8")
-    with pytest.raises(
-        ParameterError,
-        match="timed out waiting for controller: not ready after 3 s; see the logs in ",
-    ):
+    only_stage.write_text(code)
+    with refusing("timed out waiting for controller: not ready after 3 s; see the logs in "):
         start_stage(osprey_gust, tmp_path / "run")
     assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(
         encoding="utf-8"
@@ -64,11 +61,9 @@ def test_process_ending_while_others_wait_named_at_once(
     only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "READY_TIMEOUT", HANG)
-    only_stage.write_text(
-        "import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8"
-    )
+    only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n")
     begin = time.monotonic()
-    with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
+    with refusing(r"^controller ended with status 2: no such airframe$"):
         start_stage(osprey_gust, tmp_path / "run")
     assert time.monotonic() - begin < HANG / 2
 
@@ -91,8 +86,8 @@ def test_end_before_ready_is_bad_input_only_by_its_status(
     end: str, flew_never: bool, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     """`rise-di fly` ends with status 3 for NotReadyError, and else with 2."""
-    only_stage.write_text(end, encoding="utf-8")
-    with pytest.raises(ParameterError, match=f"^{cause}$") as caught:
+    only_stage.write_text(end)
+    with refusing(f"^{cause}$") as caught:
         start_stage(osprey_gust, tmp_path / "run")
     assert isinstance(caught.value, NotReadyError) is flew_never
 
@@ -104,12 +99,8 @@ def test_process_that_ends_named_with_fatal_line_not_last_one(
         "[FATAL] [1.0] [controller]: lost contact with aircraft",
         "[INFO] [1.1] [controller]: 3 messages in run",
     )
-    only_stage.write_text(
-        f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8"
-    )
-    with pytest.raises(
-        ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"
-    ):
+    only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n")
+    with refusing(r"^controller ended with status 3: lost contact with aircraft$"):
         start_stage(osprey_gust, tmp_path / "run")
 
 
@@ -137,7 +128,7 @@ def test_flight_without_matched_nodes_never_begins(
 def test_flight_by_a_clock_that_never_comes_is_told_so(
     only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only_stage.write_text("import time\ntime.sleep(60)\n", encoding="utf-8")
+    only_stage.write_text("import time\ntime.sleep(60)\n")
     monkeypatch.setattr(processes, "READY_TIMEOUT", 0.5)
     monitor: Any = SimpleNamespace(**vars(SILENT_MONITOR))
     monitor.is_ready = lambda *_: True
@@ -169,9 +160,9 @@ LOSES_CONTACT = (
 def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
     end: str, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
+    only_stage.write_text(LOSES_CONTACT)
     (tmp_path / "cause").mkdir()
-    (tmp_path / "cause" / "main.py").write_text(end, encoding="utf-8")
+    (tmp_path / "cause" / "main.py").write_text(end)
     flight = FlightProcesses(
         osprey_gust, tmp_path, SILENT_MONITOR, lockstep=True, one_process=False
     )
@@ -205,7 +196,7 @@ def test_process_that_closes_log_has_time_for_it(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    only_stage.write_text(CLOSES_SLOWLY, encoding="utf-8")
+    only_stage.write_text(CLOSES_SLOWLY)
     node = NodeSpec("fake", executable)
     monkeypatch.setattr(processes, executable.upper(), node)
     monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.1)  # of the other nodes

@@ -11,12 +11,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
+from tests.conftest import refusing
 from tests.nodes.rise_di_controller.test_controller import Flight, missed
 from tests.nodes.world import diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_core.modes import Mode
-from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_design.learning.node import LearnerNode
 from flight_ros import reports
@@ -168,6 +168,6 @@ def test_learner_refuses_a_scenario_that_does_not_learn() -> None:
     )
     with (
         world_of("-p", f"scenario_file:={file}") as world,
-        pytest.raises(ParameterError, match=refusal),
+        refusing(refusal),
     ):
         world.make(LearnerNode)

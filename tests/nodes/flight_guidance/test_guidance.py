@@ -15,13 +15,13 @@ import pytest
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
+from tests.conftest import refusing
 from tests.nodes.world import OUTPUTS, World, diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
-from flight_core.parameters import ParameterError
 from flight_guidance.guidance_state import Lateral, Vertical
 from flight_guidance.node import GuidanceNode
 from flight_guidance.reach import AUTHORITY
@@ -89,7 +89,7 @@ def calm(path: Path, **guidance: object) -> Path:
     varied = find_scenario("osprey_route").vary(
         aircraft={"wind": [0.0, 0.0], "turbulence": None}, guidance={"route": None} | guidance
     )
-    path.write_text(scenario_yaml(varied), encoding="utf-8")
+    path.write_text(scenario_yaml(varied))
     return path
 
 
@@ -299,10 +299,10 @@ def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
     file, refusal = find_scenario("osprey_route").path, r"`parameters.yaml` of a run has them"
     with (
         world_of("--params-file", str(file)) as world,
-        pytest.raises(ParameterError, match=refusal),
+        refusing(refusal),
     ):
         world.make(GuidanceNode)
     with_all_sections = tmp_path / "parameters.yaml"
-    with_all_sections.write_text(scenario_yaml(find_scenario("osprey_route")), encoding="utf-8")
+    with_all_sections.write_text(scenario_yaml(find_scenario("osprey_route")))
     with world_of("--params-file", str(with_all_sections)) as world:
         assert world.make(GuidanceNode).get_name() == "guidance"

@@ -23,12 +23,12 @@ from rclpy.qos import (
 )
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
+from tests.conftest import refusing
 from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, world_of
 from tests.recordings import count_messages, messages
 from tests.small_disk import small_disk
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_log.follow import Follower, Messages
 from flight_log.repair import repair
@@ -90,7 +90,7 @@ def recorder(osprey_gust: Scenario, tmp_path: Path) -> Iterator[Recording]:
 
 def test_log_has_each_message_and_the_outcome_that_the_flight_left(recorder: Recording) -> None:
     recorder.run(1.0, *LOOP, "truth")
-    (recorder.folder / "outcome").write_text("interrupted", encoding="utf-8")
+    (recorder.folder / "outcome").write_text("interrupted")
     log = recorder.end()
     sent = {
         topic: [raw for _, raw in recorder.world.sent[topic]]
@@ -347,7 +347,7 @@ def test_type_that_is_not_installed_or_another_one_named(
 def test_an_invalid_topic_name_is_rejected(osprey_gust: Scenario, tmp_path: Path) -> None:
     refusal = "recorder.topics: found 'a topic', expected the name of a topic"
     with (
-        pytest.raises(ParameterError, match=refusal),
+        refusing(refusal),
         recording(osprey_gust, tmp_path / "run", topics="[a topic]"),
     ):
         pass
@@ -408,7 +408,7 @@ def test_full_disk_ends_recording_with_one_error_and_not_flight(
 
 def test_too_little_space_at_start_rejected(osprey_gust: Scenario, disk: Path) -> None:
     refusal = r"recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB"
-    with pytest.raises(ParameterError, match=refusal), recording(osprey_gust, disk / "run"):
+    with refusing(refusal), recording(osprey_gust, disk / "run"):
         pass
 
 

@@ -5,6 +5,7 @@
 import random
 
 import pytest
+from pytest import approx
 
 from flight_core.rates import nanoseconds
 from flight_ros.clocks import AHEAD, HOST, Peers
@@ -30,25 +31,23 @@ def exchanged(
 @pytest.mark.parametrize("offset", [-0.15, 0.0, 0.05, 3600.0])
 def test_offset_and_delay_estimated_both_ways(offset: float) -> None:
     clock = exchanged(offset, 0.010, 0.010, 0.004).clocks()["/b"]
-    assert clock.offset == pytest.approx(offset, abs=0.002)  # half of the jitter
-    assert clock.delay == pytest.approx(0.010, abs=0.004)
+    assert clock.offset == approx(offset, abs=0.002)  # half of the jitter
+    assert clock.delay == approx(0.010, abs=0.004)
 
 
 def test_error_of_offset_is_half_of_difference_of_delays() -> None:
-    assert exchanged(0.1, 0.002, 0.012, 0.0).clocks()["/b"].offset == pytest.approx(
-        0.1 - 0.005, abs=1e-6
-    )
+    assert exchanged(0.1, 0.002, 0.012, 0.0).clocks()["/b"].offset == approx(0.1 - 0.005, abs=1e-6)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.15])
 def test_delays_of_busy_host_shift_no_clock_of_that_host(offset: float) -> None:
     """To another host one way of 0.002 s and one of 0.202 s are a clock that is 0.1 s off."""
     clock = exchanged(offset, 0.002, 0.202, 0.0, (7.0, 7.0)).clocks()["/b"]
-    assert clock.offset == pytest.approx(offset, abs=1e-9)
-    assert clock.delay == pytest.approx(0.202)
+    assert clock.offset == approx(offset, abs=1e-9)
+    assert clock.delay == approx(0.202)
     assert "set" in clock.advice
     elsewhere = exchanged(offset, 0.002, 0.202, 0.0, (7.0, 8.0)).clocks()["/b"]
-    assert elsewhere.offset == pytest.approx(offset - 0.1)
+    assert elsewhere.offset == approx(offset - 0.1)
     assert "synchronise" in elsewhere.advice
 
 

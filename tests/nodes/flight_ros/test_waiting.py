@@ -45,10 +45,8 @@ def printed(folder: Path, pause: float) -> str:
     """What pytest prints of tests that pass at an attempt, and of one that bears a longer pause and
     fails.
     """
-    (folder / "test_it.py").write_text(TESTS, encoding="utf-8")
-    (folder / "pytest.ini").write_text(
-        "[pytest]\nmarkers =\n  longest_pause(s): a test\n", encoding="utf-8"
-    )
+    (folder / "test_it.py").write_text(TESTS)
+    (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n")
     program = PLUGIN.format(pause=pause, folder=str(folder))
     options = {"cwd": folder, "env": {"PYTHONPATH": str(REPOSITORY)}}
     done = subprocess.run(

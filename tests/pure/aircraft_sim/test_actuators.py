@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax import enable_x64
 from jax import numpy as jnp
+from pytest import approx
 from scipy.integrate import solve_ivp
 from tests.builders import MS, aircraft_parameters, rms
 from tests.closed_loop import PROTOTYPE_SERVO, error
@@ -71,17 +72,17 @@ def test_ideal_actuator_passes_command_on_to_last_bit(
 def test_step_response_is_exact_first_order_response_for_any_dt(dt: float) -> None:
     # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding
     history = positions([0.3] * 20, dt, actuator(lag=0.02))
-    assert history == pytest.approx(
+    assert history == approx(
         [0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13
     )
 
 
 def test_rate_limit_gives_straight_ramp_that_ends_on_command() -> None:
     # 2 /s over 0.1 s: 0.2 a step, the last one only as far as the command
-    assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx(
+    assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == approx(
         [0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15
     )
-    assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx(
+    assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == approx(
         [-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15
     )
 
@@ -100,9 +101,9 @@ def test_lag_comes_before_rate_limit_and_end_stop_last() -> None:
     # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2,
     # the stop 0.05.
     moved = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
-    assert moved == pytest.approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
+    assert moved == approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
     # Close to the command the lag is slower than the rate limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
-    assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(
+    assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == approx(
         0.1 * (1.0 - math.exp(-1.0)), abs=1e-15
     )
 
@@ -111,9 +112,7 @@ def test_dead_zone_gives_zero_inside_and_excess_outside() -> None:
     # input = c - clip(c, -w, w), w = 0.1
     params = Actuators(dead_zone=np.array([0.1]))
     commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
-    assert positions(commands, 0.01, params) == pytest.approx(
-        [0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16
-    )
+    assert positions(commands, 0.01, params) == approx([0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16)
 
 
 @given(command=st.floats(-1.0, 1.0), further=st.floats(0.0, 1e-3), width=st.floats(0.0, 0.5))
@@ -148,7 +147,7 @@ def test_stuck_surface_stays_where_it_is_from_instant_on() -> None:
     assert (stuck[:, 1:] == healthy[:, 1:]).all()
     assert (stuck[:5, 0] == healthy[:5, 0]).all()
     assert (stuck[5:, 0] == healthy[4, 0]).all()
-    assert stuck[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5)))
+    assert stuck[-1, 0] == approx(0.2 * (1.0 - math.exp(-2.5)))
 
 
 def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
@@ -197,7 +196,7 @@ def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float
     """0.5 in trim and 0.2 above it; without any effect it is an engine that is lost."""
     params = osprey(faults=[f"thrust weak 0 {part}"]).actuators
     _, mean = move(0.0, np.zeros(4), np.array([0.0, 0.2, 0.0, 0.0]), 0.01, params)
-    assert 0.5 + mean[1] == pytest.approx(thrust, abs=1e-15)
+    assert 0.5 + mean[1] == approx(thrust, abs=1e-15)
     assert mean[[0, 2, 3]].tolist() == [0.0] * 3
 
 
@@ -209,7 +208,7 @@ def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
     assert (slow[:5] == healthy[:5]).all()
     assert (slow[:, 1:] == healthy[:, 1:]).all()
-    assert slow[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5) * math.exp(-0.05 / 0.2)))
+    assert slow[-1, 0] == approx(0.2 * (1.0 - math.exp(-2.5) * math.exp(-0.05 / 0.2)))
 
 
 def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> None:
@@ -232,9 +231,9 @@ def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> N
         means.append(mean)
     t = 0.01 * np.arange(1, 31)
     expected = np.maximum(0.1 - 2.0 * np.maximum(t - 0.02, 0.0), -0.3)
-    assert np.array(history)[:, 0] == pytest.approx(expected, abs=1e-12)
-    assert np.array(means)[2:20, 0] == pytest.approx(expected[2:20] + 0.01, abs=1e-12)
-    assert np.array(history)[:, 2] == pytest.approx(np.minimum(2.0 * t, 0.3), abs=1e-12)
+    assert np.array(history)[:, 0] == approx(expected, abs=1e-12)
+    assert np.array(means)[2:20, 0] == approx(expected[2:20] + 0.01, abs=1e-12)
+    assert np.array(history)[:, 2] == approx(np.minimum(2.0 * t, 0.3), abs=1e-12)
     assert np.array(history)[:, 3].tolist() == [0.0] * 30
 
 
@@ -253,7 +252,7 @@ def test_loose_surface_follows_play_operator() -> None:
     for t, command in ((0.0, 0.05), (1.0, 0.1), (1.0, 0.3), (1.0, 0.15), (1.0, 0.05), (1.0, -0.2)):
         position, _ = move(t, position, np.array([command]), 0.01, params)
         history.append(float(position[0]))
-    assert history == pytest.approx([0.05, 0.05, 0.2, 0.2, 0.15, -0.1])
+    assert history == approx([0.05, 0.05, 0.2, 0.2, 0.15, -0.1])
 
 
 def test_drift_ends_as_the_drifted_aircraft() -> None:
@@ -267,8 +266,8 @@ def test_drift_ends_as_the_drifted_aircraft() -> None:
         expected,
         strict=True,
     ):
-        assert getattr(after, matrix) == pytest.approx(last)
-        assert getattr(plant.aircraft_at(2000 * MS, ice.plant()), matrix) == pytest.approx(
+        assert getattr(after, matrix) == approx(last)
+        assert getattr(plant.aircraft_at(2000 * MS, ice.plant()), matrix) == approx(
             (first + last) / 2.0
         )
         assert (getattr(plant.aircraft_at(1000 * MS, ice.plant()), matrix) == first).all()
@@ -393,7 +392,7 @@ def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
     for k in range(2):
         apart = move(0.0, position[:, k], command[:, k], 0.01, SIX)
         for whole, part in zip(together, apart, strict=True):
-            assert np.asarray(whole)[:, k] == pytest.approx(part, abs=1e-15)
+            assert np.asarray(whole)[:, k] == approx(part, abs=1e-15)
 
 
 def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
@@ -412,9 +411,7 @@ def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
         for ms in (5.0, 2.5)
     ]
     errors = [np.abs(x - exact).max() for x in runs]
-    assert errors[0] / errors[1] == pytest.approx(
-        4.0, rel=0.1
-    )  # half the step, a quarter of the error
+    assert errors[0] / errors[1] == approx(4.0, rel=0.1)  # half the step, a quarter of the error
 
 
 # Flights through servos: scenario osprey_servo without its noise, with the gains of the prototype.

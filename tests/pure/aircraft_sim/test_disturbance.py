@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx
 from scipy.integrate import solve_ivp
 from tests.builders import MS, aircraft_parameters
 from tests.closed_loop import error
@@ -48,9 +49,7 @@ def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
 
     # U_ds/2 (1 - cos(pi s/H)): U_ds at H, half of it at H/2 and 3H/2, zero at 0 and from 2H on.
     speeds = [w(distance * H) for distance in (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 2.5)]
-    assert speeds == pytest.approx(
-        [0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9
-    )
+    assert speeds == approx([0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
 
 
 def test_gust_comes_again_after_its_time() -> None:
@@ -62,7 +61,7 @@ def test_gust_comes_again_after_its_time() -> None:
     later = one_minus_cosine(t + 21.0, again, np.array(V0))[
         t > 2.0
     ]  # before the first entry there was none
-    assert later == pytest.approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
+    assert later == approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
 
 
 def test_wind_along_axis_changes_relative_velocity() -> None:
@@ -70,9 +69,9 @@ def test_wind_along_axis_changes_relative_velocity() -> None:
     # alpha = w / V0.
     osprey = load_airframe("osprey")
     A = osprey.matrix_a()
-    assert osprey.gust_direction("longitudinal") == pytest.approx(-A[:, osprey.index("V")])
-    assert osprey.gust_direction("lateral") == pytest.approx(-A[:, osprey.index("beta")] / V0)
-    assert osprey.gust_direction("vertical") == pytest.approx(
+    assert osprey.gust_direction("longitudinal") == approx(-A[:, osprey.index("V")])
+    assert osprey.gust_direction("lateral") == approx(-A[:, osprey.index("beta")] / V0)
+    assert osprey.gust_direction("vertical") == approx(
         -A[:, osprey.index("alpha")] / V0, abs=0.051 / V0
     )
     assert set(osprey.gusts) == set(AXES)
@@ -82,7 +81,7 @@ def test_bias_rises_along_half_cosine_and_stays() -> None:
     params = single(Bias, 2.0, 0.3, 4.0)
     at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
     # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
-    assert at == pytest.approx(
+    assert at == approx(
         [0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3],
         abs=1e-15,
     )
@@ -100,9 +99,9 @@ def test_biases_and_sines_act_on_state_they_name() -> None:
         },
     )
     f = dict(zip(load_airframe("osprey").states, dynamics.f(3.0, np.zeros(8), params), strict=True))
-    assert f["q"] == pytest.approx(0.3 + 0.2 * math.sin(4.0))
-    assert f["V"] == pytest.approx(-2.0)
-    assert f["r"] == pytest.approx(0.1 * math.sin(6.0))
+    assert f["q"] == approx(0.3 + 0.2 * math.sin(4.0))
+    assert f["V"] == approx(-2.0)
+    assert f["r"] == approx(0.1 * math.sin(6.0))
     assert [f[name] for name in ("alpha", "theta", "beta", "p", "phi")] == [0.0] * 5
 
 
@@ -180,7 +179,7 @@ def test_inside_assumption_2_error_falls_with_square_of_period(
     # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s with the sine, 1.56 and 0.39 with the
     # bias.
     coarse, fine = (largest(INSIDE[name], rate, osprey_gust)[0] for rate in (100.0, 200.0))
-    assert coarse / fine == pytest.approx(4.0, rel=0.05)
+    assert coarse / fine == approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize("name, channel", [("step", 0), ("turbulence", 1)])
@@ -212,8 +211,8 @@ def test_the_coupling_is_that_of_eulers_equations() -> None:
         x[PQR] = w
         w_dot = np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w))
         f = dynamics.f(0.0, x, coupled(1.0))
-        assert f[PQR] == pytest.approx(w_dot, abs=1e-5)
-        assert dynamics.f(0.0, x, coupled(0.25))[PQR] == pytest.approx(0.25 * w_dot, abs=1e-5)
+        assert f[PQR] == approx(w_dot, abs=1e-5)
+        assert dynamics.f(0.0, x, coupled(0.25))[PQR] == approx(0.25 * w_dot, abs=1e-5)
         assert np.count_nonzero(np.delete(f, PQR)) == 0
 
 
@@ -235,12 +234,10 @@ def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
         max_step=0.01,
     )
     end = advance(0, AircraftState(x, np.zeros(4)), np.zeros(4), 10_000 * MS, free).x[PQR]
-    assert end == pytest.approx(
-        exact.y[:, -1], abs=1e-4
-    )  # six digits of the gains, over three turns
+    assert end == approx(exact.y[:, -1], abs=1e-4)  # six digits of the gains, over three turns
     assert np.ptp(exact.y[1]) > 3.0  # it has turned over
     for kept in (lambda w: w @ INERTIA @ w, lambda w: np.linalg.norm(INERTIA @ w)):
-        assert kept(end) == pytest.approx(kept(w), rel=1e-5)
+        assert kept(end) == approx(kept(w), rel=1e-5)
 
 
 BASELINE: dict[str, Any] = {

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.conftest import refusing
 
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 SAMPLES, CHANGE = 400, 201  # at 500 Hz; the number of the first sample after the change
@@ -101,13 +101,10 @@ def test_sensor_errors_begin_and_end_between_two_samples(osprey_gust: Scenario) 
 
 def test_gust_changes_neither_past_nor_gust_that_acts(osprey_gust: Scenario) -> None:
     scenario = osprey_gust.vary(aircraft={"gusts": {"vertical": GUST | {"start": 0.3}}})
-    with pytest.raises(
-        ParameterError, match=r"gusts\.lateral\.start: found 0\.1 s, expected at least t = 0\.4 s"
-    ):
+    with refusing(r"gusts\.lateral\.start: found 0\.1 s, expected at least t = 0\.4 s"):
         flown(scenario.aircraft, varied(scenario, gusts={"lateral": GUST | {"start": 0.1}}))
-    with pytest.raises(
-        ParameterError,
-        match=r"gusts\.vertical: found a change of a gust that acts, expected one after its end",
+    with refusing(
+        r"gusts\.vertical: found a change of a gust that acts, expected one after its end"
     ):
         flown(scenario.aircraft, varied(scenario, gusts={"vertical": GUST}))
 
@@ -118,14 +115,9 @@ def test_drift_that_is_scheduled_in_flight_is_one_of_the_scenario(osprey_gust: S
         varied(osprey_gust, drift=ice | {"start": start}) for start in (NEVER, BEGIN + 0.1)
     )
     assert flown(never, later).tobytes() == flown(later, later).tobytes()
-    with pytest.raises(
-        ParameterError, match=r"drift\.start: found 0\.1 s, expected at least t = 0\.4 s"
-    ):
+    with refusing(r"drift\.start: found 0\.1 s, expected at least t = 0\.4 s"):
         flown(never, varied(osprey_gust, drift=ice | {"start": 0.1}))
-    with pytest.raises(
-        ParameterError,
-        match=r"^drift: found a change of a drift that acts, expected one before its start",
-    ):
+    with refusing(r"^drift: found a change of a drift that acts, expected one before its start"):
         flown(varied(osprey_gust, drift=ice | {"start": 0.1}), later)
 
 

@@ -13,6 +13,7 @@ import jsbsim
 import numpy as np
 import pytest
 from tests.builders import aircraft_parameters
+from tests.conftest import refusing
 
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
@@ -30,14 +31,13 @@ from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import trim_solution
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di import Scenario, fly
 
 pytestmark = pytest.mark.slow
 
 PACKAGE = Path(jsbsim.get_default_root_dir())
-CESSNA = (PACKAGE / "aircraft" / "c172p" / "c172p.xml").read_text(encoding="utf-8")
+CESSNA = (PACKAGE / "aircraft" / "c172p" / "c172p.xml").read_text()
 STEP_NS = 5_000_000
 SECTION: dict[str, Any] = {"speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
 
@@ -50,7 +50,7 @@ def write_model(
     (folder / engines / "own_engine.xml").write_bytes(
         (PACKAGE / "engine" / f"{engine}.xml").read_bytes()
     )
-    (folder / name).write_text(CESSNA.replace("eng_io320", "own_engine"), encoding="utf-8")
+    (folder / name).write_text(CESSNA.replace("eng_io320", "own_engine"))
     return folder / name
 
 
@@ -91,7 +91,7 @@ def external(tmp_path: Path) -> Path:
         "<input>fcs/roll-trim-cmd-norm</input>", ""
     )
     path = tmp_path / "own.xml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text)
     return path
 
 
@@ -101,9 +101,9 @@ def test_hysteresis_of_a_model_is_named(external: Path) -> None:
         '<actuator name="servo"><input>own/elevator</input>'
         "<hysteresis_width>0.02</hysteresis_width></actuator>"
     )
-    text = external.read_text(encoding="utf-8")
+    text = external.read_text()
     marked = text.replace('<channel name="Pitch">', f'<channel name="Pitch">{servo}', 1)
-    external.write_text(marked, encoding="utf-8")
+    external.write_text(marked)
     assert hysteresis_of(external).startswith("; servos of the model have a hysteresis_width")
 
 
@@ -161,7 +161,7 @@ def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) ->
     ],
 )
 def test_named_property_that_is_none_is_refused(commands: dict[str, str], sentence: str) -> None:
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         aircraft_parameters(
             **SECTION, airframe=f"{PREFIX}c172p", commands=commands
         ).flight_condition()
@@ -228,14 +228,14 @@ def test_model_without_trim_of_its_own_trims_by_its_elevator(
     electric: Path, tmp_path: Path
 ) -> None:
     # as flying wings have it: no surface reads fcs/pitch-trim-cmd-norm
-    text = electric.read_text(encoding="utf-8")
+    text = electric.read_text()
     cut = text.replace("fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
     assert cut != text
     for part in electric.parent.iterdir():
         if part.is_dir():
             shutil.copytree(part, tmp_path / part.name)
     model = tmp_path / electric.name
-    model.write_text(cut, encoding="utf-8")
+    model.write_text(cut)
     solution = trim_solution(FlightCondition(str(model), 46.3, 1219.2, STEP_NS))
     assert solution is not None
     assert solution[-1] == 1.0  # all of it by the elevator
@@ -258,10 +258,7 @@ def test_root_of_user_has_names_and_engines(
         assert aircraft_names() == ("mine",)
         assert np.array_equal(throttle_step(f"{PREFIX}mine"), expected)
         monkeypatch.setenv("JSBSIM_ROOT", str(tmp_path))
-        with pytest.raises(
-            ParameterError,
-            match=r"^JSBSIM_ROOT: found .*, expected a folder with aircraft and engine$",
-        ):
+        with refusing(r"^JSBSIM_ROOT: found .*, expected a folder with aircraft and engine$"):
             root()
     finally:
         aircraft_names.cache_clear()
@@ -292,14 +289,12 @@ def test_wrong_path_refused_with_what_is_there(
     monkeypatch.chdir(tmp_path)
     for folder in ("empty", "two", "page"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "page" / "page.xml").write_text("<html/>", encoding="utf-8")
+    (tmp_path / "page" / "page.xml").write_text("<html/>")
     for name in ("a", "b"):
-        (tmp_path / "two" / f"{name}.xml").write_text(
-            '<?xml version="1.0"?><fdm_config/>', encoding="utf-8"
-        )
+        (tmp_path / "two" / f"{name}.xml").write_text('<?xml version="1.0"?><fdm_config/>')
     (tmp_path / "engine.xml").write_bytes((PACKAGE / "engine" / "eng_io320.xml").read_bytes())
-    (tmp_path / "text.xml").write_text("x,y\n1,2\n", encoding="utf-8")
-    with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
+    (tmp_path / "text.xml").write_text("x,y\n1,2\n")
+    with refusing(f"^aircraft.airframe: {sentence}") as refused:
         aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
     assert len(str(refused.value)) < 300  # no list of all names
 

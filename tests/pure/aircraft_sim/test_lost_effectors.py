@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 from tests.conftest import REPOSITORY
 
 from aircraft_sim import plant
@@ -56,11 +57,11 @@ def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     """
     thrust = 0.5 * 0.06 * 100.0 * 13.5 / 2.0
     found = accelerations("osprey_twin", lost)
-    assert found["r"] == pytest.approx(
+    assert found["r"] == approx(
         toward * 0.2 * thrust / 1.759, rel=2e-3
     )  # the file has two figures: 0.046 of 0.04605
-    assert found["V"] == pytest.approx(-thrust / 13.5, rel=2e-3)
-    assert found["p"] == pytest.approx(0.0, abs=1e-3)
+    assert found["V"] == approx(-thrust / 13.5, rel=2e-3)
+    assert found["p"] == approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["osprey", "osprey_vtail"])
@@ -69,8 +70,8 @@ def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) 
     %.
     """
     found = accelerations(name, "thrust")
-    assert found["V"] == pytest.approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
-    assert [found["q"], found["r"]] == pytest.approx([0.0, 0.0], abs=1e-3)
+    assert found["V"] == approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
+    assert [found["q"], found["r"]] == approx([0.0, 0.0], abs=1e-3)
 
 
 def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
@@ -78,7 +79,7 @@ def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
     has a part in.
     """
     found = accelerations("x8_elevons", "thrust")
-    assert found["V"] == pytest.approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
+    assert found["V"] == approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
 
 
 @pytest.mark.parametrize("number", range(1, 7))
@@ -94,9 +95,9 @@ def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number
     roll, pitch = np.array([-east, north]) * thrust / 0.02  # of a thrust up: r x F
     yaw = 0.016 * thrust / 0.035 * (1.0 if number % 2 else -1.0)
     found = accelerations(HEXAROTOR, f"rotor_{number}")
-    assert found["w"] == pytest.approx(GRAVITY / 6.0, rel=2e-3)  # down
+    assert found["w"] == approx(GRAVITY / 6.0, rel=2e-3)  # down
     expected = np.array([-roll, -pitch, -yaw])
-    assert [found[rate] for rate in "pqr"] == pytest.approx(expected.tolist(), rel=2e-3, abs=1e-3)
+    assert [found[rate] for rate in "pqr"] == approx(expected.tolist(), rel=2e-3, abs=1e-3)
 
 
 def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
@@ -171,7 +172,7 @@ def test_loss_of_an_unknown_thrust_is_refused_with_the_way_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "sentence"),
+    "fault, sentence",
     [
         ("aileron lots 60", "found 'lots', expected lost perhaps, or another of stuck, lost,"),
         ("ailron lost 60", "found 'ailron', expected aileron perhaps, or another of elevator,"),

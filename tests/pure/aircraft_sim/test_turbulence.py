@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from pytest import approx
 from scipy.integrate import quad
 from scipy.linalg import expm
 from tests.builders import MS, aircraft_parameters, truth_of
+from tests.conftest import refusing
 
 from aircraft_sim import plant, turbulence
 from aircraft_sim.disturbance import AXES
 from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.slow
@@ -91,8 +93,8 @@ def test_lengths_and_intensities_are_those_published(
     intensities: tuple[float, ...],
 ) -> None:
     found = dryden(feet * FEET, wind * KNOTS, sigma * KNOTS)
-    assert found.length == pytest.approx(np.array(lengths) * FEET)
-    assert found.sigma == pytest.approx(np.array(intensities) * KNOTS)
+    assert found.length == approx(np.array(lengths) * FEET)
+    assert found.sigma == approx(np.array(intensities) * KNOTS)
 
 
 def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
@@ -113,7 +115,7 @@ def test_the_filters_have_the_published_spectra(axis: int) -> None:
     for omega in np.logspace(-2, 2, 9):
         response = output[axis] @ np.linalg.solve(1j * omega * np.eye(5) - F, G)
         # White noise of unit intensity has the one-sided spectrum 1/pi.
-        assert np.sum(np.abs(response) ** 2) / np.pi == pytest.approx(
+        assert np.sum(np.abs(response) ** 2) / np.pi == approx(
             float(spectrum(omega, axis, SMALL)), rel=1e-12
         )
 
@@ -126,12 +128,12 @@ def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
     params = filters(model, V0, dt, ALL, 1)
     transition, added = params.transition, params.spread @ params.spread.T
     stationary = params.stationary @ params.stationary.T
-    assert transition @ stationary @ transition.T + added == pytest.approx(stationary, abs=1e-14)
+    assert transition @ stationary @ transition.T + added == approx(stationary, abs=1e-14)
     if dt * V0 / model.length.min() < 5.0:
         F, G = continuous(model)
         double = expm(np.block([[-F, G @ G.T], [np.zeros((5, 5)), F.T]]) * dt)
-        assert transition == pytest.approx(expm(F * dt), rel=1e-9, abs=1e-14)
-        assert added == pytest.approx(double[5:, 5:].T @ double[:5, 5:], rel=1e-9, abs=1e-11)
+        assert transition == approx(expm(F * dt), rel=1e-9, abs=1e-14)
+        assert added == approx(double[5:, 5:].T @ double[:5, 5:], rel=1e-9, abs=1e-11)
 
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
@@ -143,7 +145,7 @@ def test_published_correlations_are_integrals_of_published_spectra(axis: int) ->
         total = quad(
             lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight
         )[0]
-        assert total == pytest.approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
+        assert total == approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
 
 
 SEEDS, STEPS = 300, 1024
@@ -160,7 +162,7 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> N
                 correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL)
             )
             expected = slope * SMALL.sigma[axis] ** 2 * dt * V0 / SMALL.length[axis]
-            assert float(increment) == pytest.approx(expected, rel=2e-3)
+            assert float(increment) == approx(expected, rel=2e-3)
     fine = ensemble(SMALL, 1e-3, 100, 64)
     mean = (
         np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2))
@@ -168,7 +170,7 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> N
         * SMALL.length
         / (1e-3 * V0)
     )
-    assert mean == pytest.approx(
+    assert mean == approx(
         [2.0, 3.0, 3.0], rel=0.1
     )  # 6300 nearly independent increments: 1.8 % standard deviation
 
@@ -207,7 +209,7 @@ def test_rotary_gusts_have_the_published_intensities(dt: float) -> None:
         quad(phi, 0.0, np.inf, args=(2, 4.0))[0],
         quad(phi, 0.0, np.inf, args=(1, 3.0))[0],
     ]
-    np.testing.assert_allclose(found, np.sqrt(published), rtol=dt / 0.1 + 1e-6)
+    assert_allclose(found, np.sqrt(published), rtol=dt / 0.1 + 1e-6)
 
 
 def test_the_air_turns_nose_up_where_the_wind_down_falls_along_the_flight() -> None:
@@ -221,7 +223,7 @@ def test_the_air_turns_nose_up_where_the_wind_down_falls_along_the_flight() -> N
     z[:5] = slope * 0.01 * 400
     rate = params.output[:3, :5] @ np.full(5, slope)  # m/s^2
     turning = turbulence.wind(z, params)[3:]
-    np.testing.assert_allclose(turning[1:], [-rate[2] / V0, rate[1] / V0], rtol=0.05)
+    assert_allclose(turning[1:], [-rate[2] / V0, rate[1] / V0], rtol=0.05)
 
 
 def test_winds_are_the_same_with_rotary_gusts() -> None:
@@ -229,7 +231,7 @@ def test_winds_are_the_same_with_rotary_gusts() -> None:
     turning = filters(SMALL, V0, 0.01, range(6), 5, SPAN)
     states = [turbulence.initial_state(params) for params in (plain, turning)]
     for k in range(200):
-        np.testing.assert_allclose(states[1][:5], states[0], rtol=1e-9, atol=1e-12)
+        assert_allclose(states[1][:5], states[0], rtol=1e-9, atol=1e-12)
         states = [
             turbulence.step(z, turbulence.normals(k, 1, params)[0], params)
             for z, params in zip(states, (plain, turning), strict=True)
@@ -242,7 +244,7 @@ def test_air_that_turns_moves_the_aircraft_as_its_own_rates_the_other_way() -> N
     place = list(airframe.gusts).index("roll")
     rows = [airframe.index(name) for name in ("p", "q", "r")]
     column = airframe.matrix_a()[:, airframe.index("p")]
-    np.testing.assert_allclose(aircraft.gust_direction[rows, place], -column[rows], rtol=1e-12)
+    assert_allclose(aircraft.gust_direction[rows, place], -column[rows], rtol=1e-12)
     simulator = Simulator(chosen)
     simulator.sample(0, np.zeros(4))
     true = truth_of(simulator)
@@ -252,10 +254,10 @@ def test_air_that_turns_moves_the_aircraft_as_its_own_rates_the_other_way() -> N
 
 def test_rotary_gusts_need_a_span_and_matrices() -> None:
     rotary: dict[str, Any] = {"turbulence": TURBULENCE | {"rotary": True}}
-    with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*no span"):
+    with refusing(r"turbulence.rotary: found true.*no span"):
         aircraft_parameters(airframe="x8_elevons", **rotary)
     jsbsim: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 1000.0}
-    with pytest.raises(ParameterError, match=r"turbulence.rotary: found true.*JSBSim takes winds"):
+    with refusing(r"turbulence.rotary: found true.*JSBSim takes winds"):
         aircraft_parameters(**jsbsim, **rotary)
 
 
@@ -268,7 +270,7 @@ def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
     assert cut.turbulence is not None
     assert whole.turbulence is not None
     assert cut.turbulence.tobytes() == whole.turbulence.tobytes()
-    assert cut.x == pytest.approx(whole.x, abs=1e-14)  # the instants are rounded differently
+    assert cut.x == approx(whole.x, abs=1e-14)  # the instants are rounded differently
     first, second = (Simulator(aircraft_parameters(turbulence=TURBULENCE)) for _ in range(2))
     for number in range(20):
         for simulator in (first, second):
@@ -289,8 +291,8 @@ def test_truth_holds_wind_that_acts_from_now_on_and_f_includes_it() -> None:
         winds = dict(zip(parameters.sampled_airframe().gusts, turbulence.wind(z, air), strict=True))
         gust = 1.0 - math.cos(math.pi * 0.01 * number * 25.0 / 2.5)
         assert true["gust.lateral"] == winds["lateral"] != 0.0
-        assert true["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
-        assert true["f.p"] == pytest.approx(3.13 / 25.0 * true["gust.lateral"], rel=1e-12)
+        assert true["gust.vertical"] == approx(winds["vertical"] + gust, rel=1e-12)
+        assert true["f.p"] == approx(3.13 / 25.0 * true["gust.lateral"], rel=1e-12)
         for normal in turbulence.normals(5 * number, 5, air):
             z = turbulence.step(z, normal, air)
 

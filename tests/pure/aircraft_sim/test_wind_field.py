@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
@@ -26,15 +27,15 @@ def config(**values: Any) -> AircraftConfig:
 
 
 @pytest.mark.parametrize(
-    ("height", "factor"), [(10.0, 1.0), (1.0, 0.5), (100.0, 1.5), (0.1, 0.0), (-3.0, 0.0)]
+    "height, factor", [(10.0, 1.0), (1.0, 0.5), (100.0, 1.5), (0.1, 0.0), (-3.0, 0.0)]
 )
 def test_log_law_over_three_decades(height: float, factor: float) -> None:
     """ln(h / 0.1) / ln(10 / 0.1): a decade is half of the wind at 10 m."""
-    assert Log(10.0, 0.1).factor(height) == pytest.approx(factor, abs=1e-15)
+    assert Log(10.0, 0.1).factor(height) == approx(factor, abs=1e-15)
 
 
 def test_power_law_and_table() -> None:
-    assert Power(10.0, 1.0 / 7.0).factor(1280.0) == pytest.approx(2.0)  # 128 = 2^7
+    assert Power(10.0, 1.0 / 7.0).factor(1280.0) == approx(2.0)  # 128 = 2^7
     assert Power(10.0, 0.5).factor(-1.0) == 0.0
     table = Table((0.0, 100.0), (0.0, -8.0), (2.0, 4.0))
     at = WindField((0.0, 0.0), 300.0, table).at
@@ -59,9 +60,9 @@ def test_largest_outflow_of_a_microburst_is_at_its_height() -> None:
     places = [(r, z) for r in np.linspace(0.0, 2000.0, 401) for z in np.linspace(0.0, 300.0, 151)]
     outflow = [BURST.wind(100.0 + r, -50.0, z)[0] for r, z in places]
     r, z = places[int(np.argmax(outflow))]
-    assert max(outflow) == pytest.approx(12.0, rel=1e-4)
-    assert (r, z) == (pytest.approx(1.1209 * 600.0, abs=5.0), pytest.approx(40.0, abs=2.0))
-    assert BURST.wind(700.0, 0.0, 0.0) == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    assert max(outflow) == approx(12.0, rel=1e-4)
+    assert (r, z) == (approx(1.1209 * 600.0, abs=5.0), approx(40.0, abs=2.0))
+    assert BURST.wind(700.0, 0.0, 0.0) == approx([0.0, 0.0, 0.0], abs=1e-12)
     assert BURST.wind(100.0, -50.0, 200.0)[2] > 0.0
 
 
@@ -87,8 +88,8 @@ def test_level_flight_in_a_shear_is_that_in_the_wind_of_its_height(base: dict[st
     u = np.zeros(4)
     sheared = flown(config(**base, shear=shear, wind=[0.0, 4.0]), 100, u)
     steady = flown(config(**base, wind=[0.0, wind]), 100, u)
-    assert sheared == pytest.approx(steady, abs=0.02)
-    assert steady[-1, 4 + POSE.index("v_east")] == pytest.approx(wind, abs=0.1)
+    assert sheared == approx(steady, abs=0.02)
+    assert steady[-1, 4 + POSE.index("v_east")] == approx(wind, abs=0.1)
 
 
 def test_aircraft_that_climbs_into_a_head_wind_gains_airspeed_and_keeps_its_ground_speed() -> None:
@@ -108,9 +109,9 @@ def test_aircraft_that_climbs_into_a_head_wind_gains_airspeed_and_keeps_its_grou
     gained = (into[last, 1] - into[first, 1]) - (calm[last, 1] - calm[first, 1])
     head = 5.0 * (into[last, altitude] - into[first, altitude])
     assert head > 0.5
-    assert gained == pytest.approx(head, rel=0.1)
+    assert gained == approx(head, rel=0.1)
     north = 4 + POSE.index("v_north")
-    assert into[last, north] == pytest.approx(calm[last, north], abs=0.1 * head)
+    assert into[last, north] == approx(calm[last, north], abs=0.1 * head)
 
 
 def test_start_heading_turns_the_flight_and_not_the_wind() -> None:
@@ -124,11 +125,11 @@ def test_start_heading_turns_the_flight_and_not_the_wind() -> None:
         rows = flown(config(microburst=burst | {"height": 40.0}, start=start), 300, np.zeros(4))
         winds.append(rows[:, -3:])
     assert abs(winds[0][-1]).max() > 0.1
-    assert winds[0] == pytest.approx(winds[1], abs=1e-9)
+    assert winds[0] == approx(winds[1], abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("section", "sentence"),
+    "section, sentence",
     [
         ({"shear": LOG | {"roughness": 20.0}}, "shear.reference: found 10 m, expected more than"),
         ({"shear": LOG | {"exponent": 0.2}}, "shear.exponent: found a value, expected none beside"),

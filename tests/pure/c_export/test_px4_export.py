@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from tests.conftest import REPOSITORY
+from pytest import approx
+from tests.conftest import REPOSITORY, refusing
 
 from c_export.constants import exportable
 from c_export.events import flight_recordings
@@ -23,7 +24,6 @@ from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.export import export
-from flight_core.parameters import ParameterError
 from flight_design.identification.module_log import STATUS, module_flight
 from flight_log.vehicle_log import Table, VehicleLog
 from rise_di_controller.internals import Saturation
@@ -128,7 +128,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
 @pytest.fixture(scope="module")
 def library(folder: Path) -> Path:
     module = folder / MODULE
-    (module / "host.c").write_text(WRAPPER, encoding="utf-8")
+    (module / "host.c").write_text(WRAPPER)
     command = [
         "gcc",
         *FLAGS,
@@ -171,8 +171,8 @@ def test_spare_flies_until_all_is_ready(shell: Shell) -> None:
 def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
     shell.fly(500, enabled=False)
     assert shell.run() == FLIES
-    assert shell.torque == pytest.approx(shell.spare, abs=0.02)
-    assert shell.values[3:6] == pytest.approx(
+    assert shell.torque == approx(shell.spare, abs=0.02)
+    assert shell.values[3:6] == approx(
         0.261799 * shell.torque[[1, 0, 2]], rel=1e-6
     )  # u in rad, q p r
 
@@ -197,10 +197,10 @@ def test_falls_back_in_the_same_cycle(
     assert set(shell.fly(50, setpoint=(0.3, 0.2, 0.1))) == {FLIES}
     before = shell.torque.copy()
     assert shell.run(**changes) == refusal
-    assert shell.torque == pytest.approx(before, abs=1e-6)  # no jump
+    assert shell.torque == approx(before, abs=1e-6)  # no jump
     assert np.abs(before - shell.spare).max() > 0.02
     shell.fly(1000, armed=False)
-    assert shell.torque == pytest.approx(shell.spare, abs=1e-4)
+    assert shell.torque == approx(shell.spare, abs=1e-4)
     assert shell.run() == (refusal if latches else FLIES)
     shell.run(enabled=False)
     assert shell.run() == FLIES
@@ -222,7 +222,7 @@ def test_reference_follows_the_setpoint(shell: Shell) -> None:
     """
     shell.fly(2, enabled=False)
     shell.fly(300, setpoint=(0.3, -0.2, 0.1), rates=(0.3, -0.2, 0.1), enabled=False)
-    assert shell.values[:3] == pytest.approx([-0.2, 0.3, 0.1], abs=1e-3)  # q, p, r
+    assert shell.values[:3] == approx([-0.2, 0.3, 0.1], abs=1e-3)  # q, p, r
     shell.now_us += 2_000_000
     shell.run(setpoint=(0.3, -0.2, 0.1), enabled=False)
     shell.run(setpoint=(0.3, -0.2, 0.1), enabled=False)
@@ -243,7 +243,7 @@ def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
     unscaled = rise.pop(0.0)
     for airspeed, torque in rise.items():
         ratio = 1.0 if np.isnan(airspeed) else 11.5 / airspeed
-        assert torque == pytest.approx(unscaled * ratio**2, rel=1e-4)
+        assert torque == approx(unscaled * ratio**2, rel=1e-4)
     assert unscaled > 0.0
 
 
@@ -254,15 +254,15 @@ def test_limits_are_those_of_the_torque(library: Path) -> None:
     shell = Shell(library)
     shell.fly(400, setpoint=(5.0, 0.0, 0.0), airspeed=8.0, max_error=30.0)
     assert shell.torque[0] == 1.0
-    assert shell.values[4] == pytest.approx(0.261799 * (8.0 / 11.5) ** 2, rel=1e-6)
+    assert shell.values[4] == approx(0.261799 * (8.0 / 11.5) ** 2, rel=1e-6)
 
 
 def test_compiles_beside_a_stub_of_px4(folder: Path, tmp_path: Path) -> None:
     module = folder / MODULE
-    source = (module / "RiseDiControl.cpp").read_text(encoding="utf-8")
+    source = (module / "RiseDiControl.cpp").read_text()
     for header in re.findall(r"#include <(.*)>", source):
         (tmp_path / header).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / header).write_text('#include "px4.h"\n', encoding="utf-8")
+        (tmp_path / header).write_text('#include "px4.h"\n')
     if shutil.which("g++") is None:
         pytest.skip("no g++ on this machine")
     flags = ["-std=gnu++14", "-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", *WARNINGS]
@@ -284,12 +284,12 @@ def test_compiles_beside_a_stub_of_px4(folder: Path, tmp_path: Path) -> None:
 
 def test_parameters_and_topics_are_those_of_the_source(folder: Path) -> None:
     module = folder / MODULE
-    source = (module / "RiseDiControl.cpp").read_text(encoding="utf-8")
-    yaml = (module / "module.yaml").read_text(encoding="utf-8")
+    source = (module / "RiseDiControl.cpp").read_text()
+    yaml = (module / "module.yaml").read_text()
     used = set(re.findall(r"px4::params::(\w+)", source))
     assert used == set(re.findall(r"^        (RDI_\w+):", yaml, re.MULTILINE))
     assert all(len(name) <= 16 for name in used)
-    message = (folder / "msg" / "RiseDiStatus.msg").read_text(encoding="utf-8")
+    message = (folder / "msg" / "RiseDiStatus.msg").read_text()
     fields = re.findall(r"^(?:uint|float)\S+ ([a-z_]+)", message, re.MULTILINE)
     assert set(re.findall(r"\tstatus\.(\w+)", source)) == set(fields)
 
@@ -301,13 +301,13 @@ def test_flight_needs_no_more_samples_than_the_module_keeps(folder: Path) -> Non
     sets = [exportable(flight.controller)]
     few, many = (next(flight_recordings(flight, sets, kept)) for kept in (SAMPLES, 100))
     assert few.reals.tobytes() == many.reals.tobytes()
-    with pytest.raises(ParameterError, match="samples: found 3, expected 4 or more"):
+    with refusing("samples: found 3, expected 4 or more"):
         write_code(sets[0], "rates", folder / "few", float32=False, samples=3)
 
 
 def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
     def refused(scenario: Scenario, words: str) -> None:
-        with pytest.raises(ParameterError, match=words):
+        with refusing(words):
             write_px4(scenario, tmp_path, float32=False)
 
     rates = find_scenario(str(RATES))
@@ -364,7 +364,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     table = flown_table(shell, controller)
     log = VehicleLog("a ULog", {STATUS: table}, {}, None)
     if "RISE_DI_FLOAT32 1" in (folder / MODULE / PARAMETERS).read_text("utf-8"):
-        with pytest.raises(ParameterError, match="found u of --float32"):
+        with refusing("found u of --float32"):
             module_flight(log, controller)
         return
     flight = module_flight(log, controller)
@@ -388,7 +388,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    "changes, words",
     [
         ({"parameters": 5.0}, "found 000000000005, expected"),
         ({"u_end[2]": None}, r"found no u_end\[2\], expected"),
@@ -407,5 +407,5 @@ def test_log_of_another_module_is_refused(
         else:
             fields[name] = np.full(len(table.stamp_ns), value)
     log = VehicleLog("a ULog", {STATUS: Table(table.stamp_ns, fields)}, {}, None)
-    with pytest.raises(ParameterError, match=words):
+    with refusing(words):
         module_flight(log, controller)

@@ -290,7 +290,7 @@ def test_outcome_of_another_flight_beside_a_log_is_not_believed(
     half = damaged(numbered, "cut", 0.5, 0.0, "")
     log = write_messages(recorded / "run_0.mcap", tmp_path / "other" / "run_0.mcap", half)
     content = {"summary.json": json.dumps({"outcome": "landed"}), "outcome": "landed"}[beside]
-    (log.parent / beside).write_text(content, encoding="utf-8")
+    (log.parent / beside).write_text(content)
     assert "landed" not in read_flight(log).summary["outcome"]
     assert "landed" not in read_flight(log.parent).summary["outcome"]
 
@@ -449,9 +449,7 @@ def test_outcome_in_the_log_is_before_that_of_a_summary_beside(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     run = fly_and_report(osprey_gust.vary(flight={"duration": 0.5}), tmp_path).mcap.parent
-    (run / "summary.json").write_text(
-        json.dumps({"outcome": "ended early: another flight"}), encoding="utf-8"
-    )
+    (run / "summary.json").write_text(json.dumps({"outcome": "ended early: another flight"}))
     assert read_run(run).tape.outcome == "completed"
     assert read_flight(run).summary["outcome"] == "completed"
 
@@ -466,7 +464,7 @@ def test_summary_of_another_flight_is_not_believed(
     summary = read_flight(log).summary
     summary["flight"]["start_ns"] += later_by
     ended = {"outcome": "aircraft was killed by SIGKILL"}
-    (run / "summary.json").write_text(json.dumps(summary | ended), encoding="utf-8")
+    (run / "summary.json").write_text(json.dumps(summary | ended))
     assert read_run(log).tape.outcome == "unknown"
     told = read_flight(log).summary["outcome"]
     assert (told == ended["outcome"]) is not bool(later_by)

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx
+from tests.conftest import refusing
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -17,7 +19,6 @@ from flight_analysis.closed_loop.guarantee import guarantee
 from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.cli import application
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
 from rise_di_controller.margins import loop_margins
@@ -69,8 +70,8 @@ def test_gain_of_integrator_may_rise_to_two_over_k_period(k: float) -> None:
     # at most above by the 1e-6 of the limit of stability; below by the level's room of 0.4 %
     assert 0.99 * limit < promise.stable < limit * (1.0 + 1e-5)
     assert promise.unstable is not None
-    assert promise.unstable.deviation == pytest.approx(limit, rel=1e-2)
-    assert promise.unstable.frequency == pytest.approx(np.pi / PERIOD)
+    assert promise.unstable.deviation == approx(limit, rel=1e-2)
+    assert promise.unstable.frequency == approx(np.pi / PERIOD)
 
 
 def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
@@ -79,7 +80,7 @@ def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
     half = 120.0 * PERIOD * 1.2 / 2.0
     disk = 1.0 / (1.0 / (1.0 - half) - 0.5)
     assert 0.97 * disk < promise.disk[0] < disk * (1.0 + 1e-5)
-    assert promise.disk_all == pytest.approx(promise.disk[0], rel=1e-9)
+    assert promise.disk_all == approx(promise.disk[0], rel=1e-9)
 
 
 def test_unstable_nominal_loop_has_no_guarantee() -> None:
@@ -90,7 +91,7 @@ def test_unstable_nominal_loop_has_no_guarantee() -> None:
 
 
 def test_loop_without_box_is_refused() -> None:
-    with pytest.raises(ParameterError, match="uncertainty: found 0"):
+    with refusing("uncertainty: found 0"):
         guarantee(integrator(100.0, 0.1)._replace(box=None))
 
 
@@ -102,7 +103,7 @@ def test_bound_of_a_real_product_is_its_closed_form() -> None:
     value, scaling = tightened(M, 4, Scaling(balanced(M), np.zeros(4)), 0.0)
     exact = float(np.abs(u * v).sum())
     assert exact <= value < 1.003 * exact
-    assert value == pytest.approx(float(bound_at(M, scaling)), rel=1e-9)
+    assert value == approx(float(bound_at(M, scaling)), rel=1e-9)
 
 
 def test_imaginary_scalar_has_no_real_perturbation() -> None:
@@ -145,7 +146,7 @@ def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
     whole = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
     pulled = every_channel(whole).closed(d)[0]
     sizes = np.abs(np.linalg.eigvals(pulled)).max(axis=-1)
-    assert sizes == pytest.approx(radii(linear, d), abs=1e-5)
+    assert sizes == approx(radii(linear, d), abs=1e-5)
 
 
 def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
@@ -178,7 +179,7 @@ def test_search_is_at_or_below_corners() -> None:
         # a walk may end at a corner beside the least one: by less than a printed digit
         assert (getattr(search.worst, name) <= 1.001 * getattr(drawn, name)).all(), name
     # an aircraft of 28.8 deg, confirmed by the file of its entries, lies within 30 %
-    assert np.degrees(search.worst.phase.min()) == pytest.approx(28.78, abs=0.1)
+    assert np.degrees(search.worst.phase.min()) == approx(28.78, abs=0.1)
 
 
 def test_search_over_two_entries_is_brute_force() -> None:
@@ -194,8 +195,8 @@ def test_search_over_two_entries_is_brute_force() -> None:
     search = worst_in_box(plant, linear.law, linear.loop, box)
     grid = np.array(list(itertools.product(np.linspace(-1.0, 1.0, 9), repeat=2)))
     brute = loop_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
-    assert search.worst.phase == pytest.approx(brute.phase, rel=1e-6)
-    assert search.worst.disk == pytest.approx(brute.disk, rel=1e-3)
+    assert search.worst.phase == approx(brute.phase, rel=1e-6)
+    assert search.worst.disk == approx(brute.disk, rel=1e-3)
 
 
 def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:

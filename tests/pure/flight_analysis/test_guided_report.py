@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from pytest import approx
 from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
@@ -47,7 +48,7 @@ def log(**channels: ArrayLike) -> Tape:
 
 def near(*values: Any) -> Any:
     """A tuple of numbers, approximately."""
-    return pytest.approx(values)
+    return approx(values)
 
 
 def after(instant: float, value: float) -> FloatArray:
@@ -85,10 +86,10 @@ def test_a_step_has_overshoot_and_settling() -> None:
     altitude = 100.0 * (1.0 - np.exp(-t / 4.0) * np.cos(t))
     step = segments(log(target__altitude=after(5.0, 100.0), pose__altitude=altitude))[1].vertical
     assert step.quantity == "altitude"
-    assert (step.max, step.overshoot) == pytest.approx((100.0, 47.0), abs=0.1)
+    assert (step.max, step.overshoot) == approx((100.0, 47.0), abs=0.1)
     error = 100.0 * np.exp(-t / 4.0) * np.cos(t)  # the closed form
     last = T[np.flatnonzero(np.abs(error) * (T >= 5.0) > 5.0)[-1]]
-    assert step.settling == pytest.approx(last + 0.02 - 5.0, abs=1e-6)
+    assert step.settling == approx(last + 0.02 - 5.0, abs=1e-6)
 
 
 def test_what_begins_within_band_has_no_step() -> None:
@@ -101,7 +102,7 @@ def test_heading_error_is_that_of_shorter_side() -> None:
     held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[
         0
     ].lateral
-    assert held.max == pytest.approx(math.radians(2.0))
+    assert held.max == approx(math.radians(2.0))
 
 
 def test_summary_names_bank_age_and_limited_commands() -> None:
@@ -111,7 +112,7 @@ def test_summary_names_bank_age_and_limited_commands() -> None:
     summary = guidance_summary(tape)
     assert summary is not None
     assert (summary["bank"], summary["age_pose"]) == (0.4, 0.3)
-    assert summary["limited"]["bank"] == pytest.approx(0.25)
+    assert summary["limited"]["bank"] == approx(0.25)
     assert summary["limited"]["slew"] == 0.0
     assert guidance_summary(Tape({}, EPOCH)) is None
     json.dumps(summary)
@@ -129,7 +130,7 @@ def test_wind_follows_from_velocities_over_ground_and_through_air() -> None:
         pose__v_north=1.0,
         pose__v_east=level - 6.0,
     )
-    assert guided_figures.mean_wind(tape, SPEED, parts=2) == pytest.approx(
+    assert guided_figures.mean_wind(tape, SPEED, parts=2) == approx(
         np.array([[1.0, -6.0]] * 2), abs=1e-9
     )
 
@@ -148,7 +149,7 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     assert isinstance(route.legs[1], Arc)
     bounds = guided_figures.bounds_of(flight.scenario)
     assert bounds["V"] == (0.8 * 25.0, 1.4 * 25.0)  # by rule, without a stall speed and a limit
-    assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(
+    assert guided_figures.mean_wind(flight.tape, 25.0) == approx(
         np.array([[3.0, 0.0]] * 8), abs=1.0
     )  # less turbulence
 
@@ -157,7 +158,7 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(
     flight: RecordedFlight, tmp_path: Path
 ) -> None:
     write_page(tmp_path / "page.html", [flight])
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = (tmp_path / "page.html").read_text()
     assert page.index("<h2>Ground track</h2>") < page.index("<table>")
     fence = Fence(
         (
@@ -172,11 +173,11 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(
         for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data
     }
     assert list(traces["legs"].text) == ["0", "2", "4", "6", "7"]  # the fillets are 1, 3, 5
-    assert (traces["start and end"].y[0], traces["start and end"].x[0]) == pytest.approx(
+    assert (traces["start and end"].y[0], traces["start and end"].x[0]) == approx(
         (0.0, 0.0), abs=1.0
     )
     assert np.asarray(traces["fence"].y).tolist() == [0.0, 900.0, 900.0, 0.0]
-    assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == pytest.approx(
+    assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == approx(
         np.full(73, 50.0)
     )
     assert (traces["home"].y[0], traces["home"].x[0]) == (300.0, 100.0)

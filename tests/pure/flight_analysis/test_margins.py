@@ -9,13 +9,15 @@ import math
 import control
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
+from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.loop_margins import law_order, loop_of, margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.margins import (
@@ -61,16 +63,14 @@ def test_integrator_has_its_closed_forms(k: float) -> None:
     kT = k * NO_LAG.period
     found = loop_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
     assert found.stable
-    assert found.phase[0] == pytest.approx(math.pi / 2.0 - math.asin(kT / 2.0), rel=1e-8)
-    assert found.crossover[0] == pytest.approx(2.0 * math.asin(kT / 2.0) / NO_LAG.period, rel=1e-8)
-    assert found.gain_increase[0] == pytest.approx(2.0 / kT)
+    assert found.phase[0] == approx(math.pi / 2.0 - math.asin(kT / 2.0), rel=1e-8)
+    assert found.crossover[0] == approx(2.0 * math.asin(kT / 2.0) / NO_LAG.period, rel=1e-8)
+    assert found.gain_increase[0] == approx(2.0 / kT)
     assert found.gain_decrease[0] == 0.0
-    assert found.gain[0] == pytest.approx(2.0 / kT)
-    assert found.sensitivity[0] == pytest.approx(1.0 / (1.0 - kT / 2.0))
-    assert found.disk[0] == pytest.approx(2.0 * (2.0 - kT) / (2.0 + kT))
-    assert [found.sensitivity_all, found.disk_all] == pytest.approx(
-        [found.sensitivity[0], found.disk[0]]
-    )
+    assert found.gain[0] == approx(2.0 / kT)
+    assert found.sensitivity[0] == approx(1.0 / (1.0 - kT / 2.0))
+    assert found.disk[0] == approx(2.0 * (2.0 - kT) / (2.0 + kT))
+    assert [found.sensitivity_all, found.disk_all] == approx([found.sensitivity[0], found.disk[0]])
     assert found.damping == 1.0  # its pole 1 - kT is real
 
 
@@ -78,12 +78,12 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
     plant, k = LinearPlant(np.eye(1), np.eye(1), np.eye(1)), 4.0
     found = loop_margins(plant, proportional(np.array([[k]])), NO_LAG)
-    assert found.gain_decrease[0] == pytest.approx(
+    assert found.gain_decrease[0] == approx(
         1.0 / k, rel=1e-3
     )  # at w = 0, seen at the lowest frequency
     growth = math.exp(NO_LAG.period)
-    assert found.gain_increase[0] == pytest.approx((growth + 1.0) / (growth - 1.0) / k)
-    assert found.gain[0] == pytest.approx(k, rel=1e-3)
+    assert found.gain_increase[0] == approx((growth + 1.0) / (growth - 1.0) / k)
+    assert found.gain[0] == approx(k, rel=1e-3)
 
 
 def test_unstable_loop_has_no_margin() -> None:
@@ -96,7 +96,7 @@ def test_unstable_loop_has_no_margin() -> None:
 def test_no_feedback_has_infinite_margins() -> None:
     found = loop_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
     assert [*found.phase, *found.crossover, *found.gain] == [math.inf, 0.0, math.inf]
-    assert [*found.sensitivity, *found.disk, found.disk_all] == pytest.approx([1.0, 2.0, 2.0])
+    assert [*found.sensitivity, *found.disk, found.disk_all] == approx([1.0, 2.0, 2.0])
 
 
 def test_second_order_loop_has_its_damping() -> None:
@@ -106,9 +106,9 @@ def test_second_order_loop_has_its_damping() -> None:
     loop = Loop(np.array([tau]), 0.0, 1e-4)
     modes = slow_modes(INTEGRATOR, proportional(np.array([[k]])), loop)
     natural = math.sqrt(k / tau)
-    assert modes.frequency == pytest.approx([natural], rel=1e-2)
-    assert modes.damping == pytest.approx([1.0 / (2.0 * tau * natural)], rel=1e-2)
-    assert loop_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == pytest.approx(
+    assert modes.frequency == approx([natural], rel=1e-2)
+    assert modes.damping == approx([1.0 / (2.0 * tau * natural)], rel=1e-2)
+    assert loop_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == approx(
         modes.damping[0]
     )
 
@@ -123,14 +123,12 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
         LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3)
     )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
-    assert expected == pytest.approx(0.0997, abs=1e-4)
-    assert found.disk_all == pytest.approx(
+    assert expected == approx(0.0997, abs=1e-4)
+    assert found.disk_all == approx(
         expected, rel=0.02
     )  # the hold, and frequencies from 1e-5 pi / T on
-    assert found.disk == pytest.approx([2.0, 2.0], rel=0.02)
-    assert math.degrees(disk_phase(found.disk_all)) == pytest.approx(
-        5.7, abs=0.1
-    )  # 2 atan(alpha / 2)
+    assert found.disk == approx([2.0, 2.0], rel=0.02)
+    assert math.degrees(disk_phase(found.disk_all)) == approx(5.7, abs=0.1)  # 2 atan(alpha / 2)
     assert disk_gain(np.array(1.0)) == 3.0
 
 
@@ -142,12 +140,12 @@ def test_scaled_norm_of_product_is_sum_of_diagonal() -> None:
         random.normal(size=(20, 4)) * 10.0 ** random.uniform(-3.0, 3.0, (20, 4)) for _ in range(2)
     )
     matrices = (u[:, :, None] * v[:, None]).astype(complex)
-    np.testing.assert_allclose(scaled_norm(matrices), np.abs(u * v).sum(axis=1), rtol=1e-3)
+    assert_allclose(scaled_norm(matrices), np.abs(u * v).sum(axis=1), rtol=1e-3)
 
 
 def test_scaled_norm_of_triangle_is_diagonal() -> None:
     triangle = np.array([[[2.0, 1e3, 5.0], [0.0, -3.0, 1e2], [0.0, 0.0, 1.0]]], dtype=complex)
-    assert scaled_norm(triangle)[0] == pytest.approx(3.0, rel=1e-2)
+    assert scaled_norm(triangle)[0] == approx(3.0, rel=1e-2)
 
 
 def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
@@ -205,15 +203,15 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
         gain, phase, sensitivity, _, crossover, _ = control.stability_margins(
             control.frd(L, w, smooth=True)
         )
-        assert math.degrees(found.phase[i]) == pytest.approx(
+        assert math.degrees(found.phase[i]) == approx(
             phase, abs=0.1
         )  # they agree far below 1 deg and 2 %
-        assert found.crossover[i] == pytest.approx(crossover, rel=1e-3)
-        assert found.gain_increase[i] == pytest.approx(gain, rel=1e-3)
-        assert found.sensitivity[i] == pytest.approx(1.0 / sensitivity, rel=5e-3)
+        assert found.crossover[i] == approx(crossover, rel=1e-3)
+        assert found.gain_increase[i] == approx(gain, rel=1e-3)
+        assert found.sensitivity[i] == approx(1.0 / sensitivity, rel=5e-3)
         disk, *_ = control.disk_margins(L, w)
-        assert found.disk[i] == pytest.approx(float(disk), rel=5e-3)
-        np.testing.assert_allclose(
+        assert found.disk[i] == approx(float(disk), rel=5e-3)
+        assert_allclose(
             loop_transfer(
                 plant_of(scenario), law_of(scenario), loop_of(scenario.controller), w[::400]
             )[:, i],
@@ -230,7 +228,7 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
     assert slow == {
         (round(w, 3), round(zeta, 3)) for w, zeta in zip(*modes, strict=True) if zeta < 0.9999
     }
-    assert found.damping == pytest.approx(min(zeta for _, zeta in slow), abs=1e-3)
+    assert found.damping == approx(min(zeta for _, zeta in slow), abs=1e-3)
 
 
 def law_of(scenario: Scenario) -> LinearLaw:
@@ -249,7 +247,7 @@ def test_phase_margin_over_crossover_is_delay_margin(name: str) -> None:
     scenario = find_scenario(name)
     found, plant, loop = margins_of(scenario), plant_of(scenario), loop_of(scenario.controller)
     for i, tolerated in enumerate(found.phase / found.crossover):
-        assert delay_margin(plant, law_of(scenario), loop, i) == pytest.approx(tolerated, rel=0.03)
+        assert delay_margin(plant, law_of(scenario), loop, i) == approx(tolerated, rel=0.03)
 
 
 def test_uncertain_aircraft_have_the_margins_of_each() -> None:
@@ -260,19 +258,19 @@ def test_uncertain_aircraft_have_the_margins_of_each() -> None:
     _, columns = law_order(airframe, scenario.controller)
     plants = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], nominal.C)
     together = loop_margins(plants, law, loop)
-    np.testing.assert_array_equal(phase_margins(plants, law, loop), together.phase)
+    assert_array_equal(phase_margins(plants, law, loop), together.phase)
     for k in (0, 7, 20):
         alone = loop_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
         for name, value in alone._asdict().items():
-            np.testing.assert_allclose(getattr(together, name)[k], value, rtol=1e-6, err_msg=name)
+            assert_allclose(getattr(together, name)[k], value, rtol=1e-6, err_msg=name)
     worst = together.worst()
     assert worst.stable
-    np.testing.assert_array_equal(worst.phase, together.phase.min(axis=0))
-    np.testing.assert_array_equal(worst.sensitivity, together.sensitivity.max(axis=0))
+    assert_array_equal(worst.phase, together.phase.min(axis=0))
+    assert_array_equal(worst.sensitivity, together.sensitivity.max(axis=0))
     assert worst.crossover[0] == together.crossover[np.argmin(together.phase[:, 0]), 0]
     assert worst.disk_all == together.disk_all.min()
 
 
 def test_no_linear_loop_no_margins() -> None:
-    with pytest.raises(ParameterError, match=r"^sign: found literal, expected soft or implicit"):
+    with refusing(r"^sign: found literal, expected soft or implicit"):
         margins(find_scenario("osprey_servo").vary(controller={"sign": "literal"}))

@@ -496,7 +496,7 @@ def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -
     with csv_file.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     piped = command(str(run), *gains, "--csv", "-")
-    assert piped.stdout.splitlines() == csv_file.read_text(encoding="utf-8").splitlines()
+    assert piped.stdout.splitlines() == csv_file.read_text().splitlines()
     assert OPEN_LOOP in piped.stderr
     log = read_run(run).tape["internals"]
     assert [float(row["u.elevator.recorded"]) for row in rows] == log["u.elevator"].tolist()

@@ -28,14 +28,12 @@ FLEET_OF_TWO = "aircraft: {one: {}, two: {}}"
 
 def fleet_file(folder: Path, text: str) -> Path:
     file = folder / "fleet.yaml"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text)
     return file
 
 
 def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Path) -> None:
-    (tmp_path / "there.yaml").write_text(
-        "route: [[0, 400, 10], [400, 400, 10]]\n", encoding="utf-8"
-    )
+    (tmp_path / "there.yaml").write_text("route: [[0, 400, 10], [400, 400, 10]]\n")
     first, second, third = read_fleet(fleet_file(tmp_path, FLEET)).members
     for member in (first, second, third):
         assert member.scenario.aircraft.wind == (2.0, -1.0)

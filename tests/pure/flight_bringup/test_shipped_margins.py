@@ -22,9 +22,7 @@ pytestmark = pytest.mark.slow
 
 CONTROLLER = "/**/controller"
 EXAMPLES = [
-    path
-    for path in sorted(REPOSITORY.glob("examples/*/*.yaml"))
-    if CONTROLLER in path.read_text(encoding="utf-8")
+    path for path in sorted(REPOSITORY.glob("examples/*/*.yaml")) if CONTROLLER in path.read_text()
 ]
 FILES = [*sorted(LIBRARY.glob("*.yaml")), *EXAMPLES]
 STATED = (
@@ -48,7 +46,7 @@ def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 def first_line(path: Path) -> str:
     """The first line of comment below the header of the licence."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_text().splitlines()
     comments = (line.removeprefix("#").strip() for line in lines if line.startswith("#"))
     return next(line for line in comments if line and not line.startswith("SPDX"))
 

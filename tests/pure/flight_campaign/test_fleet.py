@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
+from pytest import approx
 from tests.closed_loop import error
+from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
@@ -21,7 +23,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule, missions
 from flight_campaign.batch_loop import FleetResult
 from flight_campaign.benchmark_course import build_course
-from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.gain_selection import with_feedforward
 from rise_di_controller.allocation import allocate, allocation
@@ -175,9 +176,10 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
         range(2) if name == "turbulence" else (1,)
     ):  # the second one: what would fly as the first differs
         for key, values in alone(scenario, number).items():
-            assert np.asarray(getattr(together, key))[:, number] == pytest.approx(
-                values, rel=within
-            ), (number, key)
+            assert np.asarray(getattr(together, key))[:, number] == approx(values, rel=within), (
+                number,
+                key,
+            )
     assert not np.asarray(together.diverged).any()
 
 
@@ -198,7 +200,7 @@ def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> N
         scenario, *sampled(0.3, 5, 2, "osprey_twin"), control_law=law, params=batch.shared(params)
     )
     for key, values in alone(scenario, 1).items():
-        assert np.asarray(getattr(together, key))[:, 1] == pytest.approx(values, rel=1e-3), key
+        assert np.asarray(getattr(together, key))[:, 1] == approx(values, rel=1e-3), key
 
 
 def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
@@ -216,8 +218,8 @@ def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
     )
     for k in range(40):
         alone_u, alone_given = allocate(v[:, k], before[:, k], DT, params)
-        assert np.asarray(u)[:, k] == pytest.approx(alone_u, abs=1e-9)  # sums in another order
-        assert np.asarray(given)[:, k] == pytest.approx(alone_given, abs=1e-9)
+        assert np.asarray(u)[:, k] == approx(alone_u, abs=1e-9)  # sums in another order
+        assert np.asarray(given)[:, k] == approx(alone_given, abs=1e-9)
 
 
 def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
@@ -230,9 +232,7 @@ def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
     for k in range(4):
         apart = fly(SERVO, A, B, wind[k], late[k], params=PARAMS._replace(beta=beta[:, k : k + 1]))
         # The same operations; only their order in sums may differ with the vector width of the CPU.
-        assert np.asarray(together.rms)[:, k] == pytest.approx(
-            np.asarray(apart.rms)[:, 0], rel=1e-9
-        )
+        assert np.asarray(together.rms)[:, k] == approx(np.asarray(apart.rms)[:, 0], rel=1e-9)
     rms = np.asarray(together.rms)
     assert rms[0, 1] < 0.5 * rms[0, 0]  # without the gust q has its largest error no more
     assert not np.allclose(rms[:, 2], rms[:, 0], rtol=1e-3)
@@ -243,7 +243,7 @@ LOSSY = SERVO.vary(aircraft={"rate": 100.0, "step": 0.002, "sensors": {"dropout"
 
 
 @pytest.mark.parametrize(
-    ("scenario", "unroll"),  # each tick unrolled compiles for a second
+    "scenario, unroll",  # each tick unrolled compiles for a second
     [(SERVO.vary(aircraft={"sensors": {"delay": 0.02}}), 2), (LOSSY, 1)],
     ids=["engagement and gusts", "dropouts"],
 )
@@ -303,7 +303,7 @@ def test_matrices_compiled_for_a_device_are_those_of_numpy(
     leaves = (jax.tree.leaves(fleet._replace(blocks=())) for fleet in (on_host, on_device))
     for numpy_values, values in zip(*leaves, strict=True):
         # a fused multiply-add rounds once where NumPy rounds twice
-        assert np.asarray(values) == pytest.approx(np.asarray(numpy_values), rel=1e-13, abs=1e-15)
+        assert np.asarray(values) == approx(np.asarray(numpy_values), rel=1e-13, abs=1e-15)
 
 
 class Ticks(NamedTuple):
@@ -323,7 +323,7 @@ def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
     ]
     C = plant.aircraft.C[course.order]
     for k in range(2):
-        assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(
+        assert np.asarray(assembled.forced_rate)[..., k] == approx(
             C @ directions[k][:, course.axes], rel=1e-14
         )
     # Without directions the plant's own act on all.
@@ -352,7 +352,7 @@ def test_late_u_acts_that_many_ticks_later() -> None:
     late = fly(undisturbed, *sampled(0.0, 1, 1), late=3, control_law=_pulse(0), params=())
     later = fly(undisturbed, *sampled(0.0, 1, 1), control_law=_pulse(3), params=())
     for name in ("rms", "max"):
-        assert np.asarray(getattr(late, name)) == pytest.approx(
+        assert np.asarray(getattr(late, name)) == approx(
             np.asarray(getattr(later, name)), rel=1e-12
         )
     assert np.asarray(late.max)[0, 0] > 0.01  # it did move
@@ -387,5 +387,5 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
     ],
 )
 def test_scenario_that_fleet_cannot_fly_refused(scenario: Scenario, sentence: str) -> None:
-    with pytest.raises(ParameterError, match=f"^{sentence}"):
+    with refusing(f"^{sentence}"):
         build_course(scenario)

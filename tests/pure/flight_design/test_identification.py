@@ -14,6 +14,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import approx
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.jsbsim_aircraft import FlightCondition
@@ -81,9 +82,9 @@ def test_omega_and_lags_of_linear_system_identified(
     # exp(-4.75) = 0.9 % of the slope, and (0.475 + 0.1) / 0.1 times that of the lag.
     known = np.diag(np.array(Omega) * signs) @ np.array([[1.0, coupled], [coupled, 1.0]])
     found = respond(lagged(known, np.array(lag)))
-    assert found.Omega == pytest.approx(known, rel=0.015, abs=1e-6)
-    assert found.lag == pytest.approx(np.array(lag), rel=0.06)
-    assert found.spread == pytest.approx(np.ones(2))
+    assert found.Omega == approx(known, rel=0.015, abs=1e-6)
+    assert found.lag == approx(np.array(lag), rel=0.06)
+    assert found.spread == approx(np.ones(2))
     assert found.rejected == ()
 
 
@@ -94,8 +95,8 @@ def test_tangent_of_damped_rate_is_initial_slope() -> None:
     t = DT * np.arange(101)
     found = steepest_tangent(b / a * (1.0 - np.exp(-a * t)), DT)
     assert found is not None
-    assert found.slope == pytest.approx(b * (1.0 - math.exp(-a * SPAN)) / (a * SPAN))
-    assert found.lag == pytest.approx(0.0, abs=1e-12)
+    assert found.slope == approx(b * (1.0 - math.exp(-a * SPAN)) / (a * SPAN))
+    assert found.lag == approx(0.0, abs=1e-12)
     assert found.first == 0
 
 
@@ -105,7 +106,7 @@ def test_the_first_maximum_of_the_slope_counts() -> None:
     y = np.sin(t) * (t < 6.0) - 50.0 * np.maximum(t - 6.0, 0.0)
     found = steepest_tangent(y, DT)
     assert found is not None
-    assert found.slope == pytest.approx(1.0, rel=1e-3)
+    assert found.slope == approx(1.0, rel=1e-3)
 
 
 def test_a_constant_response_has_no_tangent() -> None:
@@ -121,8 +122,8 @@ def test_drift_and_even_parts_of_response_cancel() -> None:
         return np.asarray(straight(u, duration) + 0.3 * t**2 + 5.0 * t * (u @ u))
 
     found, clean = respond(drifting), respond(straight)
-    assert found.Omega == pytest.approx(clean.Omega, abs=1e-9)
-    assert found.lag == pytest.approx(clean.lag, abs=1e-9)
+    assert found.Omega == approx(clean.Omega, abs=1e-9)
+    assert found.lag == approx(clean.lag, abs=1e-9)
 
 
 def test_largest_step_determines_omega_behind_dead_zone() -> None:
@@ -132,8 +133,8 @@ def test_largest_step_determines_omega_behind_dead_zone() -> None:
         return STRAIGHT(u - np.clip(u, -0.06, 0.06), duration)
 
     found = respond(dead)
-    assert found.size == pytest.approx([SIZES[-1]] * 2)
-    assert np.diag(found.Omega) == pytest.approx([0.7 * 3.0] * 2, rel=0.01)
+    assert found.size == approx([SIZES[-1]] * 2)
+    assert np.diag(found.Omega) == approx([0.7 * 3.0] * 2, rel=0.01)
     assert found.rejected == (
         "elevator by 0.05: q does not move",
         "aileron by 0.05: p does not move",
@@ -148,7 +149,7 @@ def test_steps_stay_inside_the_stops() -> None:
         return STRAIGHT(u, duration)
 
     respond(fly, np.array([0.1, 10.0]))
-    assert sorted(set(steps)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
+    assert sorted(set(steps)) == approx([0.05, 0.09, 0.1, 0.2])
 
 
 def test_step_that_ends_flight_rejected_with_reason() -> None:
@@ -158,7 +159,7 @@ def test_step_that_ends_flight_rejected_with_reason() -> None:
         return STRAIGHT(u, duration)
 
     found = respond(fragile)
-    assert np.diag(found.Omega) == pytest.approx([3.0, 3.0], rel=0.01)
+    assert np.diag(found.Omega) == approx([3.0, 3.0], rel=0.01)
     assert found.rejected == (
         "elevator by 0.2: gave up at t = 0.10 s",
         "aileron by 0.2: gave up at t = 0.10 s",
@@ -181,7 +182,7 @@ def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: flo
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
     assert steepest <= min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
-    assert steepest == pytest.approx(
+    assert steepest == approx(
         min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02
     )
     assert max(params.pulses["q"].value) * speed <= GRAVITY * (
@@ -202,7 +203,7 @@ def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None
     assert cessna.sideslip_zero < 0.0
     # Its surfaces act one step of 5 ms later; its engine has to speed up the propeller, which takes
     # about a second.
-    assert cessna.responses.lag[[0, 2, 3]] == pytest.approx([DT] * 3, abs=1e-3)
+    assert cessna.responses.lag[[0, 2, 3]] == approx([DT] * 3, abs=1e-3)
     assert 0.5 < cessna.responses.lag[1] < 2.0
     assert cessna.failure == ""
 
@@ -210,7 +211,7 @@ def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None
 def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> None:
     # Numbers in the file have six digits; other machines may round the last ones of a flight
     # differently.
-    shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
+    shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text())
     written = yaml.safe_load(cessna.text)
     assert shipped.keys() == written.keys()
     for section, content in written.items():
@@ -219,7 +220,7 @@ def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> 
             numbers = isinstance(value, float) or (
                 isinstance(value, list) and isinstance(value[0], float)
             )
-            assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
+            assert found == (approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
 
 
 def test_shipped_learner_begins_with_sketch(cessna: IdentifiedAircraft) -> None:
@@ -227,9 +228,9 @@ def test_shipped_learner_begins_with_sketch(cessna: IdentifiedAircraft) -> None:
     learned = that_learns(cessna.selection, cessna.condition, cessna.responses.Omega, 0.015).chosen
     assert shipped.feedforward is not None
     assert learned.feedforward is not None
-    assert shipped.beta == pytest.approx(gains.beta, rel=1e-3)
+    assert shipped.beta == approx(gains.beta, rel=1e-3)
     for key in ("A", "B"):
-        assert getattr(shipped.feedforward, key) == pytest.approx(
+        assert getattr(shipped.feedforward, key) == approx(
             getattr(learned.feedforward, key), rel=1e-3, abs=1e-6
         )
 
@@ -251,12 +252,10 @@ def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
         cessna.condition, cessna.trim, cessna.responses, commands, cessna.selection, stall=30.0
     )
     log = simulate(step_identification._load(text).vary(aircraft={"gusts": {}}))["guidance"]
-    assert log["pose.psi"][-1] == pytest.approx(
+    assert log["pose.psi"][-1] == approx(
         math.pi / 2.0, abs=math.radians(2.0)
     )  # the band of a settled heading
-    assert log["pose.altitude"][-1] == pytest.approx(
-        1219.2 + 100.0, abs=5.0
-    )  # that of a settled altitude
+    assert log["pose.altitude"][-1] == approx(1219.2 + 100.0, abs=5.0)  # that of a settled altitude
 
 
 def rise_di(*arguments: str) -> Result:
@@ -308,8 +307,8 @@ def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
 
 def test_file_is_overwritten_only_if_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
+    (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n")
     refused = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception
     assert isinstance(refused, ParameterError)
     assert "jsbsim_c172p.yaml exists" in str(refused)
-    assert (tmp_path / "jsbsim_c172p.yaml").read_text(encoding="utf-8") == "mine\n"
+    assert (tmp_path / "jsbsim_c172p.yaml").read_text() == "mine\n"

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy.linalg import block_diag, eigvals, solve_continuous_are, solve_continuous_lyapunov
 from scipy.signal import lsim, place_poles
 from tests.closed_loop import law_params
@@ -225,7 +226,7 @@ def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None
             product = np.linalg.det(rosenbrock(plant, s)) * np.linalg.det(
                 filter_matrix - s * np.eye(N + M)
             )
-            assert np.linalg.det(rosenbrock(both, s)) == pytest.approx(product, rel=1e-8)
+            assert np.linalg.det(rosenbrock(both, s)) == approx(product, rel=1e-8)
         unstable += eigvals(filter_matrix - observer.B_z @ observer.F).real.max() > 0.0
     assert unstable > 0  # the zeros do not depend on the stability of the compensator
 
@@ -279,7 +280,7 @@ def test_N_d_of_extended_plant_is_slew_that_feedforward_and_observer_leave(omega
         f_e = np.concatenate([f + plant.B @ u_ff, -observer.L @ y_m])
         x_e, _ = ideal(both, omega, f_e, y_m)
         N_d = np.linalg.solve(plant.S, both.C @ (both.A @ (s * x_e) + s * f_e) - s**2 * y_m)
-        assert slew_left(plant, Wave(omega, f, y_m, u_ff), observer) == pytest.approx(N_d, rel=1e-9)
+        assert slew_left(plant, Wave(omega, f, y_m, u_ff), observer) == approx(N_d, rel=1e-9)
 
 
 def short() -> Scenario:
@@ -334,11 +335,11 @@ def test_on_osprey_observer_halves_slew_of_elevator_and_rudder_in_gusts() -> Non
     nominal, sampled = slews_of_the_osprey()
     names = list(load_airframe("osprey").inputs)
     assert names == ["elevator", "thrust", "aileron", "rudder"]
-    assert nominal == pytest.approx(
+    assert nominal == approx(
         np.array([[23.3, 115, 7.7, 43.6], [23.3, 114, 0.331, 43.7], [12.4, 60.3, 0.367, 22.2]]),
         rel=0.05,
     )
-    assert sampled == pytest.approx(
+    assert sampled == approx(
         np.array([[26.5, 126, 8.1, 45.6], [26.6, 125, 1.6, 45.7], [14.2, 123, 0.8, 23.2]]), rel=0.05
     )
 
@@ -349,8 +350,8 @@ def test_without_fade_in_observer_moves_inputs_at_once() -> None:
     observer, e_0 = osprey_observer(), {"q": 0.1, "p": 0.2, "r": 0.1, "V": 2.0}
     u_o = -observer.F @ observer.H.T @ np.array([e_0[name] for name in airframe.outputs])
     jump = dict(zip(airframe.inputs, u_o, strict=True))
-    assert jump["thrust"] == pytest.approx(-3.65, rel=0.01)  # of 1: 365 %
-    assert np.degrees(jump["rudder"]) == pytest.approx(-8.7, rel=0.01)
+    assert jump["thrust"] == approx(-3.65, rel=0.01)  # of 1: 365 %
+    assert np.degrees(jump["rudder"]) == approx(-8.7, rel=0.01)
 
 
 # Lemma A
@@ -485,7 +486,7 @@ def test_with_gains_of_lemma_A_error_falls_with_square_of_period(seed: int) -> N
     least, beta = classical_beta(plant, seed, observer)
     params = law_params(K, 1.0, 1.1 * beta, plant.D, omega=omega)
     coarse, fine = (largest_error(plant, seed, observer, params, dt) for dt in (0.01, 0.005))
-    assert coarse / fine == pytest.approx([4.0, 4.0], rel=0.02)  # measured 3.99 to 4.00
+    assert coarse / fine == approx([4.0, 4.0], rel=0.02)  # measured 3.99 to 4.00
     # half of what N_d needs leaves an error that no period reduces
     below = params._replace(beta=0.5 * least)
     assert np.all(largest_error(plant, seed, observer, below) > 20.0 * coarse)
@@ -673,7 +674,7 @@ def test_behind_servos_tuned_law_scores_as_PI_with_integral_gain(
     # Lambda + 1 / T_eps in place of Lambda, and no sign. Measured -1.4 to 1.3 %, and -4.3 % on
     # uncertain aircraft with the first gains: their thrust saturates, and the anti-windup of PI
     # differs from that of both integrals.
-    assert as_pi(course, law, objective, channels) == pytest.approx([1.0, 1.0], abs=0.05)
+    assert as_pi(course, law, objective, channels) == approx([1.0, 1.0], abs=0.05)
 
 
 @pytest.mark.parametrize("objective", ["nominal", "late"])

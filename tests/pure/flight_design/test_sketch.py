@@ -4,9 +4,10 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from tests.conftest import refusing
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.parameters import ParameterError
 from flight_design.identification.innovation_filters import (
     Actuation,
     Recording,
@@ -63,16 +64,14 @@ def test_learner_begins_with_feedforward() -> None:
     assert controller.observer.part == 0.0
     assert controller.feedforward is not None
     frame = sketched("c172p", controller, 46.3)
-    np.testing.assert_array_equal(frame.matrix_a().ravel(), controller.feedforward.A)
-    np.testing.assert_array_equal(frame.matrix_b().ravel(), controller.feedforward.B)
+    assert_array_equal(frame.matrix_a().ravel(), controller.feedforward.A)
+    assert_array_equal(frame.matrix_b().ravel(), controller.feedforward.B)
     # wind is the aircraft relative to the air: a gust to the right is a sideslip from the left
-    np.testing.assert_allclose(
-        frame.gust_direction("lateral")[[5, 6]], -frame.matrix_a()[[5, 6], 4] / 46.3
-    )
+    assert_allclose(frame.gust_direction("lateral")[[5, 6]], -frame.matrix_a()[[5, 6], 4] / 46.3)
 
 
 def test_sketch_of_other_channels_is_refused() -> None:
-    with pytest.raises(ParameterError, match="expected q, V, p, r"):
+    with refusing("expected q, V, p, r"):
         sketch("kite", np.eye(2), ("q", "p"), ("elevator", "aileron"), 20.0)
-    with pytest.raises(ParameterError, match=r"controller\.feedforward: found none"):
+    with refusing(r"controller\.feedforward: found none"):
         sketched("c172p", find_scenario("jsbsim_c172p").controller, 46.3)

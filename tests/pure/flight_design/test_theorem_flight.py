@@ -22,7 +22,7 @@ from flight_design.gains.gain_design import select_gains
 
 pytestmark = pytest.mark.slow
 
-PAGE = (REPOSITORY / "docs/tutorials/theorem.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs/tutorials/theorem.md").read_text()
 FILES = dict(re.findall(r"^cat > (\S+) <<'EOF'\n(.*?)^EOF$", PAGE, re.MULTILINE | re.DOTALL))
 
 
@@ -31,7 +31,7 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
     """The files of the page, and both gain sets for the ideal loop."""
     folder = tmp_path_factory.mktemp("theorem")
     for name, text in FILES.items():
-        (folder / name).write_text(text, encoding="utf-8")
+        (folder / name).write_text(text)
     return folder, select_gains(
         folder / "f4c.yaml", "osprey_gust", lag=0.0, delay=0.0, rate=100.0, samples=20
     )
@@ -43,7 +43,7 @@ def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> Floa
         "rate: 100.0  # Hz", f"rate: {rate}  # Hz"
     )
     path = folder / f"ideal_{rate:g}.yaml"
-    path.write_text(FILES["sections.yaml"] + written, encoding="utf-8")
+    path.write_text(FILES["sections.yaml"] + written)
     _, error = best_error(simulate(load_scenario(path)))
     return np.asarray(np.abs(error.values).max(axis=0))
 

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
+from pytest import approx
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from tests.conftest import refusing
 
 from flight_core.channels import POSE
-from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_guidance import modes, path, protection
@@ -55,16 +56,16 @@ def test_bank_loop_has_damping_0_74() -> None:
     """The gain is a quarter of the bandwidth of p."""
     # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on
     # (Hurwitz).
-    assert loop_damping(5.0 / 4.0, 5.0, 0.9) == pytest.approx(0.74, abs=0.01)
-    assert loop_damping(2.0, 5.0, 0.9) == pytest.approx(0.48, abs=0.01)
-    assert loop_damping(9.0, 5.0, 0.9) == pytest.approx(0.0, abs=1e-9)
+    assert loop_damping(5.0 / 4.0, 5.0, 0.9) == approx(0.74, abs=0.01)
+    assert loop_damping(2.0, 5.0, 0.9) == approx(0.48, abs=0.01)
+    assert loop_damping(9.0, 5.0, 0.9) == approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("phi", [-0.9, 0.0, 0.5])
 def test_held_bank_gives_level_turn_rates(phi: float) -> None:
     turn = GRAVITY * math.tan(phi) / SPEED
     rates = body_rates(phi, 0.0, phi, 0.0, turn * math.cos(phi), 0.0, SPEED, HOLD)
-    assert rates == pytest.approx((0.0, turn * math.sin(phi), turn * math.cos(phi)), abs=1e-15)
+    assert rates == approx((0.0, turn * math.sin(phi), turn * math.cos(phi)), abs=1e-15)
 
 
 def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
@@ -74,38 +75,38 @@ def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
     turn = GRAVITY * math.tan(phi) / SPEED
     r = turn * math.cos(phi) * math.cos(theta) - HOLD.k_theta * (theta_c - theta) * math.sin(phi)
     rates, dt = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD), 1e-6
-    assert rates.r == pytest.approx(r, rel=1e-12)
+    assert rates.r == approx(r, rel=1e-12)
     moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
         np.array(rates) * dt
     )
     psi_after, theta_after, phi_after = moved.as_euler("ZYX")
-    assert (phi_after - phi) / dt == pytest.approx(HOLD.k_phi * (phi_c - phi), abs=1e-6)
-    assert (theta_after - theta) / dt == pytest.approx(HOLD.k_theta * (theta_c - theta), abs=1e-6)
-    assert psi_after / dt == pytest.approx(turn, abs=1e-6)
+    assert (phi_after - phi) / dt == approx(HOLD.k_phi * (phi_c - phi), abs=1e-6)
+    assert (theta_after - theta) / dt == approx(HOLD.k_theta * (theta_c - theta), abs=1e-6)
+    assert psi_after / dt == approx(turn, abs=1e-6)
 
 
 def test_roll_rate_and_load_are_limited() -> None:
     rates = body_rates(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, SPEED, HOLD)
-    assert (rates.p, rates.q) == pytest.approx((0.3, 0.5 * GRAVITY / SPEED))
+    assert (rates.p, rates.q) == approx((0.3, 0.5 * GRAVITY / SPEED))
 
 
 def test_sideslip_to_right_turns_nose_right() -> None:
-    assert body_rates(
-        0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)
-    ).r == pytest.approx(0.1)
+    assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == approx(
+        0.1
+    )
 
 
 def test_climb_rate_is_smooth_and_brakes() -> None:
     """The climb rate is continuous in value and slope, and falls by half the acceleration."""
     free = CLIMB._replace(climb=1e3, sink=1e3)
     near, step = 1.0 / (2.0 * 0.2**2), 1e-6
-    assert climb_for(near - step, free) == pytest.approx(climb_for(near + step, free), abs=1e-6)
+    assert climb_for(near - step, free) == approx(climb_for(near + step, free), abs=1e-6)
     slope = (climb_for(near + 2.0 * step, free) - climb_for(near + step, free)) / step
-    assert slope == pytest.approx(0.2, abs=1e-4)
+    assert slope == approx(0.2, abs=1e-4)
     far = 100.0  # d(climb)/dt = -climb d(climb)/de = -a/2
     assert climb_for(far, free) * (
         climb_for(far + step, free) - climb_for(far, free)
-    ) / step == pytest.approx(0.5, abs=1e-4)
+    ) / step == approx(0.5, abs=1e-4)
     assert climb_for(-far, free) == -climb_for(far, free)
     assert (climb_for(far, CLIMB), climb_for(-far, CLIMB)) == (5.0, -4.0)
 
@@ -134,9 +135,9 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
     alpha = 0.0
     for _ in range(1000):  # 20 s, ten time constants: exp(-10)
         alpha = alpha_estimate(alpha, 0.13, 2.0, SPEED, 0.02, CLIMB)
-    assert alpha == pytest.approx(0.13 - math.asin(2.0 / SPEED), abs=1e-5)
-    assert pitch_for(2.0, SPEED, alpha) == pytest.approx(0.13, abs=1e-5)
-    assert slewed(1.0, 2.0, 0.5, 0.1) == pytest.approx(1.05)
+    assert alpha == approx(0.13 - math.asin(2.0 / SPEED), abs=1e-5)
+    assert pitch_for(2.0, SPEED, alpha) == approx(0.13, abs=1e-5)
+    assert slewed(1.0, 2.0, 0.5, 0.1) == approx(1.05)
 
 
 def test_course_approached_on_shorter_side() -> None:
@@ -145,8 +146,8 @@ def test_course_approached_on_shorter_side() -> None:
         course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
     )  # to the right, over south
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
-    assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == pytest.approx(0.2 * SPEED)
-    assert bank_for(GRAVITY, 0.0, 1.0) == pytest.approx(math.pi / 4.0)
+    assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == approx(0.2 * SPEED)
+    assert bank_for(GRAVITY, 0.0, 1.0) == approx(math.pi / 4.0)
     assert bank_for(-1e3, 0.0, 0.6) == -0.6
 
 
@@ -174,13 +175,13 @@ def test_error_near_line_is_second_order() -> None:
     exact = np.exp(-zeta * w * times) * (
         np.cos(damped * times) + zeta * w / damped * np.sin(damped * times)
     )
-    assert cross_track(0.1, times) / 0.1 == pytest.approx(exact, abs=2e-3)
+    assert cross_track(0.1, times) / 0.1 == approx(exact, abs=2e-3)
 
 
 def test_line_captured_from_far_at_capture_angle() -> None:
     times = np.linspace(0.0, 200.0, 401)
     e = cross_track(2000.0, times)
-    assert np.diff(e)[100] / 0.5 == pytest.approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
+    assert np.diff(e)[100] / 0.5 == approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
     assert abs(e[-1]) < 0.01
     assert (
         e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping
@@ -192,7 +193,7 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
     """An aircraft on the course opposite to a line turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
-    assert turn == pytest.approx(
+    assert turn == approx(
         math.copysign(full, -away), rel=1e-9
     )  # a sine would leave 0.2 % of it at 179.9 deg
 
@@ -204,10 +205,10 @@ def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
     on = path.error(
         orbit, (300.0, 0.0)
     )  # to the north of the centre: east on a right turn, west on a left one
-    assert on == pytest.approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
-    assert path_acceleration(on, on.track, SPEED, FOLLOW) == pytest.approx(SPEED**2 / radius)
+    assert on == approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
+    assert path_acceleration(on, on.track, SPEED, FOLLOW) == approx(SPEED**2 / radius)
     outside = path.error(orbit, (320.0, 0.0))
-    assert outside.e == pytest.approx(-math.copysign(20.0, radius))
+    assert outside.e == approx(-math.copysign(20.0, radius))
     assert abs(path_acceleration(outside, outside.track, SPEED, FOLLOW)) > SPEED**2 / 320.0
 
 
@@ -233,7 +234,7 @@ def offset_from_a_circle(*, estimated: bool) -> float:
 def test_aircraft_that_slips_flies_on_circle() -> None:
     # Without the estimate e'' + 2 zeta w e' + w^2 e = 0.1 V^2 / R near the circle: an offset of 3.2
     # m; measured 3.5 m.
-    assert offset_from_a_circle(estimated=False) == pytest.approx(
+    assert offset_from_a_circle(estimated=False) == approx(
         0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15
     )
     assert (
@@ -244,7 +245,7 @@ def test_aircraft_that_slips_flies_on_circle() -> None:
 def test_roll_is_no_sideslip() -> None:
     """In a roll the turn lags the bank; the estimate of the sideslip stays."""
     assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
-    assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(
+    assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == approx(
         0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12
     )
 
@@ -257,7 +258,7 @@ def test_gyro_bias_is_no_sideslip() -> None:
     for _ in range(1000):
         slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
     assert slip == 0.0
-    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(
+    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == approx(
         0.4
     )  # a fifth of the turn of a bank to the left
 
@@ -273,19 +274,19 @@ def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
         psi = heading_estimate(psi, math.remainder(true + error, 2.0 * math.pi), 0.06, dt)
         off.append(math.degrees(math.remainder(psi - true, 2.0 * math.pi)))
     g = 1.0 - math.exp(-dt / 2.0)
-    assert np.std(off) == pytest.approx(math.sqrt(g / (2.0 - g)), rel=0.3)  # 50 independent values
+    assert np.std(off) == approx(math.sqrt(g / (2.0 - g)), rel=0.3)  # 50 independent values
     assert abs(np.mean(off)) < 0.05
     # A gyro that is 1 mrad/s off turns the heading by 2 mrad; without a pose it alone counts.
     held = 0.0
     for _ in range(2000):
         held = heading_estimate(held, 0.0, 1e-3, dt)
-    assert held == pytest.approx(2e-3, rel=0.02)
-    assert heading_estimate(0.1, None, 1.0, dt) == pytest.approx(0.12)
+    assert held == approx(2e-3, rel=0.02)
+    assert heading_estimate(0.1, None, 1.0, dt) == approx(0.12)
 
 
 def test_error_of_line_is_positive_to_right() -> None:
     east = Line((0.0, 0.0), (0.0, 1000.0))
-    assert path.error(east, (-7.0, 400.0)) == pytest.approx((7.0, math.pi / 2.0, 0.0))
+    assert path.error(east, (-7.0, 400.0)) == approx((7.0, math.pi / 2.0, 0.0))
     assert not path.passed(east, (50.0, 999.0))
     assert path.passed(east, (50.0, 1001.0))
 
@@ -296,15 +297,15 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
     first, arc, second, *_, orbit = path.route(corner, 200.0, 100.0)
     assert isinstance(arc, Arc)
     assert isinstance(orbit, Arc)
-    assert first.end == pytest.approx((800.0, 0.0))  # a right angle cuts one radius
-    assert arc.centre == pytest.approx((800.0, side * 200.0))
+    assert first.end == approx((800.0, 0.0))  # a right angle cuts one radius
+    assert arc.centre == approx((800.0, side * 200.0))
     assert arc.radius == side * 200.0
-    assert arc.end == pytest.approx((1000.0, side * 200.0))
+    assert arc.end == approx((1000.0, side * 200.0))
     assert isinstance(second, Line)
-    assert second.start == pytest.approx(arc.end)
-    assert path.course_of(second.start, second.end) == pytest.approx(side * math.pi / 2.0)
-    assert path.error(arc, (800.0, 0.0)) == pytest.approx((0.0, 0.0, side / 200.0), abs=1e-12)
-    assert path.end_course(arc) == pytest.approx(side * math.pi / 2.0)
+    assert second.start == approx(arc.end)
+    assert path.course_of(second.start, second.end) == approx(side * math.pi / 2.0)
+    assert path.error(arc, (800.0, 0.0)) == approx((0.0, 0.0, side / 200.0), abs=1e-12)
+    assert path.end_course(arc) == approx(side * math.pi / 2.0)
     assert (orbit.centre, orbit.end) == (corner[3], None)
     assert not path.passed(orbit, (0.0, 0.0))
 
@@ -330,28 +331,26 @@ def test_infeasible_route_refused_with_mend(
     waypoints: list[tuple[float, float]], radius: float, sentence: str
 ) -> None:
     """The sentence names a value that would do."""
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         path.route(waypoints, radius, 100.0)
 
 
 def test_rules_of_radius_and_period() -> None:
     bank = math.radians(30.0)
     # A circle of the least radius asks for 0.8 of the bank at the speed with the wind from behind.
-    assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == pytest.approx(
-        0.8 * bank
-    )
-    assert least_period(46.0, bank, 0.15) == pytest.approx(11.0 * bank / 0.15)
+    assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == approx(0.8 * bank)
+    assert least_period(46.0, bank, 0.15) == approx(11.0 * bank / 0.15)
     assert least_period(25.0, bank, 1.0) == 14.0
 
 
 def test_protection_follows_from_the_stall_speed() -> None:
-    assert protection.bank_limit(1.2, 25.0, 40.0) == pytest.approx(math.acos((27.5 / 40.0) ** 2))
+    assert protection.bank_limit(1.2, 25.0, 40.0) == approx(math.acos((27.5 / 40.0) ** 2))
     assert protection.bank_limit(0.5, 25.0, 60.0) == 0.5
     assert protection.bank_limit(0.5, 25.0, 27.0) == 0.0  # below 1.1 V_s: wings level
     floor = protection.speed_floor(20.0)
-    assert floor == pytest.approx(23.0)
+    assert floor == approx(23.0)
     assert protection.climb_limit(4.0, 3.0, 30.0, floor) == 4.0
-    assert protection.climb_limit(4.0, 3.0, 0.95 * floor, floor) == pytest.approx(0.5)
+    assert protection.climb_limit(4.0, 3.0, 0.95 * floor, floor) == approx(0.5)
     assert protection.climb_limit(4.0, 3.0, 0.8 * floor, floor) == -3.0
 
 
@@ -376,4 +375,4 @@ def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None
         pose = pose | {"altitude": altitude, "climb": climb, "theta": commands.theta_c}
         state, highest = state._replace(theta=commands.theta_c), max(highest, altitude)
     assert highest < 300.1
-    assert altitude == pytest.approx(300.0, abs=0.5)
+    assert altitude == approx(300.0, abs=0.5)

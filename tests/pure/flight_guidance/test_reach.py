@@ -5,7 +5,7 @@
 import math
 
 import numpy as np
-import pytest
+from pytest import approx
 
 from flight_core.channels import POSE
 from flight_core.units import GRAVITY
@@ -68,8 +68,8 @@ def test_weak_throttle_limits_climb_and_sink_to_what_it_can_do() -> None:
     # In a steady climb the weight along the path is g h_dot / V: what is left of the throttle holds
     # the airspeed.
     vertical = within_reach(OWN, Authority(down=0.6, up=0.5)).vertical
-    assert GRAVITY * vertical.climb / SPEED == pytest.approx(0.7 * 0.5)
-    assert GRAVITY * vertical.sink / SPEED == pytest.approx(0.5 * 0.6)
+    assert GRAVITY * vertical.climb / SPEED == approx(0.7 * 0.5)
+    assert GRAVITY * vertical.sink / SPEED == approx(0.5 * 0.6)
     assert flown({"climb": 2.5}, Authority(up=0.5))[0].climb_c == vertical.climb
 
 
@@ -78,12 +78,10 @@ def test_weak_aileron_limits_roll_rate_and_the_bank_that_can_be_reversed() -> No
     # 0.37 is the largest w y_dot of a second-order step of damping 1, as of the rule, which counts
     # 0.4
     assert 0.37 * FREQUENCY * now.attitude.roll_rate < 1.2 / 3.0
-    assert 11.0 * now.limits.bank / now.attitude.roll_rate == pytest.approx(now.path.period)
+    assert 11.0 * now.limits.bank / now.attitude.roll_rate == approx(now.path.period)
     assert now.limits.bank < OWN.limits.bank
     # An orbit at this bank needs V^2 / (g tan(0.8 bank))
-    assert now.limits.radius == pytest.approx(
-        SPEED**2 / (GRAVITY * math.tan(0.8 * now.limits.bank))
-    )
+    assert now.limits.radius == approx(SPEED**2 / (GRAVITY * math.tan(0.8 * now.limits.bank)))
 
 
 def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
@@ -92,9 +90,9 @@ def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
     assert u_m["p"] == 0.0
     assert commands.bank_limited
     bank = math.radians(10.0)
-    assert u_m["r"] == pytest.approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
+    assert u_m["r"] == approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
     held, _ = flown({"phi": 0.3}, Authority(p=0.0), phi=bank)
-    assert held.u_m[OWN.outputs.index("r")] == pytest.approx(
+    assert held.u_m[OWN.outputs.index("r")] == approx(
         GRAVITY * math.tan(bank) / SPEED
     )  # of a turn at this bank
     # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank
@@ -113,10 +111,10 @@ def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
     # upwards with 2 g / V.
     sinks, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=-1.0)
     assert sinks.u_m[OWN.outputs.index("q")] == 0.0
-    assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == pytest.approx(0.4 * 1.0)
+    assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == approx(0.4 * 1.0)
     climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
-    assert climbs.V_c - SPEED == pytest.approx(SPEED - sinks.V_c)
-    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == pytest.approx(
+    assert climbs.V_c - SPEED == approx(SPEED - sinks.V_c)
+    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == approx(
         1.2
     )  # m/s^2, of 1.2 rad/s
 

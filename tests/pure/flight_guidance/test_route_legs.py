@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from pytest import approx
 from scipy.integrate import solve_ivp
+from tests.conftest import refusing
 
 from flight_analysis.report.account import account, final_outcome
 from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
-from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
@@ -66,12 +67,12 @@ def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) 
     joined = int(np.flatnonzero(np.abs(off) < 0.05 * abs(radius))[0])
     tangent = math.sqrt(distance**2 - radius**2)
     # 2 s for the turn by asin(R / d), and the last metres of an exponential approach.
-    assert times[joined] == pytest.approx(tangent / SPEED, abs=4.0)
+    assert times[joined] == approx(tangent / SPEED, abs=4.0)
     bearings = np.unwrap(np.arctan2(east, north - distance))[: joined + 1]
     assert math.degrees(abs(bearings[-1] - bearings[0])) < 90.0  # acos(R / d) of the tangent
     assert off[joined:].max() < 0.05 * abs(radius)
     assert off[joined:].min() > -0.02 * abs(radius)  # no overshoot
-    assert math.sin(course[-1] - math.atan2(east[-1], north[-1] - distance)) == pytest.approx(
+    assert math.sin(course[-1] - math.atan2(east[-1], north[-1] - distance)) == approx(
         math.copysign(1.0, radius), abs=1e-3
     )
 
@@ -84,12 +85,12 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     assert isinstance(line, Line)
     assert isinstance(orbit, Arc)
     error = path.error(line, orbit.centre)
-    assert error.e == pytest.approx(
+    assert error.e == approx(
         200.0
     )  # the centre is one radius to the right of the line: a clockwise orbit
     touching = path.error(orbit, line.end)
-    assert touching.e == pytest.approx(0.0, abs=1e-9)
-    assert math.cos(touching.track - error.track) == pytest.approx(1.0)
+    assert touching.e == approx(0.0, abs=1e-9)
+    assert math.cos(touching.track - error.track) == approx(1.0)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -100,30 +101,30 @@ def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
     def length(position: path.Point, flown: float) -> float:
         return float(path.joining_length(at, north, side * R, position, flown))
 
-    assert length((-1000.0, 0.0), 0.0) == pytest.approx(1000.0)  # straight behind
+    assert length((-1000.0, 0.0), 0.0) == approx(1000.0)  # straight behind
     # On the opposite course beside the circle: down the tangent, and half of the circle.
-    assert length((1000.0, side * 2.0 * R), math.pi) == pytest.approx(1000.0 + math.pi * R)
+    assert length((1000.0, side * 2.0 * R), math.pi) == approx(1000.0 + math.pi * R)
     # Across: the circle is touched at the point behind the centre, and a quarter of it is left.
-    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(
+    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == approx(
         1000.0 + R * math.pi / 2.0
     )
     # A turn to the tangent costs R times the angle.
-    assert length((-1000.0, 0.0), 0.5) == pytest.approx(1000.0 + 0.5 * R)
+    assert length((-1000.0, 0.0), 0.5) == approx(1000.0 + 0.5 * R)
 
 
 def test_wind_is_velocity_over_ground_less_through_air() -> None:
     # 3-4-5: climbing at 3 m/s of 5 m/s, 4 m/s remain level, to the east.
-    assert wind_of(1.0, -2.0, 3.0, math.pi / 2.0, 5.0) == pytest.approx((1.0, -6.0))
+    assert wind_of(1.0, -2.0, 3.0, math.pi / 2.0, 5.0) == approx((1.0, -6.0))
     wind = (0.0, 0.0)
     for _ in range(250):  # a time constant of a step of 20 ms
         wind = wind_estimate(wind, (10.0, -5.0), WIND_TIME / 250)
-    assert wind == pytest.approx((10.0 * (1.0 - math.exp(-1.0)), -5.0 * (1.0 - math.exp(-1.0))))
+    assert wind == approx((10.0 * (1.0 - math.exp(-1.0)), -5.0 * (1.0 - math.exp(-1.0))))
 
 
 def test_largest_wind_takes_whole_bank() -> None:
     bank, wind = math.radians(30.0), 3.0
     largest = largest_wind(SPEED, wind, bank)
-    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == pytest.approx(
+    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == approx(
         GRAVITY * math.tan(bank)
     )
 
@@ -150,7 +151,7 @@ def test_wind_that_airspeed_cannot_beat_refused(
     wind: float, V: tuple[float, ...], sentence: str
 ) -> None:
     route = {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": V}
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         GuidanceConfig.validate_mapping(SECTION | {"wind": wind, "route": route}, "guidance")
 
 
@@ -191,10 +192,10 @@ def test_first_waypoint_has_to_be_reached() -> None:
     assert log["target.altitude"] == 150.0  # of the first waypoint
     # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the
     # tangent, and an arc of pi + 2 b.
-    assert log["to_go"] == pytest.approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
+    assert log["to_go"] == approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
     log = flown.at(2499.0, 3.0, math.pi)
     assert (log["leg"], log["joining"]) == (0.0, 0.0)
-    assert log["target.altitude"] == pytest.approx(150.0, abs=0.1)  # at the begin of the slope
+    assert log["target.altitude"] == approx(150.0, abs=0.1)  # at the begin of the slope
 
 
 def test_leg_after_sharp_corner_is_joined() -> None:
@@ -219,7 +220,7 @@ def test_leg_passed_far_away_is_missed() -> None:
     log = flown.at(1010.0, 600.0)
     end = flown.made.route.legs[0].end if flown.made.route else None
     assert end is not None
-    assert log["missed"] == pytest.approx(math.dist(end, (1010.0, 600.0)))
+    assert log["missed"] == approx(math.dist(end, (1010.0, 600.0)))
     assert (log["leg"], abs(log["joining"])) == (1.0, 1.0)
     assert flown.notices == (f"leg 0 missed by {log['missed']:.0f} m",)
     assert flown.at(1011.0, 600.0)["missed"] == 0.0
@@ -261,7 +262,7 @@ def test_skip_leaves_waypoint_ahead_out() -> None:
     log, route = flown.at(100.0, 0.0), flown.made.route
     assert route is not None
     assert log["leg"] == 2.0  # the line after the fillet
-    assert log["target.along"] == pytest.approx(path.length(route.legs[2]))
+    assert log["target.along"] == approx(path.length(route.legs[2]))
 
 
 def test_resume_flies_last_leg_from_nearest_point() -> None:
@@ -282,8 +283,8 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
     if profile == "step":
         assert (log["target.altitude"], log["target.climb"]) == (140.0, 0.0)
     else:  # the last line touches the orbit: the legs meet at an angle of 4 deg
-        assert log["target.altitude"] == pytest.approx(110.0, abs=0.1)
-        assert log["target.climb"] == pytest.approx(40.0 / 2000.0 * SPEED, abs=0.01)
+        assert log["target.altitude"] == approx(110.0, abs=0.1)
+        assert log["target.climb"] == approx(40.0 / 2000.0 * SPEED, abs=0.01)
     assert flown.made.hold()
     assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
     flown.made.take_target({"leg": 0.0, "altitude": 120.0})
@@ -320,7 +321,7 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     route = flown.made.route
     assert route is not None
     circle = route.legs[1]
-    assert circle.end == pytest.approx(
+    assert circle.end == approx(
         (2000.0, -R), abs=10.0
     )  # the last line touches the orbit round the last waypoint
     end = route.legs[0].end
@@ -352,7 +353,7 @@ def test_yaw_rate_beside_bank() -> None:
     flown.made.take_target({"phi": 0.0, "r": 0.05})
     for k in range(50):
         log = flown.at(10.0 + k, 0.0)
-    assert log["u_m.r"] == pytest.approx(0.05)
+    assert log["u_m.r"] == approx(0.05)
     flown.made.take_target({"heading": 0.0})
     assert flown.at(70.0, 0.0)["target.r"] == 0.0
     for values, sentence in (

@@ -23,11 +23,11 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
+from tests.conftest import refusing
 from tests.joint_states import JOINT_STATE, STORE, vector
 from tests.recordings import summary_of, truncate
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
@@ -100,7 +100,7 @@ def test_attachments_and_metadata_are_stored_unchanged(
 ) -> None:
     attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
     attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
-    metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n", encoding="utf-8")
+    metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n")
     write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (attached,), metadata))
     back = read_run(tmp_path / "run")
     assert back.attachments == (("airframe.yaml", attached.read_bytes()),)
@@ -115,8 +115,8 @@ def test_metadata_other_than_strings_are_rejected(
     text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     metadata = tmp_path / "metadata.yaml"
-    metadata.write_text(text, encoding="utf-8")
-    with pytest.raises(ParameterError, match="expected a mapping of mappings of strings"):
+    metadata.write_text(text)
+    with refusing("expected a mapping of mappings of strings"):
         write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (), metadata))
 
 
@@ -214,15 +214,12 @@ def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -
 
 def test_two_bags_in_a_folder_are_rejected(run: Path) -> None:
     (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
-    with pytest.raises(
-        ParameterError,
-        match=r"run: found 2 \.mcap files that are not parts of one bag, expected one bag",
-    ):
+    with refusing(r"run: found 2 \.mcap files that are not parts of one bag, expected one bag"):
         read_run(run)
 
 
 def test_a_folder_without_a_bag_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=r"found no \.mcap file"):
+    with refusing(r"found no \.mcap file"):
         read_run(tmp_path)
 
 
@@ -232,7 +229,7 @@ def test_definitions_include_all_referenced_types() -> None:
         "MSG: builtin_interfaces/Time",
         "MSG: std_msgs/Header",
     ]
-    with pytest.raises(ParameterError, match="install the package no_such_msgs"):
+    with refusing("install the package no_such_msgs"):
         definition("no_such_msgs/msg/Thing")
 
 
@@ -330,9 +327,9 @@ def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
             tmp_path / "bag" / f"bag_{part}.mcap"
         )
     files = [f"bag_{part}.mcap" for part in range(12)]
-    information = yaml.safe_load((tmp_path / "part0" / "metadata.yaml").read_text(encoding="utf-8"))
+    information = yaml.safe_load((tmp_path / "part0" / "metadata.yaml").read_text())
     information["rosbag2_bagfile_information"]["relative_file_paths"] = files
-    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(information), encoding="utf-8")
+    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(information))
     back = read_run(tmp_path / "bag").tape
     assert back["y"].stamp_ns.tolist() == [2_000_000 * k for k in range(48)]
     assert back["y"]["V"].tolist() == [-float(k) for k in range(48)]
@@ -347,11 +344,9 @@ def test_two_aircraft_in_one_bag_selected_by_namespace(tmp_path: Path) -> None:
     }
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
     found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
-    with pytest.raises(ParameterError, match=f"{found} that one of them"):
+    with refusing(f"{found} that one of them"):
         read_run(tmp_path / "bag")
-    with pytest.raises(
-        ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"
-    ):
+    with refusing(r"namespaces /fleet/two, /one, expected one in '/three'"):
         read_run(tmp_path / "bag", "/three")
     for namespace, counts in (
         ("/one", {"y": 50, "u": 5}),

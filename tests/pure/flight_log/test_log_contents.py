@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, refusing
 from tests.joint_states import vector
 
 from aircraft_sim.airframe import load_airframe
@@ -30,7 +30,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
 from flight_analysis.report.summary import summarise
 from flight_bringup.graph import ONE_PROCESS, RECORDER, parameter_overrides
-from flight_core.parameters import ParameterError
 from flight_log import columns
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.named_vectors import JOINT_STATE
@@ -130,7 +129,7 @@ def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
     if git is None:
         pytest.skip("no git here")
     source = tmp_path / "source.py"
-    source.write_text("a = 1\n", encoding="utf-8")
+    source.write_text("a = 1\n")
     assert revision(source) == {}  # not in a checkout
 
     def run(*words: str) -> str:
@@ -147,17 +146,14 @@ def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
     run("add", "source.py")
     run("commit", "-m", "first")
     assert revision(source) == {"commit": run("rev-parse", "HEAD").strip(), "dirty": "false"}
-    source.write_text("a = 2\n", encoding="utf-8")
+    source.write_text("a = 2\n")
     assert revision(source)["dirty"] == "true"
 
 
 def test_folder_that_cannot_be_written_is_one_sentence(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    with pytest.raises(
-        ParameterError,
-        match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)",
-    ):
+    with refusing(r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
         attachments_for(osprey_gust, tmp_path / "nowhere")
 
 
@@ -190,7 +186,7 @@ def test_summary_of_log_whose_y_was_refused_names_the_refusal(
         r"no sample of y \(y: 3 samples refused: damaged, not finite, or of other "
         r"channels\), expected"
     )
-    with pytest.raises(ParameterError, match=refused):
+    with refusing(refused):
         summarise(read_run(tmp_path / "run").tape, osprey_gust)
 
 

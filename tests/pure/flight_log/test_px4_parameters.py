@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy.signal import butter, freqz, iirnotch
+from tests.conftest import refusing
 from tests.vehicle_logs import write_ulog
 
 from flight_cli import gains
@@ -19,7 +21,7 @@ HEAD = "# Onboard parameters for Vehicle 1\n#\n"
 
 def written(path: Path, **values: float) -> Path:
     rows = [f"1\t1\t{name}\t{value!r}\t9\n" for name, value in values.items()]
-    path.write_text(HEAD + "".join(rows), encoding="utf-8")
+    path.write_text(HEAD + "".join(rows))
     return path
 
 
@@ -42,15 +44,15 @@ def test_delay_is_the_phase_of_the_filters_and_a_period(
         values |= {f"IMU_GYRO_NF{k}_FRQ": frequency, f"IMU_GYRO_NF{k}_BW": width}
     loop = rate_loop(written(tmp_path / "plane.params", **values))
     assert loop.rate == 250.0
-    assert loop.delay == pytest.approx(filter_delay(40.0, notches) + 0.004, rel=0.01)
+    assert loop.delay == approx(filter_delay(40.0, notches) + 0.004, rel=0.01)
 
 
 def test_defaults_are_those_of_px4(tmp_path: Path) -> None:
     """Of IMU_GYRO_CUTOFF at 40 Hz and 400 Hz; of a lower rate of the law."""
     path = written(tmp_path / "plane.params", IMU_GYRO_NF0_FRQ=0.0)
     assert rate_loop(path).rate == 400.0
-    assert rate_loop(path).delay == pytest.approx(0.0056 + 0.0025, abs=5e-5)
-    assert rate_loop(path, 200.0).delay == pytest.approx(0.0056 + 0.005, abs=5e-5)
+    assert rate_loop(path).delay == approx(0.0056 + 0.0025, abs=5e-5)
+    assert rate_loop(path, 200.0).delay == approx(0.0056 + 0.005, abs=5e-5)
 
 
 def test_parameters_come_from_a_ulog(tmp_path: Path) -> None:
@@ -59,11 +61,11 @@ def test_parameters_come_from_a_ulog(tmp_path: Path) -> None:
     write_ulog(tmp_path / "a.ulg", topics, {"IMU_GYRO_CUTOFF": 20.0, "IMU_GYRO_RATEMAX": 800.0})
     loop = rate_loop(tmp_path / "a.ulg")
     assert loop.rate == 800.0
-    assert loop.delay == pytest.approx(0.01125 + 0.00125, abs=1e-4)
+    assert loop.delay == approx(0.01125 + 0.00125, abs=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("values", "rate", "words"),
+    "values, rate, words",
     [
         (
             {"IMU_GYRO_RATEMAX": 250.0},
@@ -75,16 +77,16 @@ def test_parameters_come_from_a_ulog(tmp_path: Path) -> None:
     ],
 )
 def test_refuses(tmp_path: Path, values: dict[str, float], rate: float | None, words: str) -> None:
-    with pytest.raises(ParameterError, match=words):
+    with refusing(words):
         rate_loop(written(tmp_path / "plane.params", **values), rate)
 
 
 def test_refuses_a_file_of_another_kind(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
-    path.write_text("hello\n", encoding="utf-8")
-    with pytest.raises(ParameterError, match="which has no rows of parameters"):
+    path.write_text("hello\n")
+    with refusing("which has no rows of parameters"):
         rate_loop(path)
-    with pytest.raises(ParameterError, match="px4: found no file"):
+    with refusing("px4: found no file"):
         rate_loop(tmp_path / "none")
 
 
@@ -100,9 +102,9 @@ def test_gains_take_the_loop_of_a_parameter_file(
         raise ParameterError("stop")
 
     monkeypatch.setattr(gains, "select_gains", select)
-    with pytest.raises(ParameterError, match="stop"):
+    with refusing("stop"):
         gains.gains("osprey", px4=path)
     assert asked[0]["rate"] == 250.0
-    assert asked[0]["delay"] == pytest.approx(0.00963, abs=1e-5)
-    with pytest.raises(ParameterError, match="px4: found it beside --delay"):
+    assert asked[0]["delay"] == approx(0.00963, abs=1e-5)
+    with refusing("px4: found it beside --delay"):
         gains.gains("osprey", px4=path, delay=0.01)

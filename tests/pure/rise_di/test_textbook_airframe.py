@@ -46,4 +46,4 @@ def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
         made.shortfall
     )
     assert "a degree of sideslip asks " in made.shortfall
-    assert made.scenario_file.read_text(encoding="utf-8").count(f"# {made.shortfall}\n") == 1
+    assert made.scenario_file.read_text().count(f"# {made.shortfall}\n") == 1

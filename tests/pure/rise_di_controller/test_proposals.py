@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import LEARNER, parameter_overrides, second_stage
@@ -135,8 +136,8 @@ def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
     assert isinstance(flown, RiseDiConfig)
     # of the file: 0.98 / s^2 per deg and 30 deg, 0.06 m/s^2 per % and 50 %. Twice 5 % less are 10 %
     # to first order
-    assert of(flown)["up.q"] == pytest.approx(0.9 * 0.98 * 30.0, rel=0.01)
-    assert of(flown)["down.V"] == pytest.approx(0.9 * 0.06 * 50.0, rel=0.01)
+    assert of(flown)["up.q"] == approx(0.9 * 0.98 * 30.0, rel=0.01)
+    assert of(flown)["down.V"] == approx(0.9 * 0.06 * 50.0, rel=0.01)
     np.testing.assert_array_equal(
         flight.learning.authority(flight.controller), authority(flown, START)
     )
@@ -309,7 +310,7 @@ def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None
         7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)
     ]  # 55 s of late ticks from 7 s on
     begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
-    assert begins == pytest.approx([0.0, 10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
+    assert begins == approx([0.0, 10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
 
 
 def test_latency_above_shortest_spacing_is_refused() -> None:
@@ -561,7 +562,7 @@ def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
     flown = whole.model_copy(update=limits | {"feedforward": model})
     least = dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
     lower, upper = ("down", "up") if sign > 0.0 else ("up", "down")
-    assert least[f"{lower}.q"] == pytest.approx(56.1499 * 0.1)
-    assert least[f"{upper}.q"] == pytest.approx(56.1499 * 0.4)
-    assert least[f"{lower}.V"] == pytest.approx(6.0 * 0.1)  # 0.06 m/s^2 per %
-    assert least[f"{upper}.V"] == pytest.approx(6.0 * 0.7)
+    assert least[f"{lower}.q"] == approx(56.1499 * 0.1)
+    assert least[f"{upper}.q"] == approx(56.1499 * 0.4)
+    assert least[f"{lower}.V"] == approx(6.0 * 0.1)  # 0.06 m/s^2 per %
+    assert least[f"{upper}.V"] == approx(6.0 * 0.7)

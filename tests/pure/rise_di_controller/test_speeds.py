@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
+from tests.conftest import refusing
 
 import rise_di
 from aircraft_sim.airframe import load_airframe
@@ -18,7 +20,6 @@ from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
 from flight_design.gains.gain_design import observed
@@ -70,20 +71,20 @@ def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
     places = [OSPREY.index(name) for name in ("alpha", "q")]
     moved = at_speed(OSPREY, 1.3, "thrust")
     before, after = (frame.matrix_a()[np.ix_(places, places)] for frame in (OSPREY, moved))
-    assert np.sort_complex(np.linalg.eigvals(after)) == pytest.approx(
+    assert np.sort_complex(np.linalg.eigvals(after)) == approx(
         1.3 * np.sort_complex(np.linalg.eigvals(before))
     )
     steady = [
         np.linalg.solve(A, frame.matrix_b()[places, 0])
         for A, frame in ((before, OSPREY), (after, moved))
     ]
-    assert steady[1] == pytest.approx(steady[0] * np.array([1.0, 1.3]))  # alpha as before, q with V
-    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == pytest.approx(
+    assert steady[1] == approx(steady[0] * np.array([1.0, 1.3]))  # alpha as before, q with V
+    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == approx(
         9.81 / (1.3 * 25.0), rel=0.01
     )
     vertical = moved.gust_direction("vertical")  # m/s of wind change alpha by 1 / V
-    assert vertical == pytest.approx(-moved.matrix_a()[:, 1] / moved.speed, abs=0.003)
-    assert moved.gust_direction("longitudinal") == pytest.approx(-moved.matrix_a()[:, 0])
+    assert vertical == approx(-moved.matrix_a()[:, 1] / moved.speed, abs=0.003)
+    assert moved.gust_direction("longitudinal") == approx(-moved.matrix_a()[:, 0])
 
 
 @pytest.mark.parametrize("ratio", [0.7, 1.4])
@@ -91,7 +92,7 @@ def test_lift_balances_weight_at_each_speed(ratio: float) -> None:
     """A[alpha,V] is -2 g / V^2 in level flight; the file of the osprey has it 4 % smaller."""
     moved = at_speed(OSPREY, ratio, "thrust")
     found = moved.matrix_a()[OSPREY.index("alpha"), OSPREY.index("V")]
-    assert found == pytest.approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
+    assert found == approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
 
 
 def test_margin_holds_from_slow_to_fast(scheduled: RiseDiConfig) -> None:
@@ -105,7 +106,7 @@ def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(
     scheduled: RiseDiConfig, tmp_path: Path
 ) -> None:
     path = tmp_path / "fast.yaml"
-    path.write_text(as_yaml(at_speed(OSPREY, FASTER, "thrust")), encoding="utf-8")
+    path.write_text(as_yaml(at_speed(OSPREY, FASTER, "thrust")))
     sensors = SHIPPED.aircraft.sensors.model_dump() | {"delay": LATE}
     fast = SHIPPED.vary(aircraft={"airframe": str(path), "sensors": sensors})
     largest = []
@@ -128,7 +129,7 @@ def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) ->
                 state, Measurements(V + e, V, zero, zero, zero), np.float64(0.01), params
             )
         outputs.append(u)
-    assert outputs[0] == pytest.approx(outputs[1], rel=1e-9)
+    assert outputs[0] == approx(outputs[1], rel=1e-9)
 
 
 def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
@@ -192,7 +193,7 @@ def test_wrong_models_at_other_speeds_refused(
             ]
         else:
             values["schedule"][name] |= change
-    with pytest.raises(ParameterError, match=sentence):
+    with refusing(sentence):
         RiseDiConfig.validate_mapping(values, "controller")
 
 
@@ -248,7 +249,7 @@ def test_learned_models_of_all_speeds_fly_and_go_back_at_once(
         state.y.value, state.y_m, np.zeros(4), state.u_trim + state.u_ff, state.u
     )
     _, u = law.step(state.law, at_once, np.float64(1e-9), params)
-    assert u == pytest.approx(state.u, abs=1e-6)
+    assert u == approx(state.u, abs=1e-6)
     monkeypatch.setattr(flight.controller, "diverging", lambda: ("q",))
     flight.tick()
     assert flight.controller.parameters == LEARNS
@@ -321,6 +322,6 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
     )  # the seconds of the climb in speed are left out
     for entry in best_known(found.entries, true.outputs):
         place = true.index(entry.row), list(true.inputs).index(entry.column)
-        assert entry.nominal == pytest.approx(file[place])
+        assert entry.nominal == approx(file[place])
         error = true.matrix_b()[place] / file[place] - 1.0
         assert abs(entry.error - error) < max(3.0 * entry.deviation, 0.1), entry.name

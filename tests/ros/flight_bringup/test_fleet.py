@@ -24,7 +24,6 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
     file.write_text(
         "{lockstep: true, composed: true, duration: 0.6, aircraft: {one: {}, two: {start: "
         "{east: 90.0, heading: 1.0}}}}",
-        encoding="utf-8",
     )
     fleet = read_fleet(file)
     for flown in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
@@ -44,9 +43,7 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
 def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(
     start: Start, tmp_path: Path
 ) -> None:
-    (tmp_path / "fleet.yaml").write_text(
-        "{composed: true, aircraft: {one: {}, two: {}}}", encoding="utf-8"
-    )
+    (tmp_path / "fleet.yaml").write_text("{composed: true, aircraft: {one: {}, two: {}}}")
     fleet = start("flight_cli.cli", "fly", "fleet.yaml")
 
     def engaged(name: str) -> bool:

@@ -33,10 +33,7 @@ def engaged(start: Start, tmp_path: Path) -> Engaged:
 
 def is_engaged(folder: Path) -> bool:
     """Whether the controller of a flight below a folder has engaged."""
-    return any(
-        "ENGAGED" in log.read_text(encoding="utf-8")
-        for log in folder.glob("runs/*/log/controller.log")
-    )
+    return any("ENGAGED" in log.read_text() for log in folder.glob("runs/*/log/controller.log"))
 
 
 def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
@@ -69,7 +66,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     with AnyReader([run]) as reader:
         assert reader.message_count > 0
     for log in (run / "log").glob("*.log"):
-        assert "Traceback" not in log.read_text(encoding="utf-8")
+        assert "Traceback" not in log.read_text()
     run_beside = next((tmp_path / "beside" / "runs").glob("*-osprey_gust"))
     assert is_closed(run_beside)
     vectors = {name for name in read_run(run_beside).topics if name.endswith(("/y", "/y_m", "/u"))}

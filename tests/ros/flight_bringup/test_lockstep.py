@@ -181,9 +181,7 @@ def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_pat
     )  # no saturation limits the wrong input
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", "runs=runs")
     assert command.end() == 3, command.output
-    summary = json.loads(
-        (tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
-    )
+    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())
     assert re.fullmatch(
         r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"]
     )

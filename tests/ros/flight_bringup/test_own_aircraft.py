@@ -19,7 +19,7 @@ from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.timeout(240)
 
-PAGE = (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "ros.md").read_text()
 SAMPLES = 400  # of y: 4 s at 100 Hz
 FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
 
@@ -43,7 +43,7 @@ def checkout(tmp_path: Path) -> Path:
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
     (program,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-    (tmp_path / "my_aircraft.py").write_text(program, encoding="utf-8")
+    (tmp_path / "my_aircraft.py").write_text(program)
     return tmp_path
 
 
@@ -80,9 +80,7 @@ def test_shells_of_page_run_to_the_last_command(
     recorder = shell[-1]
 
     def texts() -> str:
-        return "\n".join(
-            path.read_text(encoding="utf-8") for path in sorted(checkout.glob("*.txt"))
-        )
+        return "\n".join(path.read_text() for path in sorted(checkout.glob("*.txt")))
 
     def flies() -> bool:
         assert [process.poll() for process in shell] == [None] * len(shell), texts()

@@ -26,7 +26,7 @@ DURATION = 12.0
 @pytest.fixture
 def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
     """The default scenario with a command on each channel and both gusts within 12 s."""
-    text = osprey_gust.path.read_text(encoding="utf-8")
+    text = osprey_gust.path.read_text()
     for old, new in (
         ("duration: 60.0", f"duration: {DURATION}"),
         ("start: 40.0", "start: 7.0"),
@@ -40,7 +40,7 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
         assert old in text
         text = text.replace(old, new)
     path = tmp_path / "short.yaml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text)
     return path
 
 
@@ -66,7 +66,7 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
         start("flight_cli.cli", "fly", str(short_scenario)).succeed()
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
-        ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
+        ticks = json.loads((run / "summary.json").read_text())["ticks"]
         gap = max(np.diff(tape[topic].stamp_ns).max() for topic in ("y", "y_m"))
         delays.append(
             bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000)

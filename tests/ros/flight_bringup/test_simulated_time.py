@@ -122,7 +122,7 @@ def test_fly_is_by_the_clock_of_a_simulator(ends: bool, start: Start, tmp_path: 
     if ends:
         until(lambda: [*tmp_path.glob("runs/*/*.mcap")], "the log")
         log = next(tmp_path.glob("runs/*/log/one_process.log"))
-        until(lambda: "ENGAGED" in log.read_text(encoding="utf-8"), "engaged")
+        until(lambda: "ENGAGED" in log.read_text(), "engaged")
         simulator.interrupt().succeed()
         flight.wait_for("outcome: ended early: /clock has no publisher: its simulator ended")
     else:

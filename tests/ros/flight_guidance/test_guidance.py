@@ -15,6 +15,7 @@ import pymap3d
 import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
+from tests.conftest import refusing
 from tests.ros.conftest import Start
 from tests.ros.flight_bringup.test_lockstep import FIRST_CHUNKS, ROUGH, fly, scenario_file
 from tests.ros.peer import OUTPUTS, Peer
@@ -25,7 +26,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
 from flight_core.outcome import STATUS_INCOMPLETE
-from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_guidance.guidance_state import Lateral
@@ -115,9 +115,7 @@ def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
     )
     command.child("flight_guidance.main").kill()
     assert command.end() == 3
-    summary = json.loads(
-        (tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8")
-    )
+    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())
     assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
@@ -129,7 +127,7 @@ def calm(tmp_path: Path) -> Path:
         guidance={"route": None},
     )
     path = tmp_path / "calm.yaml"
-    path.write_text(scenario_yaml(varied), encoding="utf-8")
+    path.write_text(scenario_yaml(varied))
     return path
 
 
@@ -232,7 +230,7 @@ def test_command_and_page_say_what_guidance_took_and_refused(
                 lambda: peer_node.node.count_publishers("route") == 1, "the publisher of the route"
             )
             client.cancel()
-            with pytest.raises(ParameterError, match="cancelled by a later request"):
+            with refusing("cancelled by a later request"):
                 pending.result()
             client.resume()
             before = len(peer_node.received["target"])
@@ -244,5 +242,5 @@ def test_command_and_page_say_what_guidance_took_and_refused(
                 each=lambda: peer_node.publish("guidance", to_message(time.time_ns(), *in_force)),
             )
             client.cancel()
-            with pytest.raises(ParameterError, match="cancelled by a later request"):
+            with refusing("cancelled by a later request"):
                 pending.result()

@@ -124,6 +124,6 @@ def test_log_of_killed_recorder_reported_and_repairable(
     assert after.tape.notes == ()
     assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
     assert (
-        json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"]
+        json.loads((run / "summary.json").read_text())["outcome"]
         == "recorder was killed by SIGKILL"
     )

@@ -135,7 +135,7 @@ OPEN_PROFILE = """<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_P
 def on_network(tmp_path: Path) -> tuple[str, ...]:
     """The environment of a process with network transport."""
     profile = tmp_path / "open.xml"
-    profile.write_text(OPEN_PROFILE, encoding="utf-8")
+    profile.write_text(OPEN_PROFILE)
     discovery = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
         "ROS_STATIC_PEERS": "10.77.0.1;10.77.0.2",

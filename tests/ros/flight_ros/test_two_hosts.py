@@ -68,9 +68,7 @@ def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(
                 "link set net0 up",
             ):
                 subprocess.run([*place, ip, *command.split()], check=True)
-            (profile := tmp_path / f"{address}.xml").write_text(
-                network_profile(address, ADDRESSES), encoding="utf-8"
-            )
+            (profile := tmp_path / f"{address}.xml").write_text(network_profile(address, ADDRESSES))
             variables = {
                 "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),
                 "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",

@@ -132,7 +132,7 @@ def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
 
     def append(row: Row) -> None:
         if path is not None:
-            with path.open("a", encoding="utf-8") as stream:
+            with path.open("a") as stream:
                 stream.write(json.dumps(row) + "\n")
 
     return append

@@ -299,7 +299,7 @@ def steady_scenario(source: Path, folder: Path) -> Path:
 
     Guidance, where the scenario has a section of it, commands this flight with level wings.
     """
-    tree = yaml.safe_load(source.read_text(encoding="utf-8"))
+    tree = yaml.safe_load(source.read_text())
     sections = {
         key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()
     }
@@ -322,9 +322,9 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     sections["controller"] |= {"max_age": MAX_AGE, "hold": HOLD, "ramp": RAMP}
     sections["aircraft"] |= {"max_age": U_MAX_AGE, "hold": HOLD, "ramp": RAMP}
     path = folder / "steady.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(yaml.safe_dump(tree))
     if guidance is not None:  # the section by itself, with what follows from the others
-        path.write_text(scenario_yaml(load_scenario(path)), encoding="utf-8")
+        path.write_text(scenario_yaml(load_scenario(path)))
     return path
 
 
@@ -335,10 +335,10 @@ def fast_map(folder: Path) -> Path:
     """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a
     small delay needs them.
     """
-    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text())
     content["messages"]["joy"]["rate"] = 200.0
     path = folder / "map.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    path.write_text(yaml.safe_dump(content))
     return path
 
 

@@ -112,6 +112,4 @@ def stop(victim: psutil.Process, duration: float) -> None:
 
 
 def outcome(folder: Path) -> str:
-    return str(
-        json.loads((folder / "latest" / "summary.json").read_text(encoding="utf-8"))["outcome"]
-    )
+    return str(json.loads((folder / "latest" / "summary.json").read_text())["outcome"])
