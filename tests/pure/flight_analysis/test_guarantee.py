@@ -20,6 +20,7 @@ from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.cli import application
 from flight_core.vectors import FloatArray
+from rise_di_controller import structured_value
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
 from rise_di_controller.margins import loop_margins
 from rise_di_controller.structured_value import (
@@ -209,3 +210,13 @@ def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_pat
     assert not promise["holds"]
     assert promise["stable"] < 0.75 > promise["unstable"]["deviation"]
     assert not margins(find_scenario(str(folder / "scenario.yaml"))).nominal.stable
+
+
+def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rounding can leave no interval around a frequency, as of a flying wing near its limit."""
+    monkeypatch.setattr(structured_value._Search, "_interval", lambda *_: None)
+    promise = guarantee(integrator(150.0, 0.1))
+    assert promise.stable == 0.0
+    assert not promise.holds

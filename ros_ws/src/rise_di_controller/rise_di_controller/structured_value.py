@@ -33,6 +33,7 @@ STALLED = 1e-3  # part of the bound by which the level is above it at the end
 
 ROOM = 1.002  # factor of the level above a bound that did not hold
 NARROWEST = 1e-8  # part of pi / T: less than LARGEST_G leaves around a frequency of a real M
+PATIENCE = 10  # raises by ROOM, before those by ROOM^2, ROOM^3 and so on
 MAX_RAISES = 400
 MAX_LEVEL = 1e3  # 1 / level beyond it: none
 NEIGHBOURS = 2
@@ -262,7 +263,7 @@ class _Search:
         """Add an interval around w, rad/s; the level rises where it has to."""
         M = self.part.response(w, RADIUS)
         starts = self._starts(w, self._scale()[:, None] * M)
-        for _ in range(MAX_RAISES):
+        for raises in range(MAX_RAISES):
             scaled = self._scale()[:, None] * M
             bound = np.inf
             for start in starts:
@@ -278,10 +279,11 @@ class _Search:
                 return
             starts = [best]
             self.peak = w
-            self.level *= ROOM * np.sqrt(max(bound, 1.0))
+            # beside real channels at their limit the bound says little of the level that is needed
+            self.level *= ROOM ** (1 + raises // PATIENCE) * np.sqrt(max(bound, 1.0))
             if self.level > MAX_LEVEL:
                 return
-        raise ArithmeticError(f"no interval around {w:g} rad/s")
+        self.level = np.inf
 
     def _scale(self) -> FloatArray:
         return np.where(self.moves, 1.0 / self.level, 1.0)

@@ -79,8 +79,10 @@ def guarantee(linear: LinearLoop) -> Guarantee:
     )
     if not found.holds:
         return found
-    each = [_disk(whole, (i,)) for i in range(m)]
-    return found._replace(disk=np.array(each), disk_all=_disk(whole, tuple(range(m))))
+    disk_all = _disk(whole, tuple(range(m)))
+    # disks in all inputs at once cover a disk in one
+    each = [max(_disk(whole, (i,)), disk_all) for i in range(m)]
+    return found._replace(disk=np.array(each), disk_all=disk_all)
 
 
 def _disk(whole: UncertainLoop, inputs: tuple[int, ...]) -> float:
