@@ -220,3 +220,14 @@ def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
     promise = guarantee(integrator(150.0, 0.1))
     assert promise.stable == 0.0
     assert not promise.holds
+
+
+def test_command_bounds_the_effectors_behind_an_allocation() -> None:
+    """An elevon acts on q and on p at once: the box of the file is larger than that of the law's
+    inputs, and an aircraft of it is unstable earlier.
+    """
+    words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
+    done = CliRunner().invoke(application(["gains"]), [*words, "--set", "samples=2"])
+    assert done.exit_code == 1
+    promise = guarantee(boxed("x8_elevons"))
+    assert json.loads(done.output)["guarantee"]["stable"] == approx(promise.stable)

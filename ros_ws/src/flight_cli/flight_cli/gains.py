@@ -28,7 +28,12 @@ from flight_analysis.report.margin_figures import (
 )
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
-from flight_cli.gains_guarantee import require_guarantee, show_guarantee, write_unstable
+from flight_cli.gains_guarantee import (
+    loop_of_effectors,
+    require_guarantee,
+    show_guarantee,
+    write_unstable,
+)
 from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
 from flight_cli.words import AsJson
 from flight_core.files import display_path, writing
@@ -260,7 +265,7 @@ def gains(
             origin = ""
             if guaranteed:
                 status.update("bounding every aircraft of the box")
-                promise = guarantee(answer.loop_with_box())
+                promise = guarantee(loop_of_effectors(answer, airframe, uncertainty))
                 write_unstable(worst, promise, airframe, scenario)
         else:
             selection = select_gains(
