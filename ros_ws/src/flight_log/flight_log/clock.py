@@ -20,6 +20,7 @@ LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
 STRAY_NS = (
     NANOSECONDS  # back: fewer messages than CONFIRMED that are so much older have a damaged stamp
 )
+LATE_NS = 4 * NANOSECONDS  # a recorder that starts on a busy host stores its first sample so late
 # successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
 CONFIRMED = 10
 CONFIRMED_AT_END = 3
@@ -96,10 +97,8 @@ class StampClock:
             ):  # the messages before are too few to be the begin of the clock
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
-                # a recorder on a busy host stores its first sample late: a lead below STRAY_NS is
-                # no damage
                 keep[known[:first]] &= (away_ns >= -STEP_NS) & (
-                    (away_ns <= STRAY_NS) | (lead_ns <= STRAY_NS)
+                    (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
                 )
             self._last_ns = int(stamps[after - 1])
             self._last_offset_ns = int(offsets[after - 1])

@@ -597,21 +597,38 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     if not begins:
         return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
     begin_ns = min(begins)
-    count = max((end_ns - begin_ns) // step_ns + 1, 1)
+    instants = max((end_ns - begin_ns) // step_ns + 1, 1)
     if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
-        return count, float(count)
+        return instants, float(instants)
     log = tape["internals"].until(end_ns)
     if not len(log.stamp_ns):
-        return count, float(count)
+        return instants, float(instants)
+    count = instants
+    if "y" in tape and not _is_of_stack(tape):
+        count = min(instants, _instants_with_y(tape, log, step_ns))
     by_controller = np.split(log["number"], controller_starts(log["number"]))
     missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in by_controller)
     before = float(by_controller[0].min()) - 1.0
     last_ns = int(log.stamp_ns[-1]) + round(float(log["age"][-1]) * NANOSECONDS)
     goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
-    after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0)
+    after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0) * count // instants
     ticks = int(len(log.stamp_ns) + max(missing, 0.0) + before + after)
     ticks = count if ticks < LEAST * count else ticks
-    return ticks, float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
+    engaged = float(np.mean(log["mode"] == Mode.ENGAGED))
+    return ticks, engaged * ticks * instants / count
+
+
+def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
+    """The number of ticks with a new y or in a failsafe: a foreign aircraft has a rate of y of its
+    own, and the controller publishes u with a new y alone.
+    """
+    age_ns = internals["age"] * NANOSECONDS
+    first_tick_ns = internals.stamp_ns[0] + age_ns[0]
+    y = tape["y"].until(int(internals.stamp_ns[-1]))
+    arrival_ns = y.stamp_ns[y.stamp_ns >= internals.stamp_ns[0]] + age_ns.min()
+    with_y = len(np.unique((arrival_ns - first_tick_ns) // step_ns))
+    lost = tape.recording.get("y", Recording(0)).lost or 0
+    return with_y + lost + int(np.count_nonzero(internals["mode"] != Mode.ENGAGED))
 
 
 def _topic(
