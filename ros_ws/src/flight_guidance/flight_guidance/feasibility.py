@@ -6,6 +6,7 @@ nearest feasible value.
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -59,8 +60,9 @@ class FlyableRoute(NamedTuple):
     notes: tuple[str, ...]  # sentences on what differs from the waypoints given
 
 
+@lru_cache(maxsize=8)  # checks, nodes, replay and report ask for the same route
 def flyable(
-    waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance
+    waypoints: tuple[Waypoint, ...], radius: float, period: float, can: Performance
 ) -> FlyableRoute:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 

@@ -551,7 +551,10 @@ class GuidanceConfig(NodeConfig):
             default=0.0,
         )
         legs, waypoints, notes = flyable(
-            waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can
+            tuple(waypoints),
+            self.radius or math.ceil(radius),
+            self.period or self.least_period(),
+            can,
         )
         flown = speeds(waypoints, self.speed)
         numbers = leads(legs)
