@@ -25,7 +25,7 @@ from benchmarks.routes import duration, errors
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.closed_loop.simulate import simulate
-from flight_guidance import modes
+from flight_guidance import lateral_modes
 from flight_guidance.lateral import PathError, PathParams, bank_for
 from flight_guidance.legs import course_and_speed
 from flight_guidance.route_file import Waypoint
@@ -88,9 +88,9 @@ def _within(angle: float) -> float:
 def without_lead(
     error: PathError, entry: Any, entered: Any, slip: Any, pose: Any, speed: Any, params: Any
 ) -> Any:
-    """`modes.follow` with L1, without the lead and without the estimate of the slip."""
+    """`lateral_modes.follow` with L1, without the lead and without the estimate of the slip."""
     wanted = l1(error, *course_and_speed(pose), params.path)
-    return bank_for(wanted, path_angle(pose["climb"], speed), modes.STEEPEST)
+    return bank_for(wanted, path_angle(pose["climb"], speed), lateral_modes.STEEPEST)
 
 
 @contextmanager
@@ -99,8 +99,8 @@ def flying(law: str) -> Iterator[None]:
     if law == LAWS[0]:
         yield
         return
-    follow = modes.follow if "lead" in law else without_lead
-    with mock.patch.multiple(modes, path_acceleration=l1, follow=follow):
+    follow = lateral_modes.follow if "lead" in law else without_lead
+    with mock.patch.multiple(lateral_modes, path_acceleration=l1, follow=follow):
         yield
 
 

@@ -4,7 +4,8 @@
 pose and guidance per aircraft.
 
 The last axis of every array is the aircraft. The equations come from the nodes:
-`flight_guidance.modes.follow` and `command`, `aircraft_sim.pose`, `reference_model.model`.
+`flight_guidance.lateral_modes.follow`, `modes.command`, `aircraft_sim.pose`,
+`reference_model.model`.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
-from flight_guidance import guidance_state, modes, path, targets
+from flight_guidance import guidance_state, lateral_modes, modes, path, targets
 from flight_guidance.fence import Escape, last_safe_turn
 from flight_guidance.guidance_state import (
     GuidanceParams,
@@ -395,8 +396,10 @@ class _GuidanceStep(NamedTuple):
             entry = jnp.where(homing, error.curvature, entry)
             altitude = jnp.where(homing, home_altitude, altitude)
         climb = jnp.where(homing, 0.0, climb)
-        wanted = modes.follow(error, entry, begins, before.slip, self.pose, self.speed, self.params)
-        wanted = modes.escaping_bank(escape, wanted, self.pose, self.speed, self.params)
+        wanted = lateral_modes.follow(
+            error, entry, begins, before.slip, self.pose, self.speed, self.params
+        )
+        wanted = lateral_modes.escaping_bank(escape, wanted, self.pose, self.speed, self.params)
         target = Target(altitude=altitude, climb=climb, V=jnp.where(joins_leg, leg.from_V, leg.V))
         flies = before._replace(
             mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target

@@ -9,8 +9,8 @@ from the sample before.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial, reduce
+from collections.abc import Mapping
+from functools import reduce
 from operator import or_
 from typing import Any
 
@@ -19,9 +19,9 @@ from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
-from flight_guidance import path, protection
+from flight_guidance import protection
 from flight_guidance.attitude import BodyRates, body_rates, yaw_for_bank
-from flight_guidance.fence import AROUND, BACK, HOME, RIGHT, Escape, Motion, last_safe_turn
+from flight_guidance.fence import AROUND, BACK, HOME, Escape, Motion, last_safe_turn
 from flight_guidance.guidance_state import (
     LARGEST,
     LATERAL,
@@ -38,24 +38,16 @@ from flight_guidance.guidance_state import (
     Vertical,
 )
 from flight_guidance.lateral import (
-    PathError,
-    bank_for,
-    course_acceleration,
     heading_estimate,
-    path_acceleration,
     slip_estimate,
-    turn_towards,
 )
+from flight_guidance.lateral_modes import escaping_bank, lateral_bank
 from flight_guidance.legs import (
-    EXIT,
     along_route,
-    course_and_speed,
-    has_loitered,
     joining,
-    leaves,
     on_profile,
 )
-from flight_guidance.path import Arc, Leg, Point, Route
+from flight_guidance.path import Route
 from flight_guidance.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.vertical import (
     alpha_estimate,
@@ -70,10 +62,6 @@ from flight_guidance.wind import Wind, wind_estimate, wind_of
 LONGEST_LEAD = 0.5
 """s. Largest age of a pose over which its attitude is brought to now: the rates change within a
 second."""
-
-
-STEEPEST = math.radians(89.0)
-"""Largest bank that a mode asks for, before protection."""
 
 
 def holding(
@@ -161,31 +149,13 @@ def step(
     y = dict(zip(params.outputs, inputs.y, strict=True))
     state, missed = _with_commands(state, inputs.commands, pose, dt, route)
     state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
-    wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
+    wanted, error, to_go = lateral_bank(state, pose, airspeed(inputs.y, params), route, params)
     if state.mode is Mode.ENGAGED:
         wanted = escaping_bank(escape, wanted, pose, airspeed(inputs.y, params), params)
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
     commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
     return state._replace(t_ns=inputs.t_ns), commands
-
-
-def escaping_bank(
-    escape: Escape,
-    wanted: Scalar,
-    pose: Mapping[str, Scalar],
-    speed: Scalar,
-    params: GuidanceParams,
-) -> Scalar:
-    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a
-    turn, or of a course.
-    """
-    course, ground_speed = course_and_speed(pose)
-    xp = array_namespace(ground_speed)
-    acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
-    towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
-    wanted = xp.where(escape.action >= BACK, towards, wanted)
-    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
 
 
 def _wanted_rates(
@@ -243,17 +213,8 @@ def command(
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = pitch_for(climb_c, speed, state.alpha)
     if flies and state.vertical is Vertical.THETA:
-        least, largest = (
-            pitch_for(rate, speed, state.alpha) for rate in _climb_within(pose["altitude"], params)
-        )
-        theta_wanted = state.target.theta
-        theta_bounded = (
-            xp.minimum(xp.maximum(theta_wanted, least), largest)
-            if _is_bounded(limits)
-            else theta_wanted
-        )
-        climb_limited = theta_bounded != theta_wanted
-        theta_wanted = theta_bounded
+        theta_wanted = _pitch_within(state, pose["altitude"], speed, params)
+        climb_limited = theta_wanted != state.target.theta
     theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
 
     V_asked = state.target.V
@@ -444,116 +405,6 @@ def _with_commands(
     return on_profile(state, pose, route), missed
 
 
-def _bank(
-    state: GuidanceState,
-    pose: Mapping[str, float],
-    speed: float,
-    route: Route | None,
-    params: GuidanceParams,
-) -> tuple[float, PathError, float]:
-    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of
-    the leg, m.
-    """
-    nowhere = PathError(0.0, 0.0, 0.0)
-    if state.mode is not Mode.ENGAGED:
-        return 0.0, nowhere, 0.0
-    target = state.target
-    gamma = path_angle(pose["climb"], speed)
-    over_ground = course_and_speed(pose)
-    if state.lateral is Lateral.PHI:
-        return target.phi, nowhere, 0.0
-    if state.lateral is Lateral.HEADING:
-        return (
-            bank_for(
-                course_acceleration(target.heading, state.psi, speed, params.k_chi), gamma, STEEPEST
-            ),
-            nowhere,
-            0.0,
-        )
-    if state.lateral is Lateral.COURSE:
-        return (
-            bank_for(
-                course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST
-            ),
-            nowhere,
-            0.0,
-        )
-    leg: Leg = Arc((target.north, target.east), target.radius)
-    following = None
-    position = (pose["north"], pose["east"])
-    if state.lateral is Lateral.ROUTE and route is not None:
-        leg = route.legs[state.leg]
-        if state.joining:
-            start, course = route.start(state.leg, target.along)
-            radius = state.joining * route.radius
-            error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
-            onto = partial(_joins, start, course, route.near(state.leg), over_ground[0])
-            wanted = follow(
-                error, path.error(leg, start).curvature, onto, state.slip, pose, speed, params
-            )
-            return (
-                wanted,
-                error,
-                path.joining_length(start, course, radius, position, over_ground[0]),
-            )
-        following = route.legs[state.leg + 1] if leg.end is not None else None
-    error = path.error(leg, position)
-    entry = (
-        error.curvature
-        if following is None
-        else path.error(following, leg.end or (0.0, 0.0)).curvature
-    )
-    entered: Callable[[Point], Any] = partial(path.entered, leg, following)
-    if (
-        route is not None
-        and following is not None
-        and path.is_orbit(leg)
-        and has_loitered(state, pose, route)
-    ):
-        near = route.near(state.leg)
-        late = leaves(leg, near, pose, position) and not leaves(
-            leg, EXIT * over_ground[1], pose, position
-        )
-        entered = (
-            partial(path.entered, leg, following) if late else partial(leaves, leg, near, pose)
-        )
-    wanted = follow(error, entry, entered, state.slip, pose, speed, params)
-    return wanted, error, path.to_go(leg, position)
-
-
-def _joins(start: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
-    """`path.joined` by the position, for `follow`."""
-    return path.joined(start, course, near, position, flown)
-
-
-def follow(
-    error: PathError,
-    entry: Scalar,
-    entered: Callable[[Point], Any],
-    slip: Scalar,
-    pose: Mapping[str, Scalar],
-    speed: Scalar,
-    params: GuidanceParams,
-) -> Scalar:
-    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg
-    at the start, 1/m.
-
-    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered`
-    holds for the position a mean lag ahead. The mean lag of a change of the bank d is abs(d) / (2
-    p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
-    """
-    course, ground_speed = course_and_speed(pose)
-    xp = array_namespace(ground_speed)
-    change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(
-        ground_speed**2 * -error.curvature / GRAVITY
-    )
-    lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
-    ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
-    error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
-    acceleration = path_acceleration(error, course, ground_speed, params.path) + slip
-    return bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
-
-
 def _climb(
     state: GuidanceState,
     pose: Mapping[str, Scalar],
@@ -587,6 +438,21 @@ def _climb(
     )
     permitted = xp.minimum(xp.maximum(wanted, least), largest)
     return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted
+
+
+def _pitch_within(
+    state: GuidanceState, altitude: Scalar, speed: Scalar, params: GuidanceParams
+) -> Scalar:
+    """The commanded pitch, rad, within that of the climb rates to the least and the largest
+    altitude.
+    """
+    if not _is_bounded(params.limits):
+        return state.target.theta
+    xp = array_namespace(speed)
+    least, largest = (
+        pitch_for(rate, speed, state.alpha) for rate in _climb_within(altitude, params)
+    )
+    return xp.minimum(xp.maximum(state.target.theta, least), largest)
 
 
 def _is_bounded(limits: Limits) -> bool:

@@ -129,6 +129,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self._controller_mode = ControllerMode.WAITING
             self._guidance.pause(paused=True, forget=False)
             self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
+        self._advertise_views()
+        self._advertise_services()
+
+    def _advertise_views(self) -> None:
+        """The topics of maps and 3-D views."""
         self._odometry, self._imu, self._fix, self._wind = map(
             self._view, (ODOMETRY, IMU, FIX, WIND)
         )
@@ -143,6 +148,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if self._broadcast is None:
             self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
         self._flown: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
+
+    def _advertise_services(self) -> None:
         for kind, name, answer in (
             (SetBool, "engage", self._engage),
             (Trigger, "hold", lambda _: self._guidance.hold() or "guidance does not fly"),

@@ -20,6 +20,7 @@ from flight_core.fields import short_repr
 from flight_core.files import parse_yaml, read_file
 from flight_core.parameters import ParameterError, require
 from flight_guidance import route_formats
+from flight_guidance.mission_files import FencePlaces
 from flight_guidance.path import Point
 from flight_guidance.route_formats import FORMATS
 from flight_guidance.route_json import read_lines
@@ -270,25 +271,8 @@ def read_fence_file(
         if area.group is not None:
             zones[key]["group"] = area.group
     heights = _Heights(altitude, read.home, above_sea=above_sea)
-    rally = [_placed(place._replace(key="rally point"), origin, heights) for place in read.rally]
-    sections: dict[str, Any] = {"fence": zones}
-    if rally:
-        home = min(rally, key=lambda point: math.hypot(*point.point))
-        sections["home"] = {"north": home.north, "east": home.east, "altitude": home.altitude}
-    elif read.back is not None:
-        level = (
-            read.back
-            if read.back.altitude is not None
-            else read.back._replace(altitude=0.0, above=Above.AS_POSE)
-        )
-        back = _placed(level._replace(key="return point"), origin, heights)
-        sections["home"] = {"north": back.north, "east": back.east}
-        if read.back.altitude is not None:
-            sections["home"]["altitude"] = back.altitude
-    elif read.home is not None and origin is not None:
-        north, east = local(read.home.latitude, read.home.longitude, origin)
-        sections["home"] = {"north": north, "east": east}
-    return sections
+    home = _home_of_fence(read, origin, heights)
+    return {"fence": zones} | ({} if home is None else {"home": home})
 
 
 def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
@@ -384,6 +368,28 @@ class _Heights:
             "--set route.altitude with that of the home, as the aircraft counts",
         )
         return altitude + (self._zero or 0.0) - (self._sea or 0.0) * (above is Above.SEA)
+
+
+def _home_of_fence(
+    read: FencePlaces, origin: Origin | None, heights: _Heights
+) -> dict[str, Any] | None:
+    """The section `home` by the rule of `read_fence_file`; None without one."""
+    rally = [_placed(place._replace(key="rally point"), origin, heights) for place in read.rally]
+    if rally:
+        nearest = min(rally, key=lambda point: math.hypot(*point.point))
+        return {"north": nearest.north, "east": nearest.east, "altitude": nearest.altitude}
+    if read.back is not None:
+        has_altitude = read.back.altitude is not None
+        level = read.back
+        if not has_altitude:
+            level = read.back._replace(altitude=0.0, above=Above.AS_POSE)
+        back = _placed(level._replace(key="return point"), origin, heights)
+        section: dict[str, Any] = {"north": back.north, "east": back.east}
+        return section | ({"altitude": back.altitude} if has_altitude else {})
+    if read.home is not None and origin is not None:
+        north, east = local(read.home.latitude, read.home.longitude, origin)
+        return {"north": north, "east": east}
+    return None
 
 
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:

@@ -142,6 +142,20 @@ def read_target(
             raise ChannelError(
                 "bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way"
             )
+    _require_limits(values, params, what, degrees=degrees)
+    limits = params.limits
+    if "radius" in values and abs(values["radius"]) < limits.radius:
+        expected = f"at least {math.ceil(limits.radius)} m either way"
+        raise ChannelError(
+            "bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}"
+        )
+    _read_leg(values, route, what)
+
+
+def _require_limits(
+    values: Mapping[str, float], params: GuidanceParams, what: str, *, degrees: bool
+) -> None:
+    """Raise ChannelError for an angle, a climb, an altitude or an airspeed beyond the limits."""
     limits = params.limits
     vertical = params.vertical
     for name, least, largest in (
@@ -165,12 +179,6 @@ def read_target(
             entered = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
             raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
-    if "radius" in values and abs(values["radius"]) < limits.radius:
-        expected = f"at least {math.ceil(limits.radius)} m either way"
-        raise ChannelError(
-            "bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}"
-        )
-    _read_leg(values, route, what)
 
 
 def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
