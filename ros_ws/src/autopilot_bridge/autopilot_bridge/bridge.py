@@ -9,14 +9,14 @@ engagement.
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
 
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.map_rows import ConditionRow, InputRow, MeasuredRow, OutputRow
+from autopilot_bridge.conditions import Conditions, Reading, joined, staleness
+from autopilot_bridge.map_rows import InputRow, MeasuredRow, OutputRow
 from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -41,13 +41,6 @@ class Phase(IntEnum):
     NEUTRAL = 2  # failsafe: u timed out, the neutral values are sent
     RELEASE = 3  # the release values, which return the channels to the autopilot
     ENGAGING = 4  # heartbeats and requests, until the awaited conditions hold
-
-
-class Reading(NamedTuple):
-    """The newest value of a field and the instant to which it belongs."""
-
-    stamp_ns: int
-    value: float
 
 
 def trim_key(name: str) -> str:
@@ -91,18 +84,14 @@ class Bridge:
             len(self.inputs), dtype=bool
         )  # whether the newest u differs from the one before
         self.u_lock = PublisherLock(self._u_timeouts_ns)
-        self._conditions: dict[str, Reading] = {}
+        self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
-        self._overrides: dict[str, Reading] = {}
-        self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
         self._keeps_mode = (
             True  # whether a release leaves the mode: a pilot requested it, or nothing was flown
         )
-        self._blind = False  # whether the engagement goes on without the transmitter
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
-        self._watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
         rows = channel_map.inputs.values()
         self._lower = np.array([row.lower for row in rows])
         self._upper = np.array([row.upper for row in rows])
@@ -164,7 +153,7 @@ class Bridge:
         """Take the field of a condition. A condition that is lost ends an engagement at the next
         step.
         """
-        self._conditions[name] = Reading(now_ns, raw)
+        self.conditions.take_condition(name, raw, now_ns)
 
     def take_parameter(self, name: str, value: float) -> None:
         """Take a parameter of the autopilot."""
@@ -174,7 +163,7 @@ class Bridge:
         """Take the field of a pilot override. Beyond its threshold the bridge disengages at
         once.
         """
-        self._overrides[name] = Reading(now_ns, raw)
+        self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
             self.disengage(f"pilot override by {name}", now_ns, by_pilot=True)
 
@@ -194,7 +183,7 @@ class Bridge:
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
             return ""
-        return _staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
+        return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self, section: str = "envelope") -> str:
         """The channels that are outside the limits of a section of the map, as a sentence. All of
@@ -234,91 +223,16 @@ class Bridge:
                 )
         return "; ".join(sentences)
 
-    def _unmet(self, now_ns: int, *, awaited: bool) -> str:
-        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the
-        others.
-        """
-        conditions = self.channel_map.conditions.items()
-        rows = (
-            (name, row)
-            for name, row in conditions
-            if row.awaited is awaited and not (row.transmitter and self._blind)
-        )
-        return sentences(*(self._violation(name, row, now_ns) for name, row in rows))
-
     def _lost(self, now_ns: int) -> str:
         """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence;
         empty where it is.
         """
-        unmet = (self._unmet(now_ns, awaited=awaited) for awaited in (False, True))
+        unmet = (self.conditions.unmet(now_ns, awaited=awaited) for awaited in (False, True))
         return sentences(self.conflict, *unmet)
 
-    def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
-        reading = self._conditions.get(name)
-        if stale := _staleness(row.topic, reading, row.max_age, now_ns):
-            return _sentence({f"{name}: {row.field}": stale})
-        return (
-            ""
-            if reading is None or row.holds(reading.value)
-            else f"{row.sentence} ({row.field} is {reading.value:g})"
-        )
-
     def _is_active(self, name: str, now_ns: int) -> bool:
-        """Whether a pilot override is active. It ends with its topic: an old one does not block an
-        engagement.
-        """
-        row = self.channel_map.overrides[name]
-        reading = self._overrides.get(name)
-        if reading is None or self._is_silent(name, now_ns):
-            return False
         engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
-        at_engagement = (
-            self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
-        )
-        return row.is_active(reading.value, at_engagement)
-
-    def _is_silent(self, name: str, now_ns: int) -> bool:
-        """Whether a pilot override could not act now: its topic was not received, or has ended."""
-        row = self.channel_map.overrides[name]
-        return bool(_staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
-
-    def _silent_overrides(self, now_ns: int) -> str:
-        rows = self.channel_map.overrides.items()
-        silent = [
-            f"no message on {row.topic} for {row.max_age:g} s"
-            for name, row in rows
-            if self._is_silent(name, now_ns)
-        ]
-        return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
-
-    def _blindness(self) -> str:
-        """What an engagement that does not see the loss of the transmitter lacks, and what still
-        releases, as a sentence.
-        """
-        if self._watches_transmitter and not self._blind:
-            return ""
-        rows = self.channel_map.overrides.items()
-        dead = ", ".join(name for name, row in rows if row.transmitter)
-        working = ", ".join(name for name, row in rows if not row.transmitter)
-        conditions = ", ".join(
-            name for name, row in self.channel_map.conditions.items() if not row.transmitter
-        )
-        releases = (
-            f"the override by {working}" if working else "",
-            f"a lost condition ({conditions})" if conditions else "",
-            "rise-di engage --off",
-            f"max_engaged after {self.channel_map.max_engaged:g} s" if self._end_ns else "",
-        )
-        where = (
-            "is not watched (--blind)"
-            if self._watches_transmitter
-            else "cannot be seen over this link"
-        )
-        blind_override = f", and the override by {dead} has no effect then" if dead else ""
-        return (
-            f"the loss of the transmitter {where}{blind_override}; released by "
-            f"{', '.join(filter(None, releases))}"
-        )
+        return self.conditions.is_active(name, now_ns, engaged=engaged)
 
     def _lacks(self, now_ns: int) -> str:
         """What an engagement lacks, as a sentence."""
@@ -328,7 +242,12 @@ class Bridge:
             if ends
             else ""
         )
-        return sentences(warning, self.problem, self._silent_overrides(now_ns), self._blindness())
+        return sentences(
+            warning,
+            self.problem,
+            self.conditions.silent_overrides(now_ns),
+            self.conditions.blindness(bounded=self._end_ns is not None),
+        )
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -353,12 +272,14 @@ class Bridge:
         checks: tuple[Callable[[int], str], ...] = (
             lambda _: self.conflict,
             self._active_overrides,
-            lambda now_ns: self._unmet(now_ns, awaited=False),
+            lambda now_ns: self.conditions.unmet(now_ns, awaited=False),
             lambda _: self.problem,
             lambda _: self._unfit_parameters(),
             lambda _: (
                 ""
-                if self._blind or self._watches_transmitter or self.channel_map.max_engaged
+                if self.conditions.blind
+                or self.conditions.watches_transmitter
+                or self.channel_map.max_engaged
                 else UNBOUNDED
             ),
             self._missing,
@@ -397,7 +318,7 @@ class Bridge:
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
-        return sentences(_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns))
+        return sentences(joined(self.stale(now_ns) | sources), self._u_timeout(now_ns))
 
     def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
@@ -431,28 +352,28 @@ class Bridge:
         engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
-            self._blind |= blind
+            self.conditions.blind |= blind
             self._begin_time(now_ns)
         if self.phase in {Phase.ENGAGED, Phase.ENGAGING}:
             return ""
-        before = self._blind
-        self._blind = blind
+        before = self.conditions.blind
+        self.conditions.blind = blind
         if refusal := self.refusal(now_ns):
-            self._blind = before
+            self.conditions.blind = before
         else:
             self._enter(Phase.ENGAGING, now_ns)
             self._continue_engagement(now_ns)
         return refusal
 
     def _begin_time(self, now_ns: int) -> None:
-        bound = None if self._blind else self.channel_map.max_engaged
+        bound = None if self.conditions.blind else self.channel_map.max_engaged
         self._end_ns = None if bound is None else now_ns + nanoseconds(bound)
 
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage once the awaited conditions hold; give up after their time, or where something
         else would refuse.
         """
-        self.reason = self._unmet(now_ns, awaited=True)
+        self.reason = self.conditions.unmet(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
         if refusal := self.refusal(now_ns):
             self.disengage(refusal, now_ns)
@@ -465,11 +386,7 @@ class Bridge:
                 for name, row in self.channel_map.outputs.items()
                 if row.captured
             }
-            self._overrides_at_engagement = {
-                name: reading.value
-                for name, reading in self._overrides.items()
-                if not self._is_silent(name, now_ns)
-            }
+            self.conditions.engage(now_ns)
             self._enter(Phase.ENGAGED, now_ns)
 
     def disengage(self, reason: str, now_ns: int, *, by_pilot: bool = False) -> None:
@@ -495,7 +412,7 @@ class Bridge:
         elif self.phase is Phase.NEUTRAL and (lost := self._lost(now_ns)):
             self.disengage(lost, now_ns)
         elif self.phase is Phase.ENGAGED:
-            measured = _sentence(self.stale(now_ns))
+            measured = joined(self.stale(now_ns))
             cause = self.problem if measured else ""
             reasons = sentences(self._lost(now_ns), measured, cause) or self._outside()
             if ended := reasons or self._does_not_answer(now_ns):
@@ -615,24 +532,14 @@ class Bridge:
         if when == "engaging":
             return phase is Phase.ENGAGING
         if when == "release":
-            return phase is Phase.RELEASE and not self._unmet(now_ns, awaited=True)
+            return phase is Phase.RELEASE and not self.conditions.unmet(now_ns, awaited=True)
         if when == "failsafe":
-            return phase is Phase.RELEASE and not (self._keeps_mode or self._is_contradicted())
+            return phase is Phase.RELEASE and not (
+                self._keeps_mode or self.conditions.is_contradicted()
+            )
         releases = [row.release for row in self.channel_map.inputs.values() if row.message == name]
         return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (
             phase is Phase.RELEASE and None not in releases
-        )
-
-    def _is_contradicted(self) -> bool:
-        """Whether a condition does not hold by its last value: the pilot or the autopilot chose
-        another mode, or has landed.
-
-        One that tells the loss of the transmitter does not count: the pilot cannot take over then.
-        """
-        rows = self.channel_map.conditions.items()
-        readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
-        return any(
-            reading is not None and not row.holds(reading.value) for row, reading in readings
         )
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
@@ -645,26 +552,4 @@ class Bridge:
             self._begin_time(now_ns)
             self.reason = self._lacks(now_ns)
         elif phase in {Phase.RELEASE, Phase.DISENGAGED}:
-            self._blind = False
-
-
-def _staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
-    """What is wrong with the age of a field; empty where it is fresh."""
-    if reading is None:
-        return f"not received yet ({topic})"
-    age_ns = now_ns - reading.stamp_ns
-    return f"{seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
-
-
-def _sentence(faults: Mapping[str, str]) -> str:
-    """What is wrong with some channels, by name, as a sentence in which channels with the same
-    fault stand together.
-    """
-    names: dict[str, list[str]] = {}
-    for name, fault in faults.items():
-        names.setdefault(fault, []).append(name)
-    verbs = {
-        fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are "
-        for fault, named in names.items()
-    }
-    return "; ".join(f"{', '.join(named)} {verbs[fault]}{fault}" for fault, named in names.items())
+            self.conditions.blind = False

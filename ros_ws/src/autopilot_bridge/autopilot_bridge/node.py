@@ -15,7 +15,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.client import Client
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -25,11 +24,10 @@ from std_srvs.srv import SetBool, Trigger
 
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
-from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, version_fault
+from autopilot_bridge.channel_map import get_field, read_raw, version_fault
 from autopilot_bridge.map_rows import (
     MAVLINK,
     ConditionRow,
-    InputRow,
     MeasuredRow,
     MessageRow,
     OverrideRow,
@@ -37,10 +35,17 @@ from autopilot_bridge.map_rows import (
     WatchedRow,
 )
 from autopilot_bridge.mavlink_link import MavlinkPublisher, MavlinkReader
+from autopilot_bridge.outgoing import (
+    OutgoingMessage,
+    ServiceCaller,
+    field_type,
+    prepared,
+    require_field,
+)
 from autopilot_bridge.params import BridgeConfig, load_map
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded, sentences
 from flight_core.vectors import ChannelError
@@ -80,17 +85,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._logged = self._bridge.phase, self._bridge.reason
         self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
         self._began_ns = self._boot_ns()
-        if self.simulated is not None:
-            key, cause = (
-                f"{self.get_name()}.use_sim_time",
-                "false: an autopilot on MAVLink ticks by its own clock",
-            )
-            require(self._map.link is None, key, "true", cause)
-        self._link = (
-            None
-            if self._map.link is None
-            else mavlink_link.Link(self._map.link, tuple(self._map.parameters))
-        )
+        self._link = self._open_link()
         self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._overrides_sticks = any(
             message.topic == RC_OVERRIDE for message in self._map.messages.values()
@@ -141,6 +136,15 @@ class BridgeNode(FlightNode[BridgeConfig]):
             )
         )
 
+    def _open_link(self) -> mavlink_link.Link | None:
+        """The MAVLink link of the map; None without one."""
+        if self._map.link is None:
+            return None
+        key = f"{self.get_name()}.use_sim_time"
+        cause = "false: an autopilot on MAVLink ticks by its own clock"
+        require(self.simulated is None, key, "true", cause)
+        return mavlink_link.Link(self._map.link, tuple(self._map.parameters))
+
     def _read_topics(self) -> list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]]:
         """Subscribe to the topics of the map. Returns each with its rows."""
         named: list[NamedRow] = [
@@ -156,9 +160,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
             rows_by_topic.setdefault(row.topic, []).append((name, row))
         readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
-            kind = _message_type(rows[0][1].type)
+            kind = field_type(rows[0][1].type)
             for name, row in rows:
-                _require_field(kind(), name, row)
+                require_field(kind(), name, row)
             if fault := version_fault(topic, kind):
                 self.get_logger().warning(fault)
             readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
@@ -174,32 +178,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
         )
         return reader
 
-    def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
-        kind = _message_type(row.type)
-        message = kind.Request() if row.is_service else kind()
-        rows = [
-            (number, channel)
-            for number, channel in enumerate(self._map.inputs.values())
-            if channel.message == name
-        ]
-        try:
-            for path, value in row.values.items():
-                set_field(message, path, value)
-            for _, channel in rows:
-                for raw in (channel.neutral, channel.release, *channel.range):
-                    if isinstance(raw, float):
-                        set_field(message, channel.field, raw)
-            if row.stamped:
-                get_field(message, "header.stamp")
-        except ChannelError as error:
-            raise ParameterError(
-                f"map {self._map.name}: messages.{name} of type {row.type}: {error}"
-            ) from None
+    def _make(self, name: str, row: MessageRow) -> OutgoingMessage:
+        message, rows = prepared(self._map, name, row)
         if self._link is not None and row.topic.startswith(f"{MAVLINK}/"):
             return OutgoingMessage(MavlinkPublisher(self._link, row.topic), message, row, rows)
         if row.is_service:
             return OutgoingMessage(
-                ServiceCaller(self.create_client(kind, row.topic)), message, row, rows
+                ServiceCaller(self.create_client(field_type(row.type), row.topic)),
+                message,
+                row,
+                rows,
             )
         publisher = self.create_publisher(
             type(message), row.topic, _qos(self._map.topics[row.topic])
@@ -584,73 +572,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._link.close()
 
 
-class ServiceCaller:
-    """A service of the autopilot in the place of a publisher."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self.topic_name = str(client.srv_name)
-
-    def publish(self, request: Any) -> None:
-        """Request it, without regard to the answer. Raises ChannelError without the service."""
-        if not self._client.service_is_ready():
-            raise ChannelError("service", f"{self.topic_name}: no such service")
-        self._client.call_async(request)
-
-
-class OutgoingMessage:
-    """A message to the autopilot and its publisher. Its constant fields are set once."""
-
-    def __init__(
-        self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]
-    ) -> None:
-        self.publisher = publisher
-        self.row = row
-        self._message = message
-        self._inputs = inputs
-        self._period_ns = nanoseconds(1.0 / row.rate)
-        self._sent_ns = 0
-
-    def due(self, now_ns: int, slack_ns: int) -> bool:
-        """Whether its period has passed since it was last sent, to within `slack_ns`."""
-        return now_ns - self._sent_ns >= self._period_ns - slack_ns
-
-    def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send it. `raw` holds the raw values of all inputs; the message takes its own."""
-        for number, row in self._inputs:
-            set_field(self._message, row.field, raw[number])
-        if self.row.stamped:
-            stamp = self._message.header.stamp
-            stamp.sec, stamp.nanosec = divmod(now_ns, NANOSECONDS)
-        self.publisher.publish(self._message)
-        self._sent_ns = now_ns
-
-
-def _message_type(name: str) -> Any:
-    """The class of a type of a map, of a message package or of MAVLink."""
-    package, _, kind = name.split("/")
-    return mavlink_link.message_type(kind) if package == MAVLINK else message_type(name)
-
-
 def _qos(row: QosRow) -> QoSProfile:
     return QoSProfile(
         depth=row.depth,
         reliability=ReliabilityPolicy[row.reliability.upper()],
         durability=DurabilityPolicy[row.durability.upper()],
     )
-
-
-def _require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
-    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the
-    first message only.
-    """
-    if "[" in row.field:
-        return
-    try:
-        get_field(empty, row.field)
-        if isinstance(row, MeasuredRow) and row.turned_by is not None:
-            get_field(empty, row.turned_by)
-        if isinstance(row, MeasuredRow) and row.stamp == "header":
-            get_field(empty, "header.stamp")
-    except ChannelError as error:
-        raise ParameterError(f"{name}.field: {error}, expected a field of {row.type}") from None

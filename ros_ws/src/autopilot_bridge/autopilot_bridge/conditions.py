@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Conditions and pilot overrides of a channel map: what the autopilot and the pilot allow now."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from autopilot_bridge.map_rows import ConditionRow
+from autopilot_bridge.params import ChannelMap
+from flight_core.rates import nanoseconds, seconds
+from flight_core.text import sentences
+
+
+class Reading(NamedTuple):
+    """The newest value of a field and the instant to which it belongs."""
+
+    stamp_ns: int
+    value: float
+
+
+class Conditions:
+    """The newest fields of the conditions and overrides of a map.
+
+    `blind`: whether an engagement goes on without the transmitter.
+    """
+
+    def __init__(self, channel_map: ChannelMap) -> None:
+        self._map = channel_map
+        self.blind = False
+        self._conditions: dict[str, Reading] = {}
+        self._overrides: dict[str, Reading] = {}
+        self._at_engagement: dict[str, float] = {}  # the overrides
+        self.watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
+
+    def take_condition(self, name: str, raw: float, now_ns: int) -> None:
+        """Take the field of a condition."""
+        self._conditions[name] = Reading(now_ns, raw)
+
+    def take_override(self, name: str, raw: float, now_ns: int) -> None:
+        """Take the field of a pilot override."""
+        self._overrides[name] = Reading(now_ns, raw)
+
+    def engage(self, now_ns: int) -> None:
+        """Keep the overrides as they are: one that is `moved` acts by its change since then."""
+        self._at_engagement = {
+            name: reading.value
+            for name, reading in self._overrides.items()
+            if not self._is_silent(name, now_ns)
+        }
+
+    def unmet(self, now_ns: int, *, awaited: bool) -> str:
+        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the
+        others.
+        """
+        rows = (
+            (name, row)
+            for name, row in self._map.conditions.items()
+            if row.awaited is awaited and not (row.transmitter and self.blind)
+        )
+        return sentences(*(self._violation(name, row, now_ns) for name, row in rows))
+
+    def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
+        reading = self._conditions.get(name)
+        if stale := staleness(row.topic, reading, row.max_age, now_ns):
+            return joined({f"{name}: {row.field}": stale})
+        return (
+            ""
+            if reading is None or row.holds(reading.value)
+            else f"{row.sentence} ({row.field} is {reading.value:g})"
+        )
+
+    def is_contradicted(self) -> bool:
+        """Whether a condition does not hold by its last value: the pilot or the autopilot chose
+        another mode, or has landed.
+
+        One that tells the loss of the transmitter does not count: the pilot cannot take over then.
+        """
+        rows = self._map.conditions.items()
+        readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
+        return any(
+            reading is not None and not row.holds(reading.value) for row, reading in readings
+        )
+
+    def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
+        """Whether a pilot override is active. It ends with its topic: an old one does not block an
+        engagement.
+        """
+        row = self._map.overrides[name]
+        reading = self._overrides.get(name)
+        if reading is None or self._is_silent(name, now_ns):
+            return False
+        at_engagement = self._at_engagement.setdefault(name, reading.value) if engaged else None
+        return row.is_active(reading.value, at_engagement)
+
+    def _is_silent(self, name: str, now_ns: int) -> bool:
+        """Whether a pilot override could not act now: its topic was not received, or has ended."""
+        row = self._map.overrides[name]
+        return bool(staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
+
+    def silent_overrides(self, now_ns: int) -> str:
+        """The overrides without effect, as a sentence."""
+        silent = [
+            f"no message on {row.topic} for {row.max_age:g} s"
+            for name, row in self._map.overrides.items()
+            if self._is_silent(name, now_ns)
+        ]
+        return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
+
+    def blindness(self, *, bounded: bool) -> str:
+        """What an engagement that does not see the loss of the transmitter lacks, and what still
+        releases, as a sentence.
+
+        `bounded`: whether `max_engaged` ends it.
+        """
+        if self.watches_transmitter and not self.blind:
+            return ""
+        rows = self._map.overrides.items()
+        dead = ", ".join(name for name, row in rows if row.transmitter)
+        working = ", ".join(name for name, row in rows if not row.transmitter)
+        conditions = ", ".join(
+            name for name, row in self._map.conditions.items() if not row.transmitter
+        )
+        releases = (
+            f"the override by {working}" if working else "",
+            f"a lost condition ({conditions})" if conditions else "",
+            "rise-di engage --off",
+            f"max_engaged after {self._map.max_engaged:g} s" if bounded else "",
+        )
+        where = (
+            "is not watched (--blind)"
+            if self.watches_transmitter
+            else "cannot be seen over this link"
+        )
+        blind_override = f", and the override by {dead} has no effect then" if dead else ""
+        return (
+            f"the loss of the transmitter {where}{blind_override}; released by "
+            f"{', '.join(filter(None, releases))}"
+        )
+
+
+def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
+    """What is wrong with the age of a field; empty where it is fresh."""
+    if reading is None:
+        return f"not received yet ({topic})"
+    age_ns = now_ns - reading.stamp_ns
+    return f"{seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
+
+
+def joined(faults: Mapping[str, str]) -> str:
+    """What is wrong with some channels, by name, as a sentence in which channels with the same
+    fault stand together.
+    """
+    names: dict[str, list[str]] = {}
+    for name, fault in faults.items():
+        names.setdefault(fault, []).append(name)
+    verbs = {
+        fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are "
+        for fault, named in names.items()
+    }
+    return "; ".join(f"{', '.join(named)} {verbs[fault]}{fault}" for fault, named in names.items())

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages to an autopilot, and the fields of its messages, for the bridge node."""
+
+from typing import Any
+
+from autopilot_bridge import mavlink_link
+from autopilot_bridge.channel_map import get_field, message_type, set_field
+from autopilot_bridge.map_rows import MAVLINK, InputRow, MeasuredRow, MessageRow, WatchedRow
+from autopilot_bridge.params import ChannelMap
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import ChannelError
+
+
+class ServiceCaller:
+    """A service of the autopilot in the place of a publisher."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self.topic_name = str(client.srv_name)
+
+    def publish(self, request: Any) -> None:
+        """Request it, without regard to the answer. Raises ChannelError without the service."""
+        if not self._client.service_is_ready():
+            raise ChannelError("service", f"{self.topic_name}: no such service")
+        self._client.call_async(request)
+
+
+class OutgoingMessage:
+    """A message to the autopilot and its publisher. Its constant fields are set once."""
+
+    def __init__(
+        self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]
+    ) -> None:
+        self.publisher = publisher
+        self.row = row
+        self._message = message
+        self._inputs = inputs
+        self._period_ns = nanoseconds(1.0 / row.rate)
+        self._sent_ns = 0
+
+    def due(self, now_ns: int, slack_ns: int) -> bool:
+        """Whether its period has passed since it was last sent, to within `slack_ns`."""
+        return now_ns - self._sent_ns >= self._period_ns - slack_ns
+
+    def send(self, now_ns: int, raw: list[float]) -> None:
+        """Send it. `raw` holds the raw values of all inputs; the message takes its own."""
+        for number, row in self._inputs:
+            set_field(self._message, row.field, raw[number])
+        if self.row.stamped:
+            stamp = self._message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(now_ns, NANOSECONDS)
+        self.publisher.publish(self._message)
+        self._sent_ns = now_ns
+
+
+def prepared(
+    channel_map: ChannelMap, name: str, row: MessageRow
+) -> tuple[Any, list[tuple[int, InputRow]]]:
+    """A message of a map with its constant fields, and the rows of its inputs by their places in u.
+
+    Raises ParameterError for a field that is missing, or that cannot have its values.
+    """
+    kind = field_type(row.type)
+    message = kind.Request() if row.is_service else kind()
+    rows = [
+        (number, channel)
+        for number, channel in enumerate(channel_map.inputs.values())
+        if channel.message == name
+    ]
+    try:
+        for path, value in row.values.items():
+            set_field(message, path, value)
+        for _, channel in rows:
+            for raw in (channel.neutral, channel.release, *channel.range):
+                if isinstance(raw, float):
+                    set_field(message, channel.field, raw)
+        if row.stamped:
+            get_field(message, "header.stamp")
+    except ChannelError as error:
+        raise ParameterError(
+            f"map {channel_map.name}: messages.{name} of type {row.type}: {error}"
+        ) from None
+    return message, rows
+
+
+def field_type(name: str) -> Any:
+    """The class of a type of a map, of a message package or of MAVLink."""
+    package, _, kind = name.split("/")
+    return mavlink_link.message_type(kind) if package == MAVLINK else message_type(name)
+
+
+def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
+    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the
+    first message only.
+    """
+    if "[" in row.field:
+        return
+    try:
+        get_field(empty, row.field)
+        if isinstance(row, MeasuredRow) and row.turned_by is not None:
+            get_field(empty, row.turned_by)
+        if isinstance(row, MeasuredRow) and row.stamp == "header":
+            get_field(empty, "header.stamp")
+    except ChannelError as error:
+        raise ParameterError(f"{name}.field: {error}, expected a field of {row.type}") from None
