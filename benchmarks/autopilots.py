@@ -25,7 +25,6 @@ import shutil
 import subprocess
 import sys
 import time
-from bisect import bisect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -34,50 +33,38 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 from benchmarks import evidence
+from benchmarks.autopilot_flights import (
+    FOLDER,
+    REPOSITORY,
+    arduplane,
+    flying,
+    on_the_ground,
+    px4,
+    tracking,
+)
+from benchmarks.autopilot_signs import TURBULENCE, counted, signs, signs_of_logs
 from benchmarks.tables import parser_of
 
-from autopilot_bridge.params import ChannelMap, load_map
-from control_laws.excitation import ExcitationConfig
+from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.metrics import errors_by_part, in_spans
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
-from flight_core.rates import NANOSECONDS, seconds
-from flight_core.tape import Signal, Tape
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
 from flight_design.gains.nominal import sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
-from flight_design.identification.bridge_identification import channel_pairs, experiment
-from flight_design.identification.response_identification import MIN_RATIO, identify_response
-from flight_design.identification.sign_check import check
 from flight_design.identification.step_identification import NOISE_SHARE
-from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
 if TYPE_CHECKING:
-    from tests.sitl.kit import ArduPlane, Autopilot, Px4
+    from tests.sitl.kit import Autopilot
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-FOLDER = REPOSITORY / "build" / "autopilots"
 EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
-PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
-"""s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of
-it at SIM_WIND_TURB 0.5."""
-STRONGER_ELEVATOR = 2.0  # `rise-di check` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
-TURBULENCE = (
-    0.25,
-    0.5,
-    0.25,
-    0.5,
-    1.0,
-)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
-EXCITED = 35.0  # s, of an experiment on signs at least
-EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
-MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
 GUIDED, EACH, SETTLED = (
     300.0,
     60.0,
@@ -96,39 +83,6 @@ TRUE = 1.049  # of true over equivalent airspeed at the kit's place
 WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
 END = "the end of the flight"
-DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
-
-
-# The autopilots
-
-
-@contextmanager
-def arduplane(servo: float, place: Path = FOLDER / "arduplane") -> Iterator["ArduPlane"]:
-    """An ArduPlane in flight, with servos of this speed."""
-    from tests.sitl.kit import ArduPlane  # noqa: PLC0415 - after the kit's place is known
-
-    with _flying(ArduPlane(place), SIM_SERVO_SPEED=servo) as plane:
-        yield plane
-
-
-@contextmanager
-def px4() -> Iterator["Px4"]:
-    """PX4's airplane in flight; without an offboard heartbeat it changes to Hold."""
-    from tests.sitl.kit import Px4  # noqa: PLC0415 - as above
-
-    with _flying(Px4(FOLDER / "px4"), COM_RCL_EXCEPT=7.0, COM_OBL_RC_ACT=5.0) as airplane:
-        yield airplane
-
-
-@contextmanager
-def _flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
-    """In flight."""
-    try:
-        autopilot.up(**parameters)
-        autopilot.take_off()
-        yield autopilot
-    finally:
-        autopilot.down()
 
 
 # Measurements
@@ -200,9 +154,7 @@ def identified(
         with flying() as autopilot:
             autopilot.patient_map(map_name)
             autopilot.experiment(*command)
-    read = _on_the_ground(
-        *command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json"
-    )
+    read = on_the_ground(*command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
     if read.returncode:
         return {"refused": read.stderr}
     result = json.loads(read.stdout)
@@ -223,48 +175,6 @@ def identified(
     }
 
 
-def _on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """A command of rise-di without an autopilot."""
-    command = (sys.executable, "-m", "flight_cli.cli", *arguments)
-    return subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - its own arguments
-
-
-def tracking(autopilot: "Autopilot") -> dict[str, Any]:
-    """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a
-    limit, whether it replays.
-    """
-    summary, log = autopilot.summary(), read_run(autopilot.run)
-    replayed = _on_the_ground("replay", str(autopilot.run)).returncode == 0
-    return {
-        "engaged": summary["engagements"],
-        "outcome": summary["outcome"],
-        "rms": {name: error["command"]["rms"] for name, error in summary["errors"].items()},
-        "behind": {
-            name: behind(log.tape, name, span)
-            for span in log.engagements or []
-            for name in log.tape["y"].names
-        },
-        "limited": {
-            name: values["limited"]["magnitude"] for name, values in summary["inputs"].items()
-        },
-        "replayed": replayed,
-    }
-
-
-def behind(tape: Tape, name: str, engaged: Engagement) -> float:
-    """The delay of y behind y_m with the smallest error, s."""
-    y, y_m = tape["y"], tape["y_m"]
-    t = np.arange(
-        engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100
-    )
-    measured = np.interp(t, y.stamp_ns, y[name])
-    errors = [
-        float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name])))
-        for delay in DELAYS
-    ]
-    return float(DELAYS[int(np.argmin(errors))])
-
-
 def own_log() -> dict[str, Any]:
     """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind: errors by its
     own log, and Omega by it.
@@ -278,7 +188,7 @@ def own_log() -> dict[str, Any]:
     for name in ("ardupilot", "ardupilot_mavlink"):
         plane = ArduPlane(FOLDER / f"own_log_{name}")
         plane.throttle = FASTER_THROTTLE
-        with _flying(
+        with flying(
             plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME
         ):
             narrower = (
@@ -317,12 +227,12 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
     """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
-    done = _on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
+    done = on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
     if done.returncode:
         return {"refused": done.stderr}
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
-        read = _on_the_ground(
+        read = on_the_ground(
             *command, str(source), "--write", str(place / f"of_{name}"), "--set", "accept", "--json"
         )
         if read.returncode:
@@ -376,7 +286,7 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
         "turns": len(starts),
         "rms": {name: float(np.sqrt(np.mean(errors[name][held] ** 2))) for name in HELD},
         "max": {name: float(np.max(np.abs(errors[name][held]))) for name in HELD},
-        "replayed": _on_the_ground("replay", str(run)).returncode == 0,
+        "replayed": on_the_ground("replay", str(run)).returncode == 0,
     }
 
 
@@ -446,120 +356,6 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
     begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
     around = sent.within([(begin, end)])
     return max(float(np.max(np.abs(np.diff(around[name])))) / size for name, size in ranges.items())
-
-
-def signs(experiments: int = 25) -> dict[str, Any]:
-    """Short experiments, open loop, each in other turbulence, and what `rise-di check` says of
-    each; earlier ones are kept.
-
-    The simulator draws its turbulence from one stream of random numbers without a seed: each
-    experiment has another part of it.
-    """
-    with arduplane(0.03) as plane:
-        channel_map = plane.patient_map("ardupilot")
-        loaded = load_map(channel_map)
-        airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
-        planned = experiment(loaded, 24.0, 0.2, str(airframe))
-        airframe.write_text(planned.airframe)
-        content = yaml.safe_load(planned.scenario)
-        controller = content["/**/controller"]["ros__parameters"]
-        controller["pause"] = 1.0
-        controller["period"] = [PERIODS[name] for name in controller["inputs"]]
-        place = controller["inputs"].index("elevator")
-        controller["amplitude"][place] *= STRONGER_ELEVATOR
-        scenario.write_text(yaml.safe_dump(content))
-        duration = ExcitationConfig.validate_mapping(controller, "controller").duration
-        plane.say("param", "SIM_WIND_SPD", "5")
-        flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
-        flown.wait_for("DISENGAGED")
-        begun, earlier = [], len(stored("signs").get("experiments", []))
-        winds = [
-            TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)
-        ]
-        for wind in winds:
-            plane.say("param", "SIM_WIND_TURB", f"{wind:g}")
-            begun.append(time.time_ns())
-            plane.level()
-            plane.hand_over()
-            while plane.engage().end() != 0:  # outside of the envelope, by a gust
-                plane.level()
-                plane.hand_over()
-            time.sleep(duration)
-            plane.engage("--off").succeed()
-        plane.say("param", "SIM_WIND_TURB", "0")
-        plane.level()
-        flown.interrupt()
-        flown.end(60.0)
-    return signs_of_logs([plane.run], lambda _, engaged: winds[bisect(begun, engaged.start_ns) - 1])
-
-
-def signs_of_logs(
-    runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]
-) -> dict[str, Any]:
-    """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an
-    engagement.
-
-    An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted,
-    not judged. Those of a run in strong turbulence are also judged together, as `rise-di check`
-    judges a log with several.
-    """
-    earlier, channel_map = stored("signs"), load_map("ardupilot")
-    found, ended, together = (earlier.get(key, []) for key in ("experiments", "ended", "together"))
-    for run in runs:
-        log, strong = read_run(run), dict[float, list[Engagement]]()
-        end_ns = int(log.tape["y"].stamp_ns[-1])
-        for number, engagement in enumerate(log.engagements or []):
-            turbulence = wind_of(number, engagement)
-            about = {"run": run.name, "turbulence": turbulence, "reason": engagement.reason}
-            if seconds((engagement.stop_ns or end_ns) - engagement.start_ns) < EXCITED:
-                ended.append(about)
-                continue
-            found.append(about | judged(channel_map, log.tape, [engagement]))
-            if turbulence > MODERATE:
-                strong.setdefault(turbulence, []).append(engagement)
-        for turbulence, some in strong.items():
-            alike = {"run": run.name, "turbulence": turbulence, "count": len(some)}
-            together.append(alike | judged(channel_map, log.tape, some))
-    return {"experiments": found, "ended": ended, "together": together}
-
-
-def judged(
-    channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]
-) -> dict[str, Any]:
-    """What `rise-di check` says of every sign, and of each flipped alone: its column of the
-    recorded u has the other sign.
-    """
-    pairing, expected = channel_pairs(channel_map)
-    columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
-    rows = [list(channel_map.outputs).index(name) for name in pairing.outputs]
-    Omega = np.zeros((len(rows), len(columns)))
-    Omega[rows, columns] = expected
-    u, end_ns = tape["u"], int(tape["y"].stamp_ns[-1])
-    spans = [(engaged.start_ns, engaged.stop_ns or end_ns) for engaged in engagements]
-
-    def verdicts(flipped: str) -> dict[str, str]:
-        turned = Signal(
-            u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names]
-        )
-        response = identify_response(
-            tape["y"], turned, pairing.outputs, pairing.inputs, engaged=spans
-        )
-        D = tuple(int(sign) for sign in expected)
-        checked = check(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
-        shown = (
-            (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect)
-            for channel in checked.channels
-        )
-        return {
-            name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong"
-            for name, ratio, agrees in shown
-        }
-
-    return {
-        "seconds": sum(seconds(stop - start) for start, stop in spans),
-        "as flown": verdicts(""),
-        "flipped": {name: verdicts(name) for name in pairing.inputs},
-    }
 
 
 def pose() -> dict[str, Any]:
@@ -642,40 +438,6 @@ ERROR_GOALS = {
     "arduplane": {"q": 0.010, "p": 0.020, "r": 0.015, "V": 0.05},
     "px4": {"q": 0.0265, "p": 0.0505, "r": 0.015, "V": 0.215},
 }
-
-
-def stored(name: str) -> dict[str, Any]:
-    """The stored result of a measurement; empty where there is none."""
-    file = FOLDER / f"{name}.json"
-    return dict(json.loads(file.read_text())["result"]) if file.is_file() else {}
-
-
-def shows_all(experiment: dict[str, Any]) -> bool:
-    """Whether every sign is found, and right."""
-    return set(experiment["as flown"].values()) == {"right"}
-
-
-def finds_each(experiment: dict[str, Any]) -> bool:
-    """Whether each single sign that is flipped is found."""
-    return all(verdicts[name] == "wrong" for name, verdicts in experiment["flipped"].items())
-
-
-def counted(result: dict[str, Any]) -> dict[str, Any]:
-    """The counts of the experiments on signs."""
-    flown = result["experiments"]
-    moderate = [each for each in flown if each["turbulence"] <= MODERATE]
-    return {
-        "experiments": len(flown),
-        "experiments that ended early": len(result["ended"]),
-        "experiments that show every sign, right": sum(map(shows_all, flown)),
-        "experiments that find each flipped sign": sum(map(finds_each, flown)),
-        "experiments that call a right sign wrong": sum(
-            "wrong" in each["as flown"].values() for each in flown
-        ),
-        "moderate experiments that miss a sign": sum(
-            not (shows_all(each) and finds_each(each)) for each in moderate
-        ),
-    }
 
 
 GOALS: dict[str, dict[str, str]] = {
