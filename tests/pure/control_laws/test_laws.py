@@ -27,7 +27,8 @@ from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.observer_selection import gains_by_rule, model_for, with_aircraft_observer
+from flight_design.gains.observer_gains import gains_by_rule
+from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from rise_di_controller import guard, laws
 from rise_di_controller.control_law import Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller

@@ -22,9 +22,9 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from flight_design.gains import observer_selection
+from flight_design.gains import observer_search
+from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_selection import (
-    gains_by_rule,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
@@ -52,7 +52,7 @@ def with_observer(controller: RiseDiConfig) -> Scenario:
 
 
 @cache
-def by_rule(margin: float = 0.03) -> observer_selection.SelectedObserver:
+def by_rule(margin: float = 0.03) -> observer_search.SelectedObserver:
     model = model_for(OSPREY, SERVO.controller, NOISE)
     gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
     return with_aircraft_observer(SERVO.rise_di(), OSPREY, [gains], NOISE, margin)
@@ -144,7 +144,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     with refusing(r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
         with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
     monkeypatch.setattr(
-        observer_selection, "MAX_RELAXATION", 1.2
+        observer_search, "MAX_RELAXATION", 1.2
     )  # the search up to 18 takes half a minute
     with refusing(
         r"^--margin: delay margin \(ms\): .*, expected at least 500.*; give the loop less "

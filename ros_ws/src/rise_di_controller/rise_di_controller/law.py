@@ -133,8 +133,7 @@ def step(
 
     e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead)
     consistent with the prediction: backward Euler of (21), with an error of order dt^2 and without
-    chatter. SOFT is for loops with lag. u is the deviation from the input at engagement. sgn(0) =
-    0.
+    chatter. SOFT is for loops with lag. u is the deviation from that at engagement; sgn(0) = 0.
 
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
     docs/theory.md.

@@ -212,6 +212,19 @@ def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParam
     return state._replace(z=z, u_o=u_o, sigma=sigma)
 
 
+def _at_engagement(
+    law_state: Any, measured: Measurements, params: ObserverParams, *, vanes: bool
+) -> Any:
+    """The state at engagement: estimates from the first e, u_o = 0."""
+    e = measured.y - measured.y_m
+    zero = array_namespace(e).zeros_like(e)
+    state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])
+    if not vanes or measured.vane is None:
+        return state
+    none = 0.0 * measured.vane
+    return VaneObserverState(*state, measured.vane, none, none)
+
+
 @lru_cache(maxsize=64)
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     """A control law from the trim u_trim + u_o; the observer takes u after saturation
@@ -236,16 +249,7 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
         return state._replace(law=law_state, z=predict(state.z, u - measured.u_trim, params))
 
     def engage(measured: Measurements, params: ObserverParams) -> Any:
-        xp = array_namespace(measured.y)
-        e = measured.y - measured.y_m
-        zero = xp.zeros_like(e)
-        state = ObserverState(
-            law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1]
-        )
-        if not vanes or measured.vane is None:
-            return state
-        none = 0.0 * measured.vane
-        return VaneObserverState(*state, measured.vane, none, none)
+        return _at_engagement(law.engage(measured, params.law), measured, params, vanes=vanes)
 
     def step(
         state: Any, measured: Measurements, dt: Array, params: ObserverParams

@@ -61,9 +61,35 @@ def design_allocation(
     "Control allocation for over-actuated systems", Proc. 14th Mediterranean Conference on Control
     and Automation, 2006.
     """
+    _require_effectors(airframe, effectors)
     Omega = airframe.matrix_c() @ airframe.matrix_b()
-    m = len(airframe.outputs)
+    T = _pseudo_inverse(airframe, Omega, effectors)
+    law = tuple(f"{LAW_INPUT}{name}" for name in airframe.outputs)
+    first = [f"{LAW_INPUT}{name}" for name in priority]
+    config = AllocationConfig.validate_mapping(
+        {
+            "effectors": tuple(airframe.inputs),
+            "T": _rounded(T),
+            "effect": _rounded(Omega),
+            "lower": effectors.lower.tolist(),
+            "upper": effectors.upper.tolist(),
+            "slew": effectors.rate.tolist() if np.isfinite(effectors.rate).all() else None,
+            "priority": [*first, *(name for name in law if name not in first)] if first else None,
+        },
+        "allocation",
+    )
+    lag = np.maximum((Omega * T.T) @ effectors.lag, 0.0)
+    lower, upper = (
+        _alone(T, sides)
+        for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper))
+    )
+    return config, LawInputs(law, -lower, upper, _alone(T, (effectors.rate, effectors.rate)), lag)
+
+
+def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
+    """Raise ParameterError for fewer effectors than outputs, and for infinite stops."""
     names = tuple(airframe.inputs)
+    m = len(airframe.outputs)
     require(
         len(names) >= m,
         f"airframe {airframe.name}: inputs",
@@ -80,40 +106,23 @@ def design_allocation(
             f"{low:g} to {high:g}",
             "both end stops: they weigh the effectors",
         )
+
+
+def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors) -> FloatArray:
+    """T, (p, m), by the weights of `design_allocation`. Raises ParameterError for dependent rows
+    of Omega.
+    """
     reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
     scaled = Omega * reach
     size = np.abs(scaled).max(axis=1, keepdims=True)
-    independent = (
-        bool((size > 0.0).all())
-        and np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6) == m
-    )
+    rank = np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6)
     require(
-        independent,
+        bool((size > 0.0).all()) and rank == len(Omega),
         f"airframe {airframe.name}: C B",
         "rows that depend on each other",
         "inputs that move each output",
     )
-    T = reach[:, None] * np.linalg.pinv(scaled)
-    law = tuple(f"{LAW_INPUT}{name}" for name in airframe.outputs)
-    first = [f"{LAW_INPUT}{name}" for name in priority]
-    config = AllocationConfig.validate_mapping(
-        {
-            "effectors": names,
-            "T": _rounded(T),
-            "effect": _rounded(Omega),
-            "lower": effectors.lower.tolist(),
-            "upper": effectors.upper.tolist(),
-            "slew": effectors.rate.tolist() if np.isfinite(effectors.rate).all() else None,
-            "priority": [*first, *(name for name in law if name not in first)] if first else None,
-        },
-        "allocation",
-    )
-    lag = np.maximum((Omega * T.T) @ effectors.lag, 0.0)
-    lower, upper = (
-        _alone(T, sides)
-        for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper))
-    )
-    return config, LawInputs(law, -lower, upper, _alone(T, (effectors.rate, effectors.rate)), lag)
+    return np.asarray(reach[:, None] * np.linalg.pinv(scaled))
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:

@@ -5,7 +5,7 @@ aircraft.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from aircraft_sim.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
+from flight_design.gains.channel_signs import MAX_COUPLING
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
-from flight_design.gains.gain_selection import MAX_COUPLING
 from rise_di_controller.decomposition import search
 from rise_di_controller.model_sections import AllocationConfig
 
@@ -30,6 +30,7 @@ AUTHORITY = {
 }  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
 USED = 0.4  # part of the authority that the edge of a command takes at most
 NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
+SPEEDS = {"V", "u"}  # outputs that a throttle moves slowly
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
 RATE = 200.0  # Hz, of y and y_m
 FASTEST = {
@@ -107,41 +108,11 @@ def scenario_text(
     outputs = list(airframe.outputs)
     V0 = airframe.speed
     stops = _stops(airframe)
-    rates = _rates(airframe)
-    if len(inputs) > len(outputs):
-        _, law = _distributed(airframe, lag)
-        authority = law.upper
-        lag_of = dict(zip(outputs, law.lag.tolist(), strict=True))
-    else:
-        paired = pairing(airframe)
-        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
-        authority = response * np.array(stops)[list(paired)]
-        lag_of = {outputs[i]: lag[j] for i, j in enumerate(paired)}
-    fastest = {
-        output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3))
-        for output in outputs
-    }
-    banks = {"p", "r"} <= set(outputs) and bool(
-        {"beta", "v"} & set(airframe.states)
-    )  # a bank turns an aeroplane
+    channels = _channels(airframe, lag)
+    # a bank turns an aeroplane
+    banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
-    amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
-    start = 2.0
-    pulses = {}
-    for k, output in enumerate(outputs):
-        reachable = USED * float(authority[k]) / fastest[output]
-        value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
-        if output == "r" and turn:
-            continue  # the turns command it
-        length = 8.0 if output in {"V", "u"} else 2.0
-        pulses[output] = {
-            "start": [start, start + 2.0 * length],
-            "stop": [start + length, start + 3.0 * length],
-        }
-        pulses[output]["value"] = [value, -value] if length == 2.0 else [value, 0.0]
-        if length == 8.0:
-            pulses[output] = {"start": [start], "stop": [start + length], "value": [value]}
-        start += 3.0 if length == 2.0 else 4.0
+    commanded = [name for name in outputs if not (name == "r" and turn)]  # turns command r
     crosswise = [axis for axis in airframe.gusts if axis != "longitudinal"]
     gusts = {
         axis: {"start": 32.0 + 3.0 * k, "speed": round(0.03 * V0, 2), "length": round(0.5 * V0, 1)}
@@ -160,15 +131,63 @@ def scenario_text(
             "lag": list(lag),
             "lower": [-stop for stop in stops],
             "upper": stops,
-            "rate": rates,
+            "rate": _rates(airframe),
         },
         noise=[NOISE.get(output, 0.001) for output in outputs],
-        frequency=list(fastest.values()),
-        damping=[1.0 if output in {"V", "u"} else 0.9 for output in outputs],
-        pulses=pulses,
+        frequency=[channels[output].frequency for output in outputs],
+        damping=[1.0 if output in SPEEDS else 0.9 for output in outputs],
+        pulses=_pulses({name: channels[name] for name in commanded}, V0, size),
         turn=turn,
         controller=controller,
     )
+
+
+class _Channel(NamedTuple):
+    """A channel of the reference model."""
+
+    authority: float  # y_dot that the input gives at its stop
+    frequency: float  # rad/s, natural, of the reference model
+
+
+def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, _Channel]:
+    """The channels by output."""
+    outputs = list(airframe.outputs)
+    if len(airframe.inputs) > len(outputs):
+        _, law = _distributed(airframe, lag)
+        authority = law.upper
+        lags = law.lag.tolist()
+    else:
+        paired = pairing(airframe)
+        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
+        authority = response * np.array(_stops(airframe))[list(paired)]
+        lags = [lag[j] for j in paired]
+    return {
+        output: _Channel(
+            float(reach), min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(seconds, 1e-3))
+        )
+        for output, reach, seconds in zip(outputs, authority, lags, strict=True)
+    }
+
+
+def _pulses(channels: Mapping[str, _Channel], V0: float, size: float) -> dict[str, Any]:
+    """Commands by output, one after another: a pulse of V, a pulse each way of the rest."""
+    amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
+    start = 2.0
+    pulses: dict[str, Any] = {}
+    for output, channel in channels.items():
+        reachable = USED * channel.authority / channel.frequency
+        value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
+        if output in SPEEDS:
+            pulses[output] = {"start": [start], "stop": [start + 8.0], "value": [value]}
+            start += 4.0
+        else:
+            pulses[output] = {
+                "start": [start, start + 4.0],
+                "stop": [start + 2.0, start + 6.0],
+                "value": [value, -value],
+            }
+            start += 3.0
+    return pulses
 
 
 def _surfaces(airframe: Airframe) -> list[bool]:

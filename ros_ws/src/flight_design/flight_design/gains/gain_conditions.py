@@ -348,27 +348,14 @@ def check_loop(
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
         conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
 
-    add(
-        "lag product",
-        params.K * response * total,
-        np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT),
-        at_least=False,
-    )
-    add(
-        "Lambda below K",
-        params.Lambda,
-        MAX_LAMBDA_TO_BANDWIDTH * params.K * response,
-        at_least=False,
-    )
-    add(
-        "beta above slew", params.beta * response, slew * response, at_least=True
-    )  # in the same inputs for every gain set
-    add(
-        "beta below rate",
-        params.beta * response,
-        MAX_BETA_TO_RATE_LIMIT * rate_limit * response,
-        at_least=False,
-    )
+    bandwidth = params.K * response
+    most = np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT)
+    add("lag product", bandwidth * total, most, at_least=False)
+    add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * bandwidth, at_least=False)
+    beta = params.beta * response  # in the same inputs for every gain set
+    add("beta above slew", beta, slew * response, at_least=True)
+    fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
+    add("beta below rate", beta, fastest, at_least=False)
     if params.sign is Sign.SOFT:
         add("softening", params.eps * params.K / params.beta, total, at_least=True)
     elif params.sign is Sign.IMPLICIT:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.loop_margins import loop_of, through_allocation
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -19,13 +20,13 @@ from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocatio
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
 from flight_design.gains.ideal_control import Study
 from flight_design.gains.nominal import sizes
-from flight_design.gains.observer_selection import (
+from flight_design.gains.observer_gains import (
+    ObserverGains,
     gains_beside_sketch,
     gains_by_rule,
     gains_of_search,
-    model_for,
-    with_aircraft_observer,
 )
+from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from flight_design.gains.requirement import (
     OBSERVER_REQUIREMENT,
     PHASE_MARGIN,
@@ -44,6 +45,7 @@ SLOWER = 1.8
 """Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`,
 searched with 38 ms in q, they have the margins with 55 ms and miss them with 65 and 75 ms. Those of
 the rule have them from 75 ms on."""
+BY_RULE = "gains by a rule from the lags, a start"
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
@@ -401,43 +403,13 @@ def observed(
     )
     measured = [name for name in scenario.aircraft.vanes.channels if name in model.states]
     vanes: dict[str, float] = {name: by_name[name] or PERFECT_VANE for name in measured}
-    perfect = (
-        sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
-    )  # noise in place of none, of a perfect sensor
+    # noise in place of none, of a perfect sensor
+    perfect = sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
     noise = np.array(
         [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
     )
     nominal = model_for(model, controller, noise)
-    tuned = _tuned_scenario(scenario)
-    results = (
-        {} if sketched else {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
-    )
-    searched = sorted(
-        ((result.cost, law, result) for law, result in results.items() if result is not None),
-        key=lambda row: row[0],
-    )
-    axes = tuple(model.gusts)
-    origin = "gains by a rule from the lags, a start"
-    candidates = [(gains_by_rule(nominal, axes, model.speed), origin)]
-    if sketched:
-        candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
-    tuned_lag = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
-    ratios = [
-        lag / tuned_lag.get(name, np.inf)
-        for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)
-    ]
-    if (
-        searched
-        and max(ratios) < SLOWER
-        and tuple(scenario.aircraft.load()[0].states) == tuple(model.states)
-    ):
-        titles = (
-            f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched
-        )
-        searched_gains = (
-            gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched
-        )
-        candidates = list(zip(searched_gains, titles, strict=True))
+    candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
         controller,
@@ -461,6 +433,42 @@ def observed(
     )
     vane_text = f" with vanes for {' and '.join(vanes)}" if vanes else ""
     return selected.controller, f"observer of {model.name}{vane_text}: {origin}{lowered}; {margins}"
+
+
+def _gain_sets(
+    controller: RiseDiConfig,
+    scenario: Scenario,
+    model: Airframe,
+    nominal: NominalModel,
+    *,
+    sketched: bool,
+) -> list[tuple[ObserverGains, str]]:
+    """The gain sets from which the margins choose, each with what it comes from."""
+    axes = tuple(model.gusts)
+    if sketched:
+        gains = gains_beside_sketch(nominal, controller.outputs, axes, model.speed)
+        return [(gains, BY_RULE)]
+    tuned = _tuned_scenario(scenario)
+    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    searched = sorted(
+        ((result.cost, law, result) for law, result in results.items() if result is not None),
+        key=lambda row: row[0],
+    )
+    tuned_lag = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
+    ratios = [
+        lag / tuned_lag.get(name, np.inf)
+        for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)
+    ]
+    states = tuple(scenario.aircraft.load()[0].states)
+    if not searched or max(ratios) >= SLOWER or states != tuple(model.states):
+        return [(gains_by_rule(nominal, axes, model.speed), BY_RULE)]
+    return [
+        (
+            gains_of_search(result.gains, nominal.total_lag),
+            f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}",
+        )
+        for _, law, result in searched
+    ]
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:

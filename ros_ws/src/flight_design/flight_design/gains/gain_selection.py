@@ -30,9 +30,10 @@ from flight_analysis.closed_loop.loop_margins import (
     loop_of,
 )
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.parameters import LARGEST, ParameterError, require
+from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
+from flight_design.gains.channel_signs import require_channels
 from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
@@ -45,7 +46,7 @@ from flight_design.gains.requirement import (
     conditions,
     within_requirement,
 )
-from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
+from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
 from rise_di_controller.model_sections import FeedforwardConfig
@@ -72,12 +73,6 @@ SOFTENING = 2.75  # 1, width of the softened sign in total lags at the begin of 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
 on the `osprey`."""
-
-MAX_COUPLING = 10.0
-"""Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the
-`osprey` with aileron and rudder swapped, 13.6 on the first edition's Aerosonde, which neither
-procedure stabilises behind servos, and at most 2.2 on the other airframes of the library."""
-
 
 INPUT_LIMITS = (
     "lower",
@@ -194,64 +189,6 @@ class Selection:
         return assess_gains(self.study, self.chosen, self.setting)
 
 
-# The manoeuvre and the ideal control along it
-
-
-# Signs and pairing
-
-
-def require_channels(
-    Omega: FloatArray,
-    channels: ChannelPairing,
-    D: Sequence[int] | None = None,
-    input_signs: Sequence[int] | None = None,
-) -> FloatArray:
-    """D of a pairing of channels, shape (m,). Raises ParameterError with the contradiction to Omega
-    and a choice that fits.
-
-    Omega = C B in the order of the channels, (m, m), with the airframe's signs of the inputs.
-    `input_signs` are -1 for an input whose sign is flipped between law and airframe; this flips D_k
-    and nothing else. The checks, in this order: the pairing has a D and max abs(U - I) at most 10;
-    the input signs fit the D given; D fits.
-    """
-    m = len(Omega)
-    flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
-    try:
-        largest = coupling(Omega)
-        problem = f"max abs(U - I) = {largest:.3g}" if largest > MAX_COUPLING else ""
-    except DecompositionError as error:
-        problem = f"no D, for leading minor {error.minor} is zero"
-    if problem:
-        named = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
-        fits = (
-            "inputs that can be paired: "
-            f"{'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
-        )
-        if better := search(Omega, MAX_COUPLING):
-            pairs = (
-                f"{channels.outputs[i]}-{channels.inputs[j]}"
-                for i, j in zip(*better[:2], strict=True)
-            )
-            fits = f"another pairing: {', '.join(pairs)}"
-        raise ParameterError(f"controller.inputs: found {named} with {problem}, expected {fits}")
-    actual = signs(Omega) * flips
-    stated = actual if D is None else np.array(D, dtype=np.float64)
-    wrong = [name for name, a, b in zip(channels.inputs, actual, stated, strict=True) if a != b]
-    if input_signs is not None:
-        fit = (flips * actual * stated).astype(int).tolist()
-        expected = f"{fit} for D = {stated.astype(int).tolist()}: {', '.join(wrong)} the other way"
-        require(not wrong, "input_signs", list(input_signs), expected)
-    expected = (
-        f"{actual.astype(int).tolist()}, the signs of the minors of C B; or flip "
-        f"{', '.join(wrong)} and keep D"
-    )
-    require(not wrong, "controller.D", stated.astype(int).tolist(), expected)
-    return np.asarray(actual)
-
-
-# Selection and assessment
-
-
 def select_gains(study: Study, setting: LoopSetting) -> Selection:
     """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering
     procedure.
@@ -264,9 +201,45 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     the largest abs(Omega_ii) of the samples. Raises ParameterError as `require_channels` does, and
     for parameters that the controller does not accept.
     """
-    airframe = study.airframe
-    inputs = list(airframe.inputs)
-    pairing = ChannelPairing(airframe.outputs, setting.inputs or tuple(inputs))
+    paired = _paired(study, setting)
+    limits = (
+        study.slew[paired.columns] / paired.unit,
+        setting.factor,
+        _by_name(setting.rate_limit, paired.channels.inputs, math.inf) / paired.unit,
+    )
+    controller = partial(_controller, setting, paired)
+
+    def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
+        selected = gain_conditions.engineering_gains(paired.bandwidth / lower, *limits, slower)
+        # both parts of the integral fall with the bandwidth
+        chosen = controller(*selected, slower * lower)
+        return Candidate(chosen, linear_loop(chosen, study.airframe, study.A, study.B))
+
+    first = engineering(np.ones(len(paired.rows)), np.ones(len(paired.rows))).controller
+    chosen = first
+    if first.sampled_sign()[0] is Sign.SOFT:  # behind servos
+        rates = study.u_dot[:, 0][:, paired.columns]
+        chosen = within_requirement(engineering, setting.requirement, rates).controller
+    chosen = with_feedforward(chosen, study.airframe) if setting.feedforward else chosen
+    return Selection(study, setting, _literal(study, setting, paired), chosen)
+
+
+class _Paired(NamedTuple):
+    """The channels of a selection, the fastest first: (22) gives the last one the smallest K."""
+
+    channels: ChannelPairing
+    rows: list[int]  # of the outputs, in the airframe's order
+    columns: list[int]  # of the inputs
+    bandwidth: FloatArray  # (m,) rad/s, at the begin of the search
+    D: FloatArray  # (m,)
+    unit: FloatArray  # (m,) 1 / abs(Omega_ii)
+    spread: FloatArray  # (m,) largest abs(Omega_ii) of the samples
+
+
+def _paired(study: Study, setting: LoopSetting) -> _Paired:
+    """The channels of a study. Raises ParameterError as `require_channels`."""
+    inputs = list(study.airframe.inputs)
+    pairing = ChannelPairing(study.airframe.outputs, setting.inputs or tuple(inputs))
     require(
         sorted(pairing.inputs) == sorted(inputs),
         "inputs",
@@ -275,72 +248,52 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     )
     paired = [inputs.index(name) for name in pairing.inputs]
     Omega = study.Omega[:, paired]
-    slew = study.slew[paired]
     require_channels(Omega, pairing)
-    products = np.array(
-        [
-            setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT)
-            for name in pairing.outputs
-        ]
-    )
+    products = [
+        setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT)
+        for name in pairing.outputs
+    ]
     loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
-    bandwidth = gain_conditions.bandwidths(loop, products)
-    places = np.argsort(
-        -bandwidth, kind="stable"
-    ).tolist()  # the fastest first: (22) gives the last channel the smallest K
+    bandwidth = gain_conditions.bandwidths(loop, np.array(products))
+    rows = np.argsort(-bandwidth, kind="stable").tolist()
     channels = ChannelPairing(
-        tuple(pairing.outputs[i] for i in places),
-        tuple(pairing.inputs[i] for i in places),
+        tuple(pairing.outputs[i] for i in rows), tuple(pairing.inputs[i] for i in rows)
     )
-    columns = [paired[i] for i in places]
-    D = require_channels(Omega[np.ix_(places, places)], channels)
-    unit = 1.0 / np.abs(np.diag(Omega))[places]
-    rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
-    spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
+    columns = [paired[i] for i in rows]
+    responses = np.einsum("Nii->Ni", (study.C @ study.B)[:, rows][..., columns])
+    return _Paired(
+        channels,
+        rows,
+        columns,
+        bandwidth[rows],
+        require_channels(Omega[np.ix_(rows, rows)], channels),
+        1.0 / np.abs(np.diag(Omega))[rows],
+        np.abs(responses).max(axis=0),
+    )
 
-    controller = partial(_controller, setting, channels, D, unit, spread)
 
-    def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
-        limits = slew[places] / unit, setting.factor, rate_limit / unit
-        selected = gain_conditions.engineering_gains(bandwidth[places] / lower, *limits, slower)
-        chosen = controller(
-            *selected, slower * lower
-        )  # both parts of the integral fall with the bandwidth
-        return Candidate(chosen, linear_loop(chosen, airframe, study.A, study.B))
-
-    ones = np.ones(len(places))
-    bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
+def _literal(study: Study, setting: LoopSetting, paired: _Paired) -> RiseDiConfig:
+    """The gain set of Theorem 1."""
+    ones = np.ones(len(paired.rows))
+    bounds, *_ = _bounds(
+        study, paired.rows, paired.columns, paired.unit, paired.D, ones, setting.gamma_2
+    )
     sufficient = gain_conditions.theorem_gains(bounds, ones)
-    first = engineering(ones, ones)
     # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the
     # f16 of JSBSim.
+    rows = (sufficient.k_d, sufficient.Lambda, sufficient.beta)
     accepted = GainSet(
-        min(sufficient.k_g, LARGEST),
-        *(
-            np.minimum(values, LARGEST)
-            for values in (sufficient.k_d, sufficient.Lambda, sufficient.beta)
-        ),
+        min(sufficient.k_g, LARGEST), *(np.minimum(values, LARGEST) for values in rows)
     )
-    literal = controller(accepted, ones, ones).model_copy(
-        update={"k_g": float(sufficient.k_g)}
-        | {name: tuple(getattr(sufficient, name).tolist()) for name in ("k_d", "Lambda", "beta")}
+    exact = {name: tuple(getattr(sufficient, name).tolist()) for name in GainSet._fields[1:]}
+    return _controller(setting, paired, accepted, ones, ones).model_copy(
+        update={"k_g": float(sufficient.k_g)} | exact
     )
-    behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
-    chosen = (
-        within_requirement(engineering, setting.requirement, study.u_dot[:, 0][:, columns])
-        if behind_servos
-        else first
-    ).controller
-    chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
-    return Selection(study, setting, literal, chosen)
 
 
 def _controller(
     setting: LoopSetting,
-    channels: ChannelPairing,
-    D: FloatArray,
-    unit: FloatArray,
-    spread: FloatArray,
+    paired: _Paired,
     gains: GainSet,
     response: FloatArray,
     slower: FloatArray,
@@ -348,7 +301,8 @@ def _controller(
     """The controller with gains; the integral is `slower`, and abs(Omega_ii) is `response` in the
     scaled inputs.
     """
-    scale = unit * response
+    channels = paired.channels
+    scale = paired.unit * response
     base_inputs = setting.base.inputs
     softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
     has_limits = set(channels.inputs) <= set(base_inputs)
@@ -361,9 +315,9 @@ def _controller(
         "k_d": gains.k_d.tolist(),
         "Lambda": gains.Lambda.tolist(),
         "beta": gains.beta.tolist(),
-        "D": D.astype(int).tolist(),
+        "D": paired.D.astype(int).tolist(),
         "input_scale": scale.tolist(),
-        "omega": (spread * scale).tolist(),
+        "omega": (paired.spread * scale).tolist(),
         "sign": "auto",
         "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
         "delay": setting.delay,
@@ -610,6 +564,3 @@ def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
 
 def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:
     return np.array([values.get(name, default) for name in names])
-
-
-# YAML

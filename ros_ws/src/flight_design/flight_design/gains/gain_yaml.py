@@ -134,6 +134,32 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering
     controller = assessed.controller
+    # else the observer of a learner, later
+    has_observer = controller.observer is not None and controller.observer.part > 0.0
+    engineering = "beside an observer" if has_observer else "by the engineering procedure"
+    comments = _comments(selection, controller)
+    if theorem:
+        comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
+    if has_observer:
+        unscaled = "units of u s / units of y; for a K of (22) that is above 1"
+        comments |= {
+            "Lambda": "1/s",
+            "beta": "units of y / s^2",
+            "omega": "abs(Omega_ii) in scaled inputs",
+            "input_scale": unscaled,
+        }
+    return section_yaml(
+        controller,
+        selection.study.airframe,
+        assessed.margins,
+        "by Theorem 1" if theorem else engineering,
+        comments,
+        assessed.unmet,
+    )
+
+
+def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
+    """Unit and reason of each parameter of the engineering gains."""
     study = selection.study
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
@@ -141,7 +167,7 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     K = _listed(params.K)
     bandwidth = _listed(params.K * responses)
     slew = _listed(study.slew[columns] / params.input_scale)
-    comments = {
+    return {
         "rate": "Hz",
         "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
         "inputs": "",
@@ -160,29 +186,6 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags: wider for the phase margin",
     }
-    if theorem:
-        comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
-    has_observer = (
-        controller.observer is not None and controller.observer.part > 0.0
-    )  # else the observer of a learner, later
-    if has_observer:
-        unscaled = "units of u s / units of y; for a K of (22) that is above 1"
-        comments |= {
-            "Lambda": "1/s",
-            "beta": "units of y / s^2",
-            "omega": "abs(Omega_ii) in scaled inputs",
-            "input_scale": unscaled,
-        }
-    origin = (
-        "by Theorem 1"
-        if theorem
-        else "beside an observer"
-        if has_observer
-        else "by the engineering procedure"
-    )
-    return section_yaml(
-        controller, study.airframe, assessed.margins, origin, comments, assessed.unmet
-    )
 
 
 def section_yaml(

@@ -148,10 +148,53 @@ def study_airframe(
     # The last column is the nominal airframe without gusts: their speed is 0 there.
     A = np.concatenate([A, A[:1]])
     B = np.concatenate([B, B[:1]])
-    aircraft = _columns(airframe, manoeuvre.gusts, len(A))
+    u_dot = _ideal_rates(_ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe))
+    undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
+    return Study(
+        airframe,
+        A[:-1],
+        B[:-1],
+        airframe.matrix_c(),
+        airframe.matrix_gravity(),
+        u_dot[:, :-1],
+        slew,
+        undisturbed,
+        stable,
+        uncertainty,
+    )
+
+
+class _IdealPlant(NamedTuple):
+    """N aircraft with y held on y_m: eta_dot = project (A x + f) + follow y_m_dot."""
+
+    A: FloatArray  # (N, n, n)
+    B: FloatArray  # (N, n, m)
+    C: FloatArray  # (m, n)
+    inverse: FloatArray  # (N, m, m) Omega^-1
+    project: FloatArray  # (N, n - m, n)
+    follow: FloatArray  # (N, n - m, m)
+    aircraft: Aircraft  # with f
+    P: FloatArray  # (n, m)
+    N: FloatArray  # (n, n - m)
+
+    def state(self, y_m: FloatArray, eta: FloatArray) -> FloatArray:
+        """X = P y_m + N eta, (n, N)."""
+        return np.asarray((self.P @ y_m)[:, None] + self.N @ eta)
+
+    def drift(self, t: Any, x: FloatArray) -> FloatArray:
+        """A x + f, (n, N)."""
+        return np.asarray(_times(self.A, x) + dynamics.f(t, x, self.aircraft))
+
+
+def _times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
+
+
+def _ideal_plant(
+    airframe: Airframe, manoeuvre: Manoeuvre, A: FloatArray, B: FloatArray
+) -> _IdealPlant:
+    """The plants of a study. Raises ParameterError for a singular Omega."""
     C = airframe.matrix_c()
-    n = len(airframe.states)
-    m = len(airframe.outputs)
     P, N, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
     require(
@@ -161,51 +204,42 @@ def study_airframe(
         "inputs that move all outputs",
     )
     inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
-    project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
-    follow = H.T @ B @ inverse
-    y_m, y_m_dot, y_m_ddot = _references(manoeuvre, airframe)
+    project = np.asarray(H.T @ (np.eye(len(P)) - B @ inverse @ C), dtype=np.float64)
+    follow = np.asarray(H.T @ B @ inverse)
+    aircraft = _columns(airframe, manoeuvre.gusts, len(A))
+    return _IdealPlant(A, B, C, inverse, project, follow, aircraft, P, N)
 
-    def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
 
-    def state(k: int, eta: FloatArray) -> FloatArray:
-        return np.asarray((P @ y_m[k])[:, None] + N @ eta)
-
-    def drift(t: Any, x: FloatArray) -> FloatArray:
-        return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
+def _ideal_rates(
+    plant: _IdealPlant, references: tuple[FloatArray, FloatArray, FloatArray]
+) -> FloatArray:
+    """u*_dot at the steps, (T, N, m)."""
+    y_m, y_m_dot, y_m_ddot = references
 
     def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
         k = round(2.0 * t / STEP)
-        return times(project, drift(t, state(k, eta))) + (follow @ y_m_dot[k]).T
+        moved = plant.drift(t, plant.state(y_m[k], eta))
+        return _times(plant.project, moved) + (plant.follow @ y_m_dot[k]).T
 
     steps = (len(y_m) - 1) // 2
-    eta = np.zeros((n - m, len(A)))
-    u_dot = np.zeros((steps + 1, len(A), m))
+    hidden = plant.N.shape[1]
+    eta = np.zeros((hidden, len(plant.A)))
+    u_dot = np.zeros((steps + 1, len(plant.A), len(plant.C)))
     near = 1e-5
     for k in range(steps + 1):
         t = k * STEP
-        x = state(2 * k, eta)
-        free = drift(t, x)
-        u = times(inverse, np.asarray(y_m_dot[2 * k][:, None] - C @ free, dtype=np.float64))
-        x_dot = free + times(B, u)
-        ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
-        drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
-        u_dot[k] = times(inverse, y_m_ddot[2 * k][:, None] - C @ drift_dot).T
-        if k < steps and n > m:
+        x = plant.state(y_m[2 * k], eta)
+        free = plant.drift(t, x)
+        driven = np.asarray(y_m_dot[2 * k][:, None] - plant.C @ free, dtype=np.float64)
+        x_dot = free + _times(plant.B, _times(plant.inverse, driven))
+        ahead, behind = (
+            dynamics.f(t + step, x + step * x_dot, plant.aircraft) for step in (near, -near)
+        )
+        drift_dot: FloatArray = _times(plant.A, x_dot) + (ahead - behind) / (2.0 * near)
+        u_dot[k] = _times(plant.inverse, y_m_ddot[2 * k][:, None] - plant.C @ drift_dot).T
+        if k < steps and hidden:
             eta = rk4(eta_dot, t, eta, None, None, STEP)
-    undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
-    return Study(
-        airframe,
-        A[:-1],
-        B[:-1],
-        C,
-        airframe.matrix_gravity(),
-        u_dot[:, :-1],
-        slew,
-        undisturbed,
-        stable,
-        uncertainty,
-    )
+    return u_dot
 
 
 def _references(

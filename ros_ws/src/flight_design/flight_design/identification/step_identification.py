@@ -41,11 +41,12 @@ from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.channel_signs import require_channels
 from flight_design.gains.gain_selection import LoopSetting, Selection
 from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
 from flight_design.gains.nominal import sizes
+from flight_design.gains.observer_gains import gains_beside_sketch
 from flight_design.gains.observer_selection import (
-    gains_beside_sketch,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
@@ -410,7 +411,7 @@ def identify(
     commands = reference_parameters(speed, float(authority))
     scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     try:
-        gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
+        require_channels(scaled, ChannelPairing(outputs, inputs))
     except ParameterError as error:
         weak = _too_weak(measured.Omega, trim, outputs, inputs)
         raise ParameterError(f"{error}{weak}") from None

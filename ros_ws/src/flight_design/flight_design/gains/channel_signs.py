@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The signs D of a pairing of inputs and outputs, checked against Omega = C B."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import FloatArray
+from flight_design.gains.ideal_control import ChannelPairing
+from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
+
+MAX_COUPLING = 10.0
+"""Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the
+`osprey` with aileron and rudder swapped, 13.6 on the first edition's Aerosonde, which neither
+procedure stabilises behind servos, and at most 2.2 on the other airframes of the library."""
+
+
+def require_channels(
+    Omega: FloatArray,
+    channels: ChannelPairing,
+    D: Sequence[int] | None = None,
+    input_signs: Sequence[int] | None = None,
+) -> FloatArray:
+    """D of a pairing of channels, shape (m,). Raises ParameterError with the contradiction to Omega
+    and a choice that fits.
+
+    Omega = C B in the order of the channels, (m, m), with the airframe's signs of the inputs.
+    `input_signs` are -1 for an input whose sign is flipped between law and airframe; this flips D_k
+    and nothing else. The checks, in this order: the pairing has a D and max abs(U - I) at most 10;
+    the input signs fit the D given; D fits.
+    """
+    m = len(Omega)
+    flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
+    try:
+        largest = coupling(Omega)
+        problem = f"max abs(U - I) = {largest:.3g}" if largest > MAX_COUPLING else ""
+    except DecompositionError as error:
+        problem = f"no D, for leading minor {error.minor} is zero"
+    if problem:
+        named = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
+        fits = (
+            "inputs that can be paired: "
+            f"{'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
+        )
+        if better := search(Omega, MAX_COUPLING):
+            pairs = (
+                f"{channels.outputs[i]}-{channels.inputs[j]}"
+                for i, j in zip(*better[:2], strict=True)
+            )
+            fits = f"another pairing: {', '.join(pairs)}"
+        raise ParameterError(f"controller.inputs: found {named} with {problem}, expected {fits}")
+    actual = signs(Omega) * flips
+    stated = actual if D is None else np.array(D, dtype=np.float64)
+    wrong = [name for name, a, b in zip(channels.inputs, actual, stated, strict=True) if a != b]
+    if input_signs is not None:
+        fit = (flips * actual * stated).astype(int).tolist()
+        expected = f"{fit} for D = {stated.astype(int).tolist()}: {', '.join(wrong)} the other way"
+        require(not wrong, "input_signs", list(input_signs), expected)
+    expected = (
+        f"{actual.astype(int).tolist()}, the signs of the minors of C B; or flip "
+        f"{', '.join(wrong)} and keep D"
+    )
+    require(not wrong, "controller.D", stated.astype(int).tolist(), expected)
+    return np.asarray(actual)

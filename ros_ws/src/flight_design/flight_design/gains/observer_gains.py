@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of the law beside an observer, with the weights of the observer: by a rule, beside a
+sketch, and of a search.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.turbulence import MODERATE, dryden
+from control_laws.nominal_model import NominalModel
+from control_laws.observer_design import Weights
+from flight_core.vectors import FloatArray
+
+SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
+
+
+class ObserverGains(NamedTuple):
+    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer; the
+    law's order.
+    """
+
+    K: FloatArray  # (m,) 1/s
+    Lambda: FloatArray  # (m,) 1/s
+    beta: FloatArray  # (m,) units of y / s^2
+    softening: FloatArray  # (m,) total lags
+    weights: Weights
+
+
+def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
+    """Gains from the lags of the loop, as a start: they were found on the `osprey` and scale with
+    the total lag T.
+
+        effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
+        wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
+        beta = K / T, and a softened sign of 3 T: eps is 3 units of y / s times T
+
+    Arguments: `axes` of the wind in the order of the model's columns; `speed` V0, m/s.
+    """
+    T = model.total_lag
+    spectrum = dryden(**MODERATE, sigma=0.0)
+    order = {"longitudinal": 0, "lateral": 1, "vertical": 2}
+    places = [order[axis] for axis in axes]
+    length = spectrum.length[places]
+    sigma = spectrum.sigma[places]
+    gust = 0.12 * sigma * np.sqrt(2.0 * speed / length)
+    weights = Weights(0.38 * T, 0.4 * 0.035 / T, gust, 17.0 * length / speed, np.array([0.0036]))
+    K = 0.026 / T
+    return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), weights)
+
+
+BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
+"""Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the
+737 of JSBSim: the law of the rates keeps two thirds of its bandwidth, because a sketch leaves out
+more than a model does."""
+
+
+def gains_beside_sketch(
+    model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
+) -> ObserverGains:
+    """Gains from the lags for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
+    by_rule = gains_by_rule(model, axes, speed)
+    airspeed = [name == "V" for name in outputs]
+    effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
+    weights = by_rule.weights._replace(effort=effort * by_rule.weights.effort)
+    return by_rule._replace(
+        K=K * by_rule.K, Lambda=K * by_rule.Lambda, beta=K * by_rule.beta, weights=weights
+    )
+
+
+def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
+    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the
+    total lag, (m,), s.
+
+    PI with K and Lambda is RISE-DI inside its softened sign with the same K, SHARE Lambda, and 1 /
+    (softening T) of the rest.
+    """
+    values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
+    weights = Weights(**{name: values[name] for name in Weights._fields})
+    K = values["K"]
+    Lambda = values["Lambda"]
+    if "beta" in values:
+        return ObserverGains(
+            K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights
+        )
+    return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
