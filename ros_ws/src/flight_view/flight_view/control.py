@@ -301,6 +301,8 @@ class Control:
                 "axes": axes,
             }
             shown["faults"] = self._faults
+        if scenario is not None and scenario.guidance is not None and "guidance" in nodes:
+            shown["radius"] = math.ceil(scenario.guidance.least_radius())  # m, of an orbit
         if "bridge" in nodes:
             shown["bridge"] = {"map": self._map(), "sends": self._sends()}
         return shown
@@ -316,7 +318,14 @@ class Control:
         gains = []
         for name, base in gains_of(scenario.controller).items():
             values = list(_as_list(self._values.get(name, base)))
-            gains.append({"name": name, "values": values, "ranges": [*map(_range, _as_list(base))]})
+            gains.append(
+                {
+                    "name": name,
+                    "values": values,
+                    "ranges": [*map(_range, _as_list(base))],
+                    "channels": _channels_of(len(values), scenario.controller),
+                }
+            )
         return gains
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
@@ -489,6 +498,18 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
     ]
     values = {name: getattr(controller, name) for name in tunable}
     return {name: value for name, value in values.items() if _is_numeric(value)}
+
+
+def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
+    """The names of the values of a gain: none of a single value, of several the outputs, the
+    outputs but the last as for `k_d`, or the inputs, else numbers from 1 on.
+    """
+    if count == 1:
+        return [""]
+    for names in (controller.outputs, controller.outputs[:-1], controller.inputs):
+        if len(names) == count:
+            return list(names)
+    return [f"[{k + 1}]" for k in range(count)]
 
 
 def _is_numeric(value: object) -> bool:

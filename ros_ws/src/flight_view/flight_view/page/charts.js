@@ -3,7 +3,10 @@ import {MODE_COLOURS, prepared} from "./canvas.js";
 import {ON_ROUTE} from "./scene.js";
 import {indexAt} from "./series.js";
 
-const LEFT = 58, RIGHT = 10, TOP = 17, BOTTOM = 4;
+const LEFT = 58, RIGHT = 10, LINE = 15, BOTTOM = 4;
+const NARROW = 500; // px, width below which the readouts have a line of their own
+const NOISE = 1e-4; // of the extent of a chart: a value below reads 0
+const RESOLUTION = {ms: 1e-3, deg: 1e-4, "m/s": 1e-4, m: 1e-3, "mrad/s": 1e-3, "rad/s": 1e-6}; // by unit, the least extent of a chart
 const LIMIT_VIEW_RATIO = 3; // a limit is in view where it is at most this many times the largest value
 
 // Ticks at multiples of 1, 2 or 5 times a power of ten, at most `most` of them.
@@ -11,11 +14,19 @@ export function ticks(low, high, most) {
   const raw = (high - low) / most, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map(digit => digit * power).find(one => one >= raw * 0.999);
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9)), found = [];
-  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push({value: k * step, text: (k * step).toFixed(digits)});
+  const text = value => (digits > 4 ? (value === 0 ? "0" : value.toExponential(1)) : value.toFixed(digits));
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push({value: k * step, text: text(k * step)});
   return found;
 }
 
-// Rows of a series to draw between two times: all, or the rows of the minimum and the maximum of each of `bins` bins.
+// A number as a readout: four digits, 0 below the noise of a chart of that extent, "-" without a value.
+export function readout(value, largest) {
+  if (!Number.isFinite(value)) return "-";
+  if (Math.abs(value) < NOISE * largest) return "0";
+  return Math.abs(value) >= 1e4 ? value.toFixed(0) : value.toPrecision(4);
+}
+
+// Rows of a series to draw between two times: all, or the rows of the minimum and the maximum of each of `bins` bins; a gap ends a bin.
 export function rows(series, column, [from, to], bins) {
   const first = Math.max(indexAt(series.t, series.count, from), 0), last = Math.min(indexAt(series.t, series.count, to) + 2, series.count);
   const width = Math.ceil((last - first) / bins), found = [];
@@ -23,6 +34,17 @@ export function rows(series, column, [from, to], bins) {
     for (let k = first; k < last; k++) found.push(k);
     return found;
   }
+  let next = first;
+  for (const before of series.gaps) {
+    if (before < first || before >= last - 1) continue;
+    binned(column, next, before + 1, width, found);
+    next = before + 1;
+  }
+  binned(column, next, last, width, found);
+  return found;
+}
+
+function binned(column, first, last, width, found) { // the rows of the minimum and the maximum of each bin
   for (let begin = first; begin < last; begin += width) {
     let low = begin, high = begin;
     for (let k = begin; k < Math.min(begin + width, last); k++) {
@@ -32,12 +54,30 @@ export function rows(series, column, [from, to], bins) {
     found.push(Math.min(low, high));
     if (low !== high) found.push(Math.max(low, high));
   }
-  return found;
 }
 
 function timed(flight, name) { // topics of the controller where it has engaged, else those of the aircraft
   const internals = flight.get("internals");
   return internals && internals.count && internals.column(name) ? ["internals", name] : [name.split(".")[0], name.split(".").slice(1).join(".")];
+}
+
+// The channels that a chart may show, "topic/channel".
+export function channelsOf(flight) {
+  return [...flight.series].flatMap(([topic, series]) => series.channels.map(channel => `${topic}/${channel}`)).sort();
+}
+
+const COLOURS = ["--plant", "--error", "--ghost", "--reference"];
+
+// A chart of channels that the user has chosen.
+export function chartOf(flight, channels) {
+  const {units} = flight.info;
+  const known = name => units[name.slice(name.indexOf("/") + 1).replace(/^(y|y_m|e|u|u_free|actuator)\./, "")] ?? {unit: "", factor: 1};
+  const [unit] = channels.map(name => known(name).unit);
+  const lines = channels.map((name, k) => {
+    const [topic, channel] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
+    return {flight, topic, channel, label: name, colour: COLOURS[k % COLOURS.length], width: 1.4, factor: known(name).unit === unit ? known(name).factor : 1};
+  });
+  return {title: channels.join(", "), unit: channels.every(name => known(name).unit === unit) ? unit : "", lines, channels};
 }
 
 // The charts of a flight, by what its log holds; `ghost` is the second flight or null.
@@ -130,24 +170,25 @@ function extent(chart, view, bins) { // the decimated lines, and the least and l
     if (Math.abs(bound) <= LIMIT_VIEW_RATIO * largest) { low = Math.min(low, bound); high = Math.max(high, bound); }
   }
   if (chart.band && chart.band <= 3 * largest) { low = Math.min(low, -chart.band); high = Math.max(high, chart.band); }
-  const pad = Math.max((high - low) * 0.08, Math.abs(high) * 1e-3, 1e-9);
+  const pad = Math.max((high - low) * 0.08, Math.abs(high) * 1e-3, RESOLUTION[chart.unit] ?? 1e-9);
   return {drawn, low: low - pad, high: high + pad};
 }
 
 export const timeAt = (canvas, x, [from, to]) => from + ((x - LEFT) / (canvas.clientWidth - LEFT - RIGHT)) * (to - from);
 
-// Draw one chart. `flight` gives the gusts; `selection` is a pair of times or null.
-export function drawChart(canvas, chart, flight, view, cursor, selection, colour) {
+// Draw one chart. `flight` gives the gusts; `selection` is a pair of times or null, `pointer` the time under the pointer or null.
+export function drawChart(canvas, chart, flight, view, cursor, {selection, pointer}, colour) {
   const {ctx, width, height} = prepared(canvas), [from, to] = view, right = width - RIGHT, bottom = height - BOTTOM;
+  const top = width < NARROW ? 2 * LINE + 2 : LINE + 2;
   const {drawn, low, high} = extent(chart, view, right - LEFT);
-  const x = t => LEFT + ((t - from) / (to - from)) * (right - LEFT), y = value => bottom - ((value - low) / (high - low)) * (bottom - TOP);
+  const x = t => LEFT + ((t - from) / (to - from)) * (right - LEFT), y = value => bottom - ((value - low) / (high - low)) * (bottom - top);
   ctx.font = "11px system-ui, sans-serif";
   ctx.save();
   ctx.beginPath();
-  ctx.rect(LEFT, TOP, right - LEFT, bottom - TOP);
+  ctx.rect(LEFT, top, right - LEFT, bottom - top);
   ctx.clip();
   ctx.fillStyle = colour("--gust");
-  for (const [, start, stop] of flight.info.gusts) ctx.fillRect(x(start), TOP, x(stop) - x(start), bottom - TOP);
+  for (const [, start, stop] of flight.info.gusts) ctx.fillRect(x(start), top, x(stop) - x(start), bottom - top);
   if (chart.band) {
     ctx.fillStyle = colour("--band");
     ctx.fillRect(LEFT, y(chart.band), right - LEFT, y(-chart.band) - y(chart.band));
@@ -156,7 +197,7 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
   ctx.lineWidth = 1;
   const marks = ticks(low, high, 5);
   for (const {value} of marks) stroke(ctx, [[LEFT, y(value)], [right, y(value)]]);
-  for (const {value} of ticks(from, to, Math.max(width / 110, 2))) stroke(ctx, [[x(value), TOP], [x(value), bottom]]);
+  for (const {value} of ticks(from, to, Math.max(width / 110, 2))) stroke(ctx, [[x(value), top], [x(value), bottom]]);
   ctx.strokeStyle = colour("--limit");
   ctx.setLineDash([6, 4]);
   for (const bound of chart.limits ?? []) stroke(ctx, [[LEFT, y(bound)], [right, y(bound)]]);
@@ -170,9 +211,11 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
     ctx.lineJoin = "round";
     ctx.setLineDash(line.dash ?? []);
     ctx.beginPath();
-    let pen = false;
+    let pen = false, before = chosen[0];
     for (const k of chosen) {
       const value = column[k] * line.factor;
+      if (series.hasGap(before, k)) pen = false;
+      before = k;
       if (!Number.isFinite(value)) { pen = false; continue; }
       if (pen && line.steps) ctx.lineTo(x(series.t[k]), y(column[k - 1] * line.factor));
       if (pen) ctx.lineTo(x(series.t[k]), y(value)); else ctx.moveTo(x(series.t[k]), y(value));
@@ -181,20 +224,25 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
     ctx.stroke();
   }
   ctx.setLineDash([]);
-  drawSaturation(ctx, chart, flight, view, x);
+  drawSaturation(ctx, chart, flight, view, x, top);
   if (selection) {
     ctx.fillStyle = colour("--gust");
-    ctx.fillRect(x(selection[0]), TOP, x(selection[1]) - x(selection[0]), bottom - TOP);
+    ctx.fillRect(x(selection[0]), top, x(selection[1]) - x(selection[0]), bottom - top);
   }
   ctx.strokeStyle = colour("--ink");
   ctx.lineWidth = 1;
-  stroke(ctx, [[x(cursor), TOP], [x(cursor), bottom]]);
+  stroke(ctx, [[x(cursor), top], [x(cursor), bottom]]);
+  if (pointer !== null) {
+    ctx.setLineDash([2, 3]);
+    stroke(ctx, [[x(pointer), top], [x(pointer), bottom]]);
+    ctx.setLineDash([]);
+  }
   ctx.restore();
   ctx.fillStyle = colour("--quiet");
   ctx.textAlign = "right";
   ctx.textBaseline = "middle";
   for (const {value, text} of marks) ctx.fillText(text, LEFT - 5, y(value));
-  drawTitle(ctx, chart, drawn, cursor, right, colour);
+  drawTitle(ctx, chart, drawn, [cursor, pointer], Math.max(Math.abs(low), Math.abs(high)), width, colour);
 }
 
 function drawLearned(ctx, line, series, column, chosen, x, y, end, colour) { // a value until the next identification; dashed where no model was proposed
@@ -216,36 +264,42 @@ function stroke(ctx, points) {
   ctx.stroke();
 }
 
-function drawSaturation(ctx, chart, flight, view, x) { // marks where the controller saturated the input
+function drawSaturation(ctx, chart, flight, view, x, top) { // marks where the controller saturated the input
   const series = flight.get("internals"), column = chart.saturation && series?.column(chart.saturation);
   if (!column) return;
   for (const k of rows(series, column, view, 2000)) {
     if (!(column[k] > 0)) continue;
     ctx.fillStyle = column[k] === 1 ? "#d62728" : "#8a63b8";
-    ctx.fillRect(x(series.t[k]) - 0.5, TOP, 2, 4);
+    ctx.fillRect(x(series.t[k]) - 0.5, top, 2, 4);
   }
 }
 
-function drawTitle(ctx, chart, drawn, cursor, right, colour) { // the title, and the value of each line at the cursor
+// The title, and the values of each line: at the cursor, and at the pointer where there is one.
+function drawTitle(ctx, chart, drawn, [cursor, pointer], largest, width, colour) {
   ctx.textAlign = "left";
   ctx.textBaseline = "alphabetic";
   ctx.fillStyle = colour("--ink");
   ctx.font = "600 11px system-ui, sans-serif";
   const title = chart.unit ? `${chart.title} (${chart.unit})` : chart.title;
-  ctx.fillText(title, LEFT, TOP - 5);
+  const narrow = width < NARROW, level = narrow ? 2 * LINE - 3 : LINE - 3, size = ctx.measureText(title).width;
+  ctx.fillText(title, LEFT, LINE - 3);
   ctx.font = "11px system-ui, sans-serif";
-  ctx.textAlign = "right";
-  let place = right;
-  for (const {line, series} of [...drawn].reverse()) {
-    const value = series.at(line.channel, cursor) * line.factor;
+  const texts = drawn.map(({line, series}) => {
+    const at = t => readout(series.shown(line.channel, t) * line.factor, largest);
     const spread = line.deviation ? ` +- ${(2 * series.at(line.deviation, cursor)).toPrecision(2)}` : "";
-    const text = `${line.label} ${Number.isFinite(value) ? value.toPrecision(4) + spread : "-"}`, size = ctx.measureText(text).width;
-    if (place - size < LEFT + 170) break;
+    return `${line.label} ${at(cursor)}${spread}${pointer === null ? "" : ` | ${at(pointer)}`}`;
+  });
+  const wide = texts.reduce((sum, text) => sum + ctx.measureText(text).width + 22, 0);
+  const scale = Math.min(1, (width - RIGHT - (narrow ? 0 : LEFT + size + 8)) / wide); // closer letters where the values need more
+  ctx.textAlign = "right";
+  let place = width - RIGHT;
+  for (const [k, text] of [...texts.entries()].reverse()) {
+    const long = ctx.measureText(text).width * scale;
     ctx.fillStyle = colour("--ink");
-    ctx.fillText(text, place, TOP - 5);
-    ctx.fillStyle = colour(line.colour);
-    ctx.fillRect(place - size - 12, TOP - 10, 8, 4);
-    place -= size + 22;
+    ctx.fillText(text, place, level, long);
+    ctx.fillStyle = colour(drawn[k].line.colour);
+    ctx.fillRect(place - long - 12 * scale, level - 5, 8 * scale, 4);
+    place -= long + 22 * scale;
   }
 }
 

@@ -1,4 +1,4 @@
-// Control of the flight: a pending list of gains, targets, the bridge, faults. Nothing is sent before a button is pressed.
+// Control of the flight: a pending list of gains, targets, the bridge, faults. A button, or a click on the map, sends.
 import {HEADERS} from "./data.js";
 
 const RENEW = 1500; // ms; the lease lasts 5 s
@@ -9,7 +9,7 @@ const KINDS = ["stuck", "lost", "failed", "weak", "slow", "loose", "hard_over up
 const DEGREE = Math.PI / 180;
 
 const $ = id => document.getElementById(id);
-let lease = "", key = "", state = null, margins = null, timer = 0, checking = 0;
+let lease = "", key = "", state = null, offered = false, margins = null, timer = 0, checking = 0;
 const pending = new Map(); // by gain: its values
 
 async function send(request) {
@@ -36,15 +36,16 @@ async function act(request, done) {
 }
 
 // What the desk is built from: nodes start and end, and the log has the axes of the wind from its first sample of truth on.
-const offered = found => found && JSON.stringify([found.nodes, Boolean(found.gains), found.aircraft, found.bridge]);
+const desk = found => found && JSON.stringify([found.nodes, Boolean(found.gains), found.aircraft, found.bridge]);
 
 function take(found) {
-  const changed = offered(state) !== offered(found);
+  const changed = desk(state) !== desk(found);
   lease = found.lease;
   state = found;
   $("control-key").hidden = true;
-  $("control-desk").hidden = false;
+  for (const id of ["control", "control-desk"]) $(id).hidden = false;
   if (changed) build();
+  showPilot();
   show();
 }
 
@@ -52,7 +53,28 @@ function stop() {
   clearInterval(timer);
   state = null;
   $("control-key").hidden = false;
-  $("control-desk").hidden = true;
+  for (const id of ["control-desk", "pilot", "fly-to"]) $(id).hidden = true;
+}
+
+const has = name => Boolean(state?.nodes.includes(name));
+
+function showPilot() { // what a pilot needs at once, in the header
+  $("pilot").hidden = !["guidance", "controller", "bridge"].some(has);
+  $("pilot-hold").hidden = $("pilot-home").hidden = !has("guidance");
+  $("pilot-stop").hidden = !has("controller") && !has("bridge");
+  $("pilot-stop").textContent = has("bridge") ? "Disengage" : "Deactivate";
+  $("fly-to").hidden = !state.radius;
+}
+
+// A click on the map: the least orbit round a place, north and east in m.
+export function flyTo([north, east]) {
+  if (!state?.radius || $("fly-to").ariaPressed !== "true") return;
+  const place = {north: Math.round(north), east: Math.round(east)};
+  act({do: "target", values: {...place, radius: state.radius}}, `flies to north ${place.north} m, east ${place.east} m`);
+}
+
+export function togglesFlyTo() {
+  $("fly-to").addEventListener("click", () => { $("fly-to").ariaPressed = $("fly-to").ariaPressed !== "true"; });
 }
 
 function say(text, refused) {
@@ -78,7 +100,7 @@ function build() {
   const parts = [];
   if (state.gains) parts.push(gains());
   if (state.nodes.includes("controller") && !state.nodes.includes("bridge")) {
-    parts.push(row("Controller", button("Deactivate", () => act({do: "deactivate"}, "deactivated")), button("Activate", () => act({do: "activate"}, "activated"))));
+    parts.push(row("Controller", button("Activate", () => act({do: "activate"}, "activated"))));
   }
   if (state.nodes.includes("bridge")) parts.push(bridge());
   if (state.nodes.includes("guidance")) parts.push(guidance());
@@ -91,15 +113,14 @@ const row = (label, ...nodes) => element("div", {className: "row"}, element("b",
 
 function gains() {
   const body = element("tbody", {id: "control-gains"});
-  for (const {name, values, ranges} of state.gains) {
+  for (const {name, values, ranges, channels} of state.gains) {
     values.forEach((_, k) => {
-      const [low, high] = ranges[k];
+      const [low, high] = ranges[k], label = [name, channels[k]].filter(Boolean).join(" ");
       const slider = element("input", {type: "range", min: low, max: high, step: "any", disabled: low === high});
-      slider.setAttribute("aria-label", `${name} ${values.length > 1 ? k + 1 : ""}`);
+      slider.setAttribute("aria-label", label);
       slider.dataset.gain = name;
       slider.dataset.place = k;
       slider.addEventListener("input", () => change(name, k, Number(slider.value)));
-      const label = values.length > 1 ? `${name} [${k + 1}]` : name;
       body.append(element("tr", {}, element("td", {textContent: label}), element("td", {}, slider), element("td"), element("td")));
     });
   }
@@ -149,7 +170,7 @@ function bridge() {
   let held = 0;
   hold.addEventListener("pointerdown", () => { held = setTimeout(() => act({do: "engage", map: name.value}, "engaged"), HOLD); });
   for (const kind of ["pointerup", "pointerleave", "pointercancel"]) hold.addEventListener(kind, () => clearTimeout(held));
-  return row(`Bridge ${state.bridge.map}${state.bridge.sends ? "" : " (dry run)"}`, button("Disengage", () => act({do: "disengage"}, "disengaged")), name, hold);
+  return row(`Bridge ${state.bridge.map}${state.bridge.sends ? "" : " (dry run)"}`, name, hold);
 }
 
 function guidance() {
@@ -173,8 +194,8 @@ function guidance() {
   const fly = () => act({do: "route", points: route.value.trim().split(/\n+/).map(line => line.trim().split(/[\s,;]+/).map(Number))}, "sent; the events say if guidance refuses it");
   return element("details", {open: true}, element("summary", {textContent: "Guidance"}),
     element("div", {className: "row"}, choice, value, button("Add", add), listed, button("Command", command, {id: "control-command"})),
-    element("div", {className: "row"}, button("Hold", () => act({do: "hold"}, "holds")), button("Skip waypoint", () => act({do: "skip"}, "skips the waypoint ahead")),
-      button("Resume route", () => act({do: "resume"}, "resumes the last leg")), button("Home", () => act({do: "home"}, "flies home"))),
+    element("div", {className: "row"}, button("Skip waypoint", () => act({do: "skip"}, "skips the waypoint ahead")),
+      button("Resume route", () => act({do: "resume"}, "resumes the last leg"))),
     route, element("div", {className: "row"}, button("Fly this route", fly)));
 }
 
@@ -250,8 +271,12 @@ function show() {
 
 // Offer control where the server has it.
 export function offer() {
-  if (!$("control").hidden) return;
-  $("control").hidden = false;
+  if (offered) return;
+  offered = true;
+  $("control-key").hidden = false;
+  $("pilot-hold").addEventListener("click", () => act({do: "hold"}, "holds"));
+  $("pilot-home").addEventListener("click", () => act({do: "home"}, "flies home"));
+  $("pilot-stop").addEventListener("click", () => (has("bridge") ? act({do: "disengage"}, "disengaged") : act({do: "deactivate"}, "deactivated")));
   const begin = async () => {
     key = $("control-typed").value;
     if (!(await act({do: "state"}, ""))) return;

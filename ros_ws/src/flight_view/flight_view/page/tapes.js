@@ -24,7 +24,7 @@ export function drawTape(canvas, {name, unit, value, command, span, right}, colo
   ctx.textAlign = "center";
   ctx.textBaseline = "middle";
   ctx.fillStyle = colour("--quiet");
-  ctx.fillText(`${name} (${unit})`, width / 2, 8);
+  ctx.fillText(`${name} (${unit})`, width / 2, 8, width);
   if (!Number.isFinite(value)) {
     ctx.fillText("-", width / 2, middle);
     return;

@@ -1,7 +1,8 @@
 // The page: asks the server for news, keeps the time and the view, draws what has changed.
 import {MODE_COLOURS} from "./canvas.js";
 import {chartsOf, drawChart, drawTimeline, timeAt, timelineTime} from "./charts.js";
-import {offer} from "./control.js";
+import * as choice from "./choice.js";
+import {flyTo, offer, togglesFlyTo} from "./control.js";
 import {Flight} from "./data.js";
 import {drawHorizon, poseAt, Scene} from "./scene.js";
 import {indexAt} from "./series.js";
@@ -12,6 +13,7 @@ const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const WINDOW = 20; // s
 const SILENT = 1000; // ms without a sample after which a recording says "no data"
 const RETRY = 500; // ms between two requests to a server that does not answer
+const FAILSAFES = {"": ["HOLD", "RAMP", "TRIM"], mode: ["DEAD_RECKONING", "POSE_LOST"]}; // modes of the controller and of guidance
 const HEADINGS = {HEADING: "target.heading", COURSE: "target.course"}; // what the heading tape shows as the command
 const SPANS = {speed: 0.5, height: 200}; // of the tapes: of the airspeed itself, and of the altitude, m
 const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
@@ -25,7 +27,7 @@ let ghost = null, fleet = null, charts = [], chartKey = "", colours = {}, dirty 
 const clock = {t: 0, playing: false, speed: 1, live: true, started: false};
 const view = {kind: "window", from: 0, to: WINDOW};
 const link = {serving: false, refusal: "", samples: 0}; // the server answers; why it refuses; when, in ms, the last answer with samples came
-const scene = new Scene($("scene"), redraw);
+const scene = new Scene($("scene"), redraw, flyTo);
 let cameraChosen = false; // by the user; until then a guided flight shows its map
 
 // ---- Colours of the scheme
@@ -192,13 +194,14 @@ function currentView() {
   if (view.kind === "zoom") return [view.from, view.to];
   if (view.kind === "whole") return [begin(), Math.max(end(), begin() + 1)];
   const to = clock.live ? clock.t : Math.min(clock.t + WINDOW / 4, Math.max(end(), clock.t));
-  return [to - WINDOW, to];
+  const from = Math.max(to - WINDOW, Math.min(begin(), clock.t));
+  return [from, Math.max(to, from + 1)];
 }
 
 // ---- Charts
 
 function arrange() { // one canvas for each chart, when what the log holds has changed
-  const found = chartsOf(flight, ghost), key = found.map(chart => `${chart.title} ${chart.unit}`).join("\n");
+  const found = choice.chosen(flight, chartsOf(flight, ghost)), key = found.map(chart => `${chart.title} ${chart.unit}`).join("\n");
   charts = found.map((chart, k) => ({...chart, canvas: charts[k]?.canvas}));
   if (key === chartKey) return;
   chartKey = key;
@@ -211,12 +214,15 @@ function arrange() { // one canvas for each chart, when what the log holds has c
   }));
 }
 
-let selection = null;
+let selection = null, pointer = null; // a pair of times; the time under the pointer
 function listen(canvas) { // a click seeks, a drag zooms all charts, a double click zooms out, the wheel zooms about the pointer
   let start = null;
   const at = event => timeAt(canvas, event.clientX - canvas.getBoundingClientRect().left, currentView());
   canvas.addEventListener("pointerdown", event => { start = [event.clientX, at(event)]; canvas.setPointerCapture(event.pointerId); });
   canvas.addEventListener("pointermove", event => {
+    const [from, to] = currentView(), t = at(event);
+    pointer = t >= from && t <= to ? t : null;
+    redraw();
     if (start && Math.abs(event.clientX - start[0]) > 4) { selection = [start[1], at(event)].sort((a, b) => a - b); redraw(); }
   });
   canvas.addEventListener("pointerup", event => {
@@ -224,6 +230,7 @@ function listen(canvas) { // a click seeks, a drag zooms all charts, a double cl
     else if (start) { clock.playing = false; seek(at(event)); }
     start = selection = null;
   });
+  canvas.addEventListener("pointerleave", () => { pointer = null; redraw(); });
   canvas.addEventListener("pointercancel", () => { start = selection = null; });
   canvas.addEventListener("dblclick", () => setView(clock.live ? "window" : "whole"));
   canvas.addEventListener("wheel", event => {
@@ -252,20 +259,27 @@ function drawState() {
   badge.className = `badge ${BADGES[now]}`;
   text($("name"), ghost ? `${flight.info.name} and ghost ${ghost.info.name}` : flight.info.name);
   document.title = `${now === "ENDED" ? "" : `${now}: `}${flight.info.name}`;
-  const mode = flight.get("internals")?.at("mode", clock.t);
-  text($("mode"), Number.isFinite(mode) ? flight.info.modes[""]?.[mode] ?? `mode ${mode}` : "");
-  $("mode").style.background = MODE_COLOURS[mode] ?? "";
-  text($("time"), `t = ${clock.t.toFixed(2)} s`);
+  drawMode();
+  text($("time"), `t = ${clock.t.toFixed(2)} s${pointer === null ? "" : ` | ${pointer.toFixed(2)} s, ${(pointer - clock.t).toFixed(2)} s on`}`);
   const sentences = [link.refusal, ...faults, ...(ghost?.head.faults ?? []).map(one => `ghost: ${one}`)].filter(Boolean);
   $("notes").hidden = sentences.length === 0;
   if (list($("notes").lastElementChild, sentences)) text($("notes").firstElementChild, `${sentences.length} notes on the log`);
   for (const [id, on] of [["live", clock.live], ["window", view.kind === "window"], ["whole", view.kind === "whole"]]) $(id).setAttribute("aria-pressed", on);
-  for (const button of $("cameras").children) button.setAttribute("aria-pressed", button.dataset.camera === scene.mode);
+  for (const button of $("cameras").querySelectorAll("[data-camera]")) button.setAttribute("aria-pressed", button.dataset.camera === scene.mode);
   text($("play"), clock.playing ? "Pause" : "Play");
   text($("legend"), scene.legend ?? "");
   drawReadouts();
   drawEvents();
   drawModels();
+}
+
+function drawMode() { // large; the header flashes when a failsafe begins
+  const mode = flight.get("internals")?.at("mode", clock.t), name = Number.isFinite(mode) ? flight.info.modes[""]?.[mode] ?? `mode ${mode}` : "";
+  const guidance = named("mode", flight.get("guidance")), failsafe = FAILSAFES.mode.includes(guidance);
+  text($("mode"), failsafe ? `${name} ${guidance.replace("_", " ")}`.trim() : name);
+  $("mode").style.background = MODE_COLOURS[mode] ?? "";
+  $("mode").dataset.dark = [0, 2].includes(mode) ? "no" : "yes";
+  document.body.classList.toggle("alarm", failsafe || FAILSAFES[""].includes(name));
 }
 
 function list(node, lines) {
@@ -376,7 +390,7 @@ function frame(now) {
     const shown = currentView();
     for (const chart of charts) {
       const {top, bottom} = chart.canvas.getBoundingClientRect();
-      if (bottom > 0 && top < innerHeight) drawChart(chart.canvas, chart, flight, shown, clock.t, selection, colour);
+      if (bottom > 0 && top < innerHeight) drawChart(chart.canvas, chart, flight, shown, clock.t, {selection, pointer}, colour);
     }
     drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour);
     document.body.dataset.drawn = Number(document.body.dataset.drawn ?? 0) + 1;
@@ -405,6 +419,8 @@ function start() {
   $("units").addEventListener("change", () => setUnits($("units").value));
   if (kept in UNITS) setUnits(kept);
   $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) setCamera(target.dataset.camera); });
+  togglesFlyTo();
+  choice.begin(redraw);
   addEventListener("keydown", event => {
     const action = ACTIONS[event.key];
     if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select, input, textarea") || (event.key === " " && event.target.closest("button"))) return;

@@ -9,6 +9,9 @@ const SCALE_BAR = 120; // px, longest
 const BESIDE = 12; // px, of the number of a leg beside its place
 const ARROW = 26; // px, of the wind
 const MARGIN = 16; // px, of the marks in the corners
+const TEXT = 14; // px, height of a label with its space
+const FAR = 3; // times BESIDE, the farthest that a label lies from its place, and
+const FARTHEST = 10; // that of one that has to be drawn
 
 // The part of the world that shows the route, the fence and home of the first flight, and the paths of all: centre in m, px a metre.
 export function extentOf(flights, width, height) {
@@ -87,6 +90,44 @@ function mark(ctx, [x, y], text, fill, colour) { // a letter on a disc
   label(ctx, text, x, y, colour("--paper"), "center");
 }
 
+// The texts of a picture: each is drawn beside its place, where it covers no other text.
+export class Labels {
+  constructor(ctx) {
+    this.ctx = ctx;
+    this.taken = [];
+  }
+
+  take(x, y, width, height) {
+    this.taken.push([x, y, x + width, y + height]);
+  }
+
+  isFree([left, top, right, bottom]) {
+    return this.taken.every(([x, y, to, low]) => right <= x || left >= to || bottom <= y || top >= low);
+  }
+
+  // The centre of a free rectangle beside a place, from near to far; null without one.
+  centre([x, y], width, farthest) {
+    for (let distance = BESIDE; distance <= farthest * BESIDE; distance += BESIDE / 2) {
+      for (const [right, down] of [[1, -1], [1, 1], [-1, 1], [-1, -1], [0, -1], [0, 1], [1, 0], [-1, 0]]) {
+        const [at, level] = [x + right * (distance / 2 + width / 2), y + down * distance];
+        if (this.isFree([at - width / 2, level - TEXT / 2, at + width / 2, level + TEXT / 2])) return [at, level];
+      }
+    }
+    return null;
+  }
+
+  // A text beside a place; one that is `needed` is drawn on another text rather than left out.
+  add(text, place, fill, {needed = false, disc = null} = {}) {
+    this.ctx.font = "600 11px system-ui, sans-serif";
+    const width = Math.max(this.ctx.measureText(text).width + 4, disc ? 17 : 0);
+    const at = this.centre(place, width, needed ? FARTHEST : FAR) ?? (needed ? [place[0] + BESIDE, place[1] - BESIDE] : null);
+    if (!at) return;
+    this.take(at[0] - width / 2, at[1] - TEXT / 2, width, TEXT);
+    if (disc) mark(this.ctx, at, text, fill, disc);
+    else label(this.ctx, text, ...at, fill, "center");
+  }
+}
+
 export function label(ctx, text, x, y, fill, align) {
   ctx.fillStyle = fill;
   ctx.font = "600 11px system-ui, sans-serif";
@@ -97,7 +138,7 @@ export function label(ctx, text, x, y, fill, align) {
 }
 
 // Waypoints with their altitudes, and the numbers of the legs, those of `target leg=`; the leg that is flown is filled.
-export function drawMission(ctx, see, {waypoints = [], legs = []}, leg, units, colour) {
+export function drawMission(ctx, see, labels, {waypoints = [], legs = []}, leg, units, colour) {
   ctx.lineWidth = 1.5;
   ctx.strokeStyle = colour("--ink");
   for (const [north, east, altitude] of waypoints) {
@@ -107,13 +148,36 @@ export function drawMission(ctx, see, {waypoints = [], legs = []}, leg, units, c
     ctx.arc(x, y, 4, 0, 2 * Math.PI);
     ctx.fill();
     ctx.stroke();
-    label(ctx, `${(altitude * units.height.factor).toFixed(0)} ${units.height.unit}`, x + 8, y - 9, colour("--quiet"), "left");
+    labels.take(x - 5, y - 5, 10, 10);
   }
   for (const [number, north, east] of legs) {
-    const [x, y] = see([north, east]), beside = [x + BESIDE, y + BESIDE]; // home may be at the centre of a circle
-    if (number === leg) mark(ctx, beside, `${number}`, colour("--ink"), colour);
-    else label(ctx, `${number}`, ...beside, colour("--ink"), "center");
+    labels.add(`${number}`, see([north, east]), colour("--ink"), {needed: number === leg, disc: number === leg ? colour : null});
   }
+  for (const [north, east, altitude] of waypoints) {
+    labels.add(`${(altitude * units.height.factor).toFixed(0)} ${units.height.unit}`, see([north, east]), colour("--quiet"));
+  }
+}
+
+// The circle that is commanded: centre and radius in m.
+export function drawOrbit(ctx, see, {scale}, north, east, radius, colour) {
+  const [x, y] = see([north, east]);
+  ctx.strokeStyle = colour("--reference");
+  ctx.lineWidth = 2;
+  ctx.setLineDash([6, 4]);
+  ctx.beginPath();
+  ctx.arc(x, y, Math.abs(radius) * scale, 0, 2 * Math.PI);
+  ctx.moveTo(x - 5, y);
+  ctx.lineTo(x + 5, y);
+  ctx.moveTo(x, y - 5);
+  ctx.lineTo(x, y + 5);
+  ctx.stroke();
+  ctx.setLineDash([]);
+}
+
+// Keep labels off the marks in the corners.
+export function takeMarks(labels, width, height) {
+  labels.take(0, 0, MARGIN + 190, MARGIN + 40);
+  labels.take(width - MARGIN - SCALE_BAR, height - MARGIN - 22, MARGIN + SCALE_BAR, MARGIN + 22);
 }
 
 // North, the scale and the wind, in the corners.

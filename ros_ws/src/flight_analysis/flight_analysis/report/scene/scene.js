@@ -1,7 +1,7 @@
 // The aircraft in three dimensions on a 2-D canvas, and the artificial horizon. No WebGL.
 // World: north, east, down (m). Body: forward, right, down. Angles in rad; matrices are rows.
 import {MODE_COLOURS, prepared} from "./canvas.js";
-import {drawGround, drawMarks, drawMission, extentOf, label, mapped, mapSpan} from "./map.js";
+import {drawGround, drawMarks, drawMission, drawOrbit, extentOf, Labels, mapped, mapSpan, takeMarks} from "./map.js";
 import {indexAt} from "./series.js";
 import {UNITS} from "./units.js";
 
@@ -14,8 +14,9 @@ const MAX_TRAIL = 1500; // points
 const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
 const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
 export const ON_ROUTE = 4; // flight_guidance.modes.Lateral.ROUTE
+const IN_ORBIT = 3; // flight_guidance.modes.Lateral.ORBIT
+const CLICK = 4; // px, that a pointer moves at most between down and up
 const MAX_WIND = 10; // m/s, drawn as one span
-const NAME_BESIDE = 14; // px, of the name of another aircraft
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -111,7 +112,8 @@ export function deflections(flight, t) {
 }
 
 export class Scene {
-  constructor(canvas, changed) {
+  // `clicked` takes a place on the map, north and east in m.
+  constructor(canvas, changed, clicked = () => {}) {
     this.canvas = canvas;
     this.mode = "chase";
     this.distance = 16; // m, of the camera
@@ -120,10 +122,15 @@ export class Scene {
     this.map = null; // of the map: centre, m, and px a metre; null shows everything
     this.shownMap = null; // as drawn last
     this.units = UNITS["m, m/s"];
-    let held = null;
-    canvas.addEventListener("pointerdown", event => { held = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); });
+    let held = null, pressed = null;
+    canvas.addEventListener("pointerdown", event => {
+      held = pressed = [event.clientX, event.clientY];
+      canvas.setPointerCapture(event.pointerId);
+    });
     canvas.addEventListener("pointermove", event => {
       if (!held) return;
+      if (pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) <= CLICK) return;
+      pressed = null;
       if (this.mode === "map" && this.shownMap) {
         const {centre, scale} = this.shownMap;
         this.map = {centre: [centre[0] + (event.clientY - held[1]) / scale, centre[1] - (event.clientX - held[0]) / scale], scale};
@@ -138,12 +145,20 @@ export class Scene {
       held = [event.clientX, event.clientY];
       changed();
     });
-    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, () => { held = null; });
+    canvas.addEventListener("pointerup", event => {
+      if (pressed && this.mode === "map" && this.shownMap) clicked(this.placeAt(event));
+    });
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, () => { held = pressed = null; });
     canvas.addEventListener("wheel", event => {
       event.preventDefault();
       this.zoom(Math.exp(event.deltaY * 0.0015));
       changed();
     }, {passive: false});
+  }
+
+  placeAt({clientX, clientY}) { // north and east of a point of the map, m
+    const {left, top, width, height} = this.canvas.getBoundingClientRect(), {centre, scale} = this.shownMap;
+    return [centre[0] - (clientY - top - height / 2) / scale, centre[1] + (clientX - left - width / 2) / scale];
   }
 
   show(mode) { // the map shows everything
@@ -186,14 +201,19 @@ export class Scene {
     this.route(ctx, see, flight, pose, colour);
     for (const beside of others) this.trail(ctx, see, beside.flight, Infinity, () => colour("--ghost"), 0.6);
     this.trail(ctx, see, flight, t, mode => MODE_COLOURS[mode] ?? colour("--plant"), 1);
+    const labels = new Labels(ctx);
+    if (map) takeMarks(labels, width, height);
     for (const beside of others) {
       const placed = poseAt(beside.flight, beside.t), at = placed && see(placed.place);
       if (!at) continue;
       this.aircraft(ctx, see, placed, deflections(beside.flight, beside.t), colour, beside.name ? 0.7 : 0.35);
-      label(ctx, beside.name, at[0] + NAME_BESIDE, at[1] - NAME_BESIDE, colour("--ghost"), "left");
+      labels.add(beside.name, at.slice(0, 2), colour("--ghost"), {needed: true});
     }
     const guidance = flight.get("guidance"), winds = ["wind.north", "wind.east"].map(name => guidance?.at(name, t) ?? NaN);
-    if (map) drawMission(ctx, see, flight.info, guidance?.at("mode.lateral", t) === ON_ROUTE ? guidance.at("leg", t) : -1, this.units, colour);
+    const lateral = guidance?.at("mode.lateral", t);
+    if (map) drawMission(ctx, see, labels, flight.info, lateral === ON_ROUTE ? guidance.at("leg", t) : -1, this.units, colour);
+    const orbit = ["north", "east", "radius"].map(name => guidance?.at(`target.${name}`, t) ?? NaN);
+    if (map && lateral === IN_ORBIT && orbit.every(Number.isFinite)) drawOrbit(ctx, see, this.shownMap, ...orbit, colour);
     this.aircraft(ctx, see, pose, deflections(flight, t), colour, 1);
     if (map) drawMarks(ctx, width, height, this.shownMap, winds.every(Number.isFinite) ? winds : null, this.units, colour);
     else this.wind(ctx, see, flight, pose, t, colour);
@@ -264,9 +284,15 @@ export class Scene {
     if (!pose || !pose.column("north")) return;
     const [north, east, altitude] = ["north", "east", "altitude"].map(name => pose.column(name));
     const now = indexAt(pose.t, pose.count, t), step = Math.max(1, Math.ceil(pose.count / MAX_TRAIL)), internals = flight.get("internals");
-    let before = null, key = "";
+    let before = null, key = "", last = 0;
     for (let k = 0; k < pose.count + step - 1; k += step) {
-      const row = Math.min(k, pose.count - 1), point = see([north[row], east[row], -(altitude?.[row] ?? 0)]);
+      const row = Math.min(k, pose.count - 1);
+      if (before && pose.hasGap?.(last, row)) {
+        ctx.stroke();
+        before = null;
+      }
+      last = row;
+      const point = see([north[row], east[row], -(altitude?.[row] ?? 0)]);
       const mode = internals ? internals.at("mode", pose.t[row]) : NaN, style = `${mode} ${row <= now}`;
       if (style !== key && before) ctx.stroke();
       if (style !== key || !point || !before) {
