@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "autopilots"
+EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
 

@@ -35,6 +35,7 @@ from xml.etree import ElementTree
 import numpy as np
 from benchmarks import evidence
 from benchmarks.autopilot_flights import (
+    EXAMPLE,
     FOLDER,
     REPOSITORY,
     arduplane,
@@ -43,6 +44,7 @@ from benchmarks.autopilot_flights import (
     px4,
     tracking,
 )
+from benchmarks.autopilot_probe import probe
 from benchmarks.autopilot_signs import TURBULENCE, counted, signs, signs_of_logs
 from benchmarks.tables import parser_of
 
@@ -61,7 +63,6 @@ from flight_log.tape_reader import read_run
 if TYPE_CHECKING:
     from tests.sitl.kit import Autopilot
 
-EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
@@ -407,6 +408,7 @@ MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "engagements": bumpless,
     "signs": signs,
     "pose": pose,
+    "probe": probe,
     "own_log": own_log,
     "releases": releases,
 }
@@ -449,6 +451,7 @@ GOALS: dict[str, dict[str, str]] = {
     "engagements": {"steps: .*": f"<= {LARGEST_STEP:g}"},
     "signs": {"right sign wrong": "<= 0", "miss a sign": "<= 0"},
     "pose": {"largest difference from 1": "<= 0.01"},
+    "probe": {"stuck: .*: seconds": "<= 8", "false alarms": "<= 0"},
     "own_log": {"difference: (elevator|aileron)": f"<= {OMEGA_GOAL:g}"},
     "releases": {
         f"times: {re.escape(name)}": f"<= {limit:g}" for name, limit in RELEASE_GOALS.items()

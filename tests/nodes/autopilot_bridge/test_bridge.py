@@ -36,6 +36,7 @@ from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_c
 from autopilot_bridge.node import ACTIVATION_TIMEOUT_NS, RELEASES_AT_SHUTDOWN, BridgeNode
 from autopilot_bridge.params import LIBRARY
 from flight_cli.cli import COMMANDS, application
+from flight_core.channels import UNKNOWN
 from flight_core.modes import Mode
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
@@ -249,6 +250,13 @@ def test_pilot_override_releases_at_once_and_blocks_an_engagement_while_it_is_ac
     setup.world.publish("/joy", Joy(buttons=[0]))
     setup.run(TICK)
     assert setup.engage() == ""
+
+
+def test_surface_without_effect_by_the_probe_of_the_controller_releases(setup: Setup) -> None:
+    setup.start()
+    setup.engaged()
+    setup.world.send("/effects", dict(zip(INPUTS, (0.9, 0.1, 0.9, UNKNOWN), strict=True)))
+    setup.until_logged(f"ENGAGED -> RELEASE: {INPUTS[1]} does not answer the probe")
 
 
 def test_silent_autopilot_releases_and_bridge_does_not_engage_again_by_itself(setup: Setup) -> None:

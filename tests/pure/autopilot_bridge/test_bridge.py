@@ -1076,3 +1076,17 @@ def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
             clean = True
     assert clean
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_input_without_effect_by_the_probe_ends_an_engagement_with_its_name() -> None:
+    bridge = engaged_bridge()
+    bridge.take_effects(
+        StampedVector(at(0.0), np.array([0.9, 0.41, 1e9, 1e9]), "controller"), at(0.0)
+    )
+    assert bridge.step(at(0.0)) is Phase.ENGAGED
+    bridge.take_effects(
+        StampedVector(at(0.0), np.array([0.9, 0.12, 1e9, 1e9]), "controller"), at(0.0)
+    )
+    assert bridge.step(at(0.0)) is Phase.RELEASE
+    name = bridge.inputs[1]
+    assert bridge.reason == f"{name} does not answer the probe: it has at most 12 % of its effect"

@@ -18,6 +18,7 @@ from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.conditions import Conditions, Reading, joined, staleness
 from autopilot_bridge.map_rows import InputRow, MeasuredRow, OutputRow
 from autopilot_bridge.params import ROUNDING, ChannelMap
+from flight_core.channels import without_effect
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import sentences
@@ -148,6 +149,14 @@ class Bridge:
         """Take u, shape (m,) in the map's order, of the publisher of `u_lock`."""
         self._moves = sample.value != self._u
         self._u = sample.value
+
+    def take_effects(self, sample: StampedVector, now_ns: int) -> None:
+        """Take the effects of the inputs by the probe of the controller, shape (m,) in the map's
+        order. An input without effect ends an engagement.
+        """
+        stuck = without_effect(self.inputs, sample.value.tolist())
+        if stuck and self.phase is Phase.ENGAGED:
+            self.disengage(stuck, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition. A condition that is lost ends an engagement at the next

@@ -54,7 +54,7 @@ from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import ENGAGEMENT, EXTERNAL, POSE, PUBLISH, WOULD_SEND, Topic, U, Y
+from flight_ros.topics import EFFECTS, ENGAGEMENT, EXTERNAL, POSE, PUBLISH, WOULD_SEND, Topic, U, Y
 
 LEFT = (
     "no publisher any more. Where the autopilot flies on, its client may not come back by "
@@ -103,6 +103,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.take_u,
             max_age_ns=self._bridge.max_u_age_ns,
             lock=self._bridge.u_lock,
+        )
+        self._effects = self.receive(
+            EFFECTS,
+            decode,
+            self._bridge.take_effects,
+            max_age_ns=self._bridge.max_u_age_ns,
+            lock=None,
         )
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
@@ -225,6 +232,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._publish_pose(self._pose_encoders[names].encode(pose.stamp_ns, pose.value))
         if any(self._u.poll(now_ns)):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
+        self._effects.poll(now_ns)
         self._bridge.step(now_ns)
         self._check_activation(now_ns)
         self._log_phase()

@@ -103,6 +103,12 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
         "none: the C code has the observer of y alone",
     )
     require(
+        controller.probe is None,
+        "controller.probe",
+        "a section",
+        "none: the C code has no probe",
+    )
+    require(
         controller.learn is None,
         "controller.learn",
         "a section",

@@ -174,6 +174,12 @@ def start_instant(lead: float, now: float) -> float:
     return round(now + lead, 2)
 
 
+def _airframe(scenario: Scenario) -> ParameterOverrides:
+    """The airframe that was found beside the scenario: a node does not know that folder."""
+    airframe = scenario.aircraft.airframe
+    return {"airframe": airframe} if Path(airframe).is_absolute() else {}
+
+
 def parameter_overrides(
     spec: NodeSpec,
     scenario: Scenario,
@@ -208,6 +214,7 @@ def parameter_overrides(
     overrides: dict[NodeSpec, ParameterOverrides] = {
         node: {"lockstep": lockstep} for node in stages
     }
+    overrides[AIRCRAFT] |= _airframe(scenario)
     if guidance is not None:
         overrides[GUIDANCE] |= {
             name: list(value) if isinstance(value, tuple) else value
@@ -217,6 +224,7 @@ def parameter_overrides(
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
         further += topics.recorded_with("learner")
+    further += topics.recorded_with("probe") if scenario.controller.probe else []
     if autopilot is not None:
         further += autopilot.topics
     if further:

@@ -35,6 +35,7 @@ from flight_campaign.batch_schedule import Schedule
 from flight_campaign.benchmark_course import Course, Segments
 from flight_campaign.device import schedule_of_device
 from flight_campaign.missions import Mission
+from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw
@@ -51,6 +52,8 @@ def vehicle(scenario: Scenario) -> Vehicle:
     errors = scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
     quantum = None if errors.quantum is None else errors.quantum[order]
+    expected = "none: a campaign flies without it"
+    require(scenario.controller.probe is None, "controller.probe", "a section", expected)
     guard = scenario.controller.guard()
     states, remainder = _reduced(aircraft)
     effectors = list(channels.inputs)

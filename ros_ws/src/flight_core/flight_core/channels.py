@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Channels shared by several nodes, by name: docs/interfaces.md."""
 
+from collections.abc import Sequence
+
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
@@ -14,7 +16,22 @@ SIDES = ("down", "up")
 either way, units/s."""
 
 UNKNOWN = 1e9
-"""Value of `authority` for an output without a model learned in flight."""
+"""Value of `authority` for an output without a model learned in flight, and of `effects` for an
+input that is not probed."""
+
+LEAST_EFFECT = 0.4
+"""Part of its effect below which an input counts as stuck: a healthy surface has 0.44 at two thirds
+of the trim speed."""
+
+
+def without_effect(names: Sequence[str], effects: Sequence[float]) -> str:
+    """The inputs below LEAST_EFFECT by a sample of `effects`, as a sentence; empty without one."""
+    return "; ".join(
+        f"{name} does not answer the probe: it has at most {100.0 * effect:.0f} % of its effect"
+        for name, effect in zip(names, effects, strict=True)
+        if effect < LEAST_EFFECT
+    )
+
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
 """Channels of `pose`: attitude, rad (body FRD in NED, psi from true north in (-pi, pi]); position,

@@ -158,9 +158,17 @@ def names_in(library: Path) -> list[str]:
     return sorted(path.stem for path in library.glob("*.yaml"))
 
 
+CHECKOUT = Path(__file__).resolve().parents[4]
+"""Root of the sources, with `examples`; some folder in an installation from a wheel."""
+
+EXAMPLES = "examples/"  # a path that begins so is also one from the root of the sources
+
+
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     """The file of a name in a library, or the path of a .yaml file. Raises ParameterError with the
     names.
+
+    A path that begins with `examples/` is found from any working folder.
 
     `key` and `kind` are of the sentence: "scenario", "a scenario file".
     """
@@ -169,6 +177,8 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
     if text.endswith(".yaml") and not path.is_absolute():
         expected = f"{expected}, from the folder {Path.cwd()}"
+        if text.startswith(EXAMPLES) and not is_file(path):
+            path = CHECKOUT / text
     require(is_file(path), key, repr(text), expected)
     return path
 

@@ -34,7 +34,7 @@ class Topic(NamedTuple):
     )
     meaning: str = ""  # channels, units and use: Markdown
     keeps: str = HISTORY
-    only_with: str = ""  # the node without which the topic is not recorded
+    only_with: str = ""  # the node or section without which the topic is not recorded
 
     @property
     def publishers(self) -> list[str]:
@@ -151,6 +151,12 @@ AUTHORITY = Topic(
     "([limits](guidance.md#limits-that-were-learned))",
     only_with="learner",
 )  # fmt: skip
+EFFECTS = Topic(
+    "effects", VECTOR, "controller -> bridge, log",
+    "by input: the largest part of its effect that fits the last seconds, 1e9 without a probe "
+    "([stuck surfaces](laws.md#stuck-surfaces))",
+    only_with="probe",
+)  # fmt: skip
 DIAGNOSTICS = Topic(
     "/diagnostics", DIAGNOSTIC, "nodes, external -> log",
     "at 1 Hz: times of ticks, refused samples by reason, mode, law",
@@ -208,7 +214,7 @@ FLIGHT = tuple(topic for topic in TOPICS if LOG in topic.subscribers and not top
 
 
 def recorded_with(node: str) -> list[str]:
-    """The topics to record of a flight with a node beside those of every flight."""
+    """The topics to record of a flight with a node or section beside those of every flight."""
     return [topic.name for topic in TOPICS if topic.only_with == node]
 
 

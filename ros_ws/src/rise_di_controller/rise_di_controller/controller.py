@@ -19,6 +19,7 @@ from flight_core.vectors import FloatArray, StampedVector, require_newer, requir
 from rise_di_controller import divergence, guard, internals, samples
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig, as_controller
+from rise_di_controller.probe import EffectTest
 
 
 class ControlOutput(NamedTuple):
@@ -28,6 +29,7 @@ class ControlOutput(NamedTuple):
     u: FloatArray  # (p,) in the order of the parameters' effectors
     inputs: guard.TickInputs
     log: Callable[[], FloatArray]
+    effects: FloatArray | None = None  # (m,) of the inputs, where a test was due: `EffectTest.most`
 
     @property
     def internals(self) -> FloatArray:
@@ -99,6 +101,7 @@ class Controller:
         self._state = guard.initial_state(len(parameters.inputs), self._guard.allocation)
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
+        self._effects = self._effect_test(parameters)
         self._first = self._parameters = parameters
         self._given_up = parameters.given_up()
         self._first_law = True
@@ -173,11 +176,14 @@ class Controller:
             new.parameters.law,
             "the law and the observer that fly: these change at a restart",
         )
+        before = self._parameters
         self._state = guard.retune(self._state, self._law, new.law, (self._guard, new.guard))
         self._law = new.law
         self._guard = new.guard
         self._digest = new.digest
         self._parameters = new.parameters
+        if not np.array_equal(new.parameters.probe_gain(), before.probe_gain()):
+            self._effects = self._effect_test(new.parameters)
         self._given_up = new.parameters.given_up()
         self._first_law = self._has_first_model(new.parameters)
         self._learned = _with_feedforward(new.parameters)
@@ -193,6 +199,21 @@ class Controller:
             for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True)
             if still
         )
+
+    def _effect_test(self, parameters: ControllerConfig) -> EffectTest | None:
+        if self._guard.probe is None or parameters.probe is None:
+            return None
+        gain = parameters.probe_gain()
+        return EffectTest(self._guard.probe, gain, parameters.probe.false_alarm)
+
+    def _tested(self, inputs: guard.TickInputs) -> FloatArray | None:
+        """The effects of the inputs after a tick, where a test was due."""
+        if self._effects is None:
+            return None
+        if self.mode is not Mode.ENGAGED or inputs.dt == 0.0:
+            self._effects.clear()
+            return None
+        return self._effects.take(inputs.stamp_ns, inputs.y, self._state.u)
 
     def _measure_vanes(self, inputs: guard.TickInputs) -> None:
         measures = getattr(self._state.law, "vane_measures", None)
@@ -327,6 +348,7 @@ class Controller:
             was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0
         ):  # a step has another dt
             self._restarted = "u or the state of the law was not finite"
+        effects = self._tested(inputs)
         self._measure_vanes(inputs)
         self._number += self.has_internals
         e = inputs.y - inputs.y_m
@@ -348,7 +370,7 @@ class Controller:
             digest,
             given_up,
         )
-        return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log)
+        return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log, effects)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
         """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago

@@ -30,6 +30,7 @@ from rise_di_controller.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
+from rise_di_controller.probe import Probe
 from rise_di_controller.samples import SampleLimits
 from rise_di_controller.saturation import Limits, saturate
 from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at, observers_of
@@ -65,6 +66,7 @@ class GuardParams(NamedTuple):
     over_speed: OverSpeed | None = (
         None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
     )
+    probe: Probe | None = None  # added to u_trim; None: no probe
 
 
 # The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full:
@@ -257,6 +259,8 @@ def _with_sample(
     dt = min(max(seconds(y.stamp_ns - last.stamp_ns), shortest), longest)
     law_state = state.law
     u_trim = state.u_trim
+    if guard.probe is not None:
+        u_trim = u_trim + guard.probe.at(y.stamp_ns)
     u_ff = state.u_ff
     ff_state = state.feedforward
     missed = max(round(dt / period) - 1, 0)
@@ -325,12 +329,15 @@ def _engaged(
         None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
     )
     measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
+    u_trim = state.u
+    if guard.probe is not None:
+        u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u goes on
     return state._replace(
         mode=Mode.ENGAGED,
         law=law.control_law.engage(measured, law.params),
         y=y,
         y_m=reference,
-        u_trim=state.u,
+        u_trim=u_trim,
         u_free=state.u,
         u_ff=zero,
         feedforward=ff_state,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
+from flight_core.channels import without_effect
 from flight_core.modes import Mode
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
@@ -27,6 +28,7 @@ from flight_ros.throttle import Throttle
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
     AUTHORITY,
+    EFFECTS,
     INTERNALS,
     LEARNING,
     LOCKSTEP,
@@ -36,7 +38,7 @@ from flight_ros.topics import (
     U,
     Y,
 )
-from rise_di_controller.controller import Controller
+from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.learned_channels import authority_names
 from rise_di_controller.params import ControllerConfig
@@ -84,6 +86,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.effectors)
         self._internals_encoder = self.encoder(self._controller.names)
+        self._publish_effects = self.advertise(EFFECTS) if self.parameters.probe else None
+        self._effects_encoder = self.encoder(self.parameters.inputs)
+        self._stuck = ""  # the inputs without effect, as a sentence
         self._learning = self._new_learning()
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())
@@ -189,6 +194,18 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 f"the law engages again: {restarted}", throttle_duration_sec=2.0
             )
 
+    def _tell_effects(self, output: ControlOutput) -> None:
+        """Publish the effects of the inputs after a test, and log which inputs are stuck."""
+        if output.effects is None or self._publish_effects is None:
+            return
+        self._publish_effects(self._effects_encoder.encode(output.stamp_ns, output.effects))
+        before = bool(self._stuck)
+        self._stuck = without_effect(self.parameters.inputs, output.effects.tolist())
+        if self._stuck:
+            self.get_logger().warning(self._stuck, throttle_duration_sec=5.0)
+        elif before:
+            self.get_logger().info("every probed input answers again")
+
     def _tell_vanes(self) -> None:
         """Log a vane at the begin and the end of a standstill."""
         before = self._still_vanes
@@ -237,6 +254,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self._publish_internals(
                 self._internals_encoder.encode(output.stamp_ns, output.internals)
             )
+        self._tell_effects(output)
         return True
 
     def advance(self) -> bool:
@@ -381,8 +399,16 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             else {}
         )
         restarts = {"restarts of the law": self._restarts}
+        effects = {"without effect": self._stuck or "none"} if self.parameters.probe else {}
         return (
             level,
             mode.name,
-            {"mode": mode.name, "law": self.parameters.summary(), **restarts, **still, **ages},
+            {
+                "mode": mode.name,
+                "law": self.parameters.summary(),
+                **restarts,
+                **effects,
+                **still,
+                **ages,
+            },
         )

@@ -38,6 +38,7 @@ from rise_di_controller.guard import DT_RANGE, GuardParams
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
 from rise_di_controller.model_sections import AllocationConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.observer import ObserverParams, filter_matrix, with_observer, without_frozen
+from rise_di_controller.probe import LARGEST, Probe, ProbeConfig
 from rise_di_controller.saturation import Limits
 
 MARGIN_PARTS = (
@@ -128,6 +129,10 @@ class ControllerConfig(NodeConfig):
         default=None,
         description="extension: corrects the trim by estimates of wind and model error",
     )
+    probe: ProbeConfig | None = Field(
+        default=None,
+        description="extension: a small sine on each input while engaged, to find a stuck surface",
+    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
@@ -172,6 +177,8 @@ class ControllerConfig(NodeConfig):
             require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
         if self.allocation is not None:
             self.allocation.arrays(self.inputs)
+        if self.probe is not None:
+            self._check_probe(self.probe)
         self.check_law()
         self._check_state()
         yield
@@ -207,6 +214,29 @@ class ControllerConfig(NodeConfig):
                 f"a state with {name} of shape {shape}",
                 f"{zero.shape}, one value an output",
             )
+
+    def _check_probe(self, probe: ProbeConfig) -> None:
+        require(
+            self.allocation is None,
+            "probe",
+            "an allocation beside it",
+            "none: a sine on an input of the law moves several effectors",
+        )
+        require_length("probe.effect", probe.effect or self.outputs, self.outputs)
+        require(
+            bool(probe.amplitudes(self.outputs).any()),
+            "probe.effect",
+            "no output to probe",
+            "an amplitude above 0",
+        )
+        highest = float(probe.harmonics(self.outputs, self.input_scale).max()) / probe.window
+        limit = min(LARGEST, self.rate / 4.0)
+        require(
+            highest <= limit,
+            "probe.lowest",
+            f"sines up to {highest:.3g} Hz",
+            f"at most {limit:.3g} Hz: a lower one, or a longer window",
+        )
 
     def _check_nominal(self, nominal: Nominal) -> None:
         zeros = zero_dynamics(nominal)
@@ -427,6 +457,39 @@ class ControllerConfig(NodeConfig):
             blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big"
         )
 
+    def probe_gain(self) -> FloatArray:
+        """abs(y_i / u_i) at the frequency of each sine, (m,), 0 without a sine.
+
+        Of the nominal model C (j omega - A)^-1 B, or of 1 / (input_scale omega) without one, behind
+        the lag of the actuator.
+        """
+        gain = np.zeros(len(self.outputs))
+        if self.probe is None:
+            return gain
+        nominal = self.nominal()
+        for i, harmonic in enumerate(self.probe.harmonics(self.outputs, self.input_scale).tolist()):
+            omega = 2.0 * np.pi * harmonic / self.probe.window
+            if omega == 0.0:
+                continue
+            response = 1.0 / (self.input_scale[i] * omega)
+            if nominal is not None:
+                dynamics = 1j * omega * np.eye(len(nominal.A)) - nominal.A - nominal.gravity
+                response = abs(nominal.C[i] @ np.linalg.solve(dynamics, nominal.B[:, i]))
+            gain[i] = response / abs(1.0 + 1j * omega * self.lag[i])
+        return gain
+
+    def _probe(self) -> Probe | None:
+        """The sines: an amplitude of y through the gain of the model; None where there is none."""
+        if self.probe is None:
+            return None
+        gain = self.probe_gain()
+        probed = gain > 0.0
+        amplitude = self.probe.amplitudes(self.outputs) / np.where(probed, gain, 1.0)
+        window_ns = nanoseconds(self.probe.window)
+        return Probe(
+            probed * amplitude, self.probe.harmonics(self.outputs, self.input_scale), window_ns
+        )
+
     def _limits(self) -> Limits:
         """The limits of u, infinite where there is none."""
         unlimited = (np.inf,) * len(self.inputs)
@@ -458,6 +521,7 @@ class ControllerConfig(NodeConfig):
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=self._flown_nominal(),
             vanes=tuple(self._model_states().index(name) for name in self.vanes),
+            probe=self._probe(),
         )
 
 

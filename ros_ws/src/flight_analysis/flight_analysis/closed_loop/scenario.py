@@ -13,7 +13,7 @@ from aircraft_sim.pose import every
 from flight_core.arguments import FilePath, as_instance, as_path
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field, short_repr
-from flight_core.files import dump_yaml, read_file
+from flight_core.files import dump_yaml, is_file, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario_file import A_SCENARIO, Sections, parse_sections
@@ -233,10 +233,19 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 
 
 def parse_scenario_sections(content: bytes, path: Path) -> Sections:
-    """The sections in the content of a scenario file, not validated yet. Raises ParameterError."""
-    return parse_sections(
+    """The sections in the content of a scenario file, not validated yet. Raises ParameterError.
+
+    A path of an airframe that is none from the working folder is one from the folder of the
+    scenario, or that file itself lies there.
+    """
+    sections = parse_sections(
         content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL
     )
+    airframe = sections["aircraft"].get("airframe")
+    if isinstance(airframe, str) and airframe.endswith(".yaml") and not is_file(Path(airframe)):
+        beside = (path.parent.absolute() / name for name in (airframe, Path(airframe).name))
+        sections["aircraft"]["airframe"] = str(next(filter(is_file, beside), airframe))
+    return sections
 
 
 def guidance_by_rule(

@@ -227,6 +227,8 @@ class ControllerStation:
         self.output: ControlOutput | None = None
         topics.advertise("u", parameters.effectors)
         topics.advertise("internals", controller.names)
+        if parameters.probe is not None:
+            topics.advertise("effects", parameters.inputs)
         topics.subscribe("y", controller.take_y, parameters.measured)
         topics.subscribe("y_m", controller.take_y_m, parameters.outputs)
 
@@ -238,3 +240,6 @@ class ControllerStation:
             self._topics.publish(
                 "internals", StampedVector(self.output.stamp_ns, self.output.internals), t_ns
             )
+            if self.output.effects is not None:
+                sample = StampedVector(self.output.stamp_ns, self.output.effects)
+                self._topics.publish("effects", sample, t_ns)

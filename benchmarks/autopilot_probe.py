@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Stuck surfaces of ArduPlane over MAVLink: when the probe of the inputs finds each, and false
+alarms.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from benchmarks.autopilot_flights import EXAMPLE, FOLDER, flying, on_the_ground
+
+from flight_core.rates import NANOSECONDS, seconds
+from flight_log.tape_reader import read_run
+
+if TYPE_CHECKING:
+    from tests.sitl.kit import ArduPlane
+
+SERVOS = {"elevator": 2, "aileron": 1, "rudder": 4}
+REPEATS = 3
+HEALTHY_FOR = 15.0  # s engaged before a surface sticks: two windows
+LONGEST = 30.0  # s, in which a stuck surface is found or not
+QUIET = 600.0  # s engaged without a fault, of each kind
+TURN = 45.0  # s between two turns under guidance
+SPEED = 23.9  # m/s
+KINDS = {"calm": (0.0, 0.0, False), "guided": (0.0, 0.0, True), "wind": (8.0, 0.5, True)}
+"""Flights without a fault: SIM_WIND_SPD, SIM_WIND_TURB, whether guidance turns and climbs."""
+
+
+def probe() -> dict[str, Any]:
+    """Each surface stuck in trim in calm air, then minutes of calm, guided and windy flight."""
+    from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
+
+    plane = ArduPlane(FOLDER / "probe")
+    with flying(plane, SIM_SERVO_SPEED=0.03, RC_OVERRIDE_TIME=OVERRIDE_TIME):
+        channel_map = plane.mavlink_map()
+        times = {
+            surface: [stuck(plane, channel_map, surface) for _ in range(REPEATS)]
+            for surface in SERVOS
+        }
+        quiet = {name: unfailed(plane, channel_map, name) for name in KINDS}
+    return {"stuck": times, "quiet": quiet}
+
+
+def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
+    """The scenario of the example with a probe, under guidance that holds or follows a program."""
+    from tests.sitl.kit import guided_scenario  # noqa: PLC0415 - as above
+
+    content = yaml.safe_load(guided_scenario(EXAMPLE, program, SPEED))
+    content["/**/controller"]["ros__parameters"]["probe"] = {"window": 6.0}
+    if not program:
+        del content["/**/guidance"]["ros__parameters"]["program"]
+    scenario = plane.folder / "probed.yaml"
+    scenario.write_text(yaml.safe_dump(content))
+    return scenario
+
+
+def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> dict[str, Any]:
+    """The time from a surface that sticks where it is until the release, s, and its reason."""
+    number = SERVOS[surface]
+    ends = {f"SERVO{number}_MIN": -1.0, f"SERVO{number}_MAX": 1.0, f"SERVO{number}_TRIM": 0.0}
+    healthy = dict(zip(ends, (1100.0, 1900.0, 1500.0), strict=True))
+    with plane.engaged(probed(plane, {}), channel_map, 200.0) as flight:
+        time.sleep(HEALTHY_FOR)
+        plane.state()  # writes the log
+        pulses = plane.log("SERVO_OUTPUT_RAW", f"servo{number}_raw")[1]
+        pulse = round(float(np.mean(pulses[-50:])))
+        began = time.time()
+        for name, shift in ends.items():
+            plane.say("param", name, f"{pulse + shift:g}")
+        while time.time() - began < LONGEST and not flight.has_logged("RELEASE"):
+            time.sleep(0.1)
+        for name, value in healthy.items():
+            plane.say("param", name, f"{value:g}")
+    (engagement,) = read_run(plane.run).engagements or []
+    stop_ns = engagement.stop_ns or int(1e18)
+    return {"seconds": stop_ns / NANOSECONDS - began, "reason": engagement.reason}
+
+
+def unfailed(plane: "ArduPlane", channel_map: str, name: str) -> dict[str, Any]:
+    """Minutes engaged without a fault: the least effect that any test told, and whether the ticks
+    replay.
+    """
+    speed, turbulence, turns = KINDS[name]
+    plane.say("param", "SIM_WIND_SPD", f"{speed:g}")
+    plane.say("param", "SIM_WIND_TURB", f"{turbulence:g}")
+    plane.level()
+    starts = np.arange(15.0, QUIET, TURN).tolist()
+    altitude = plane.state()["alt"] - plane.home
+    program = plane.turns(starts, altitude, SPEED) if turns else {}
+    with plane.engaged(probed(plane, program), channel_map, QUIET) as flight:
+        flight.end(QUIET + 100.0)
+    log = read_run(plane.run)
+    (engagement,) = log.engagements or []
+    effects = log.tape["effects"]
+    stop_ns = engagement.stop_ns or int(effects.stamp_ns[-1])
+    return {
+        "seconds": seconds(stop_ns - engagement.start_ns),
+        "reason": engagement.reason,
+        "false alarms": int("probe" in engagement.reason),
+        "tests": len(effects.stamp_ns),
+        "least effect": {surface: float(effects[surface].min()) for surface in SERVOS},
+        "replayed": on_the_ground("replay", str(plane.run)).returncode == 0,
+    }
