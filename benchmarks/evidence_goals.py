@@ -162,7 +162,7 @@ SECTIONS = {
         "autopilots-slow_servos": "the same with default servos of 0.14 s",
         "autopilots-px4": "PX4's airplane, identified gains",
         "autopilots-guided": "ArduPlane under guidance",
-        "autopilots-probe": "ArduPlane over MAVLink with a surface stuck in trim, and false alarms of the probe",
+        "autopilots-probe": "ArduPlane over MAVLink: stuck surfaces, false alarms of the probe",
         "autopilots-observer": "ArduPlane with an identified observer, in turbulence",
         "autopilots-engagements": "engagements without a jump",
         "autopilots-signs": "signs, in wind of 5 m/s",

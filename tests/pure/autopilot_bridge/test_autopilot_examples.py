@@ -4,14 +4,17 @@
 says how they flew.
 """
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from tests.conftest import REPOSITORY, refusing
 
+from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.graph import find_autopilot, require_limits
+from flight_bringup.graph import AIRCRAFT, find_autopilot, parameter_overrides, require_limits
 from flight_design.identification.sign_check import require_signs
 
 OF_PX4 = ("px4_airplane", "px4_quadrotor")
@@ -29,9 +32,10 @@ LARGEST = {
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
-    name: str, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(REPOSITORY)  # the path of an airframe counts from the working folder
+    """From any working folder."""
+    monkeypatch.chdir(tmp_path)
     scenario = find_scenario(str(REPOSITORY / "examples" / name / "scenario.yaml"), 15.0)
     autopilot = find_autopilot(EXAMPLES[name], dry_run=False)
     require_signs(autopilot.channel_map, scenario)
@@ -43,6 +47,27 @@ def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
             abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max()
             < LARGEST[output]
         ), output
+
+
+def test_copy_of_scenario_takes_the_airframe_beside(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A copy in a folder of its own flies the airframe of the sources, until one lies beside."""
+    example = REPOSITORY / "examples" / "arduplane"
+    copy = tmp_path / "mine" / "my_scenario.yaml"
+    copy.parent.mkdir()
+    shutil.copyfile(example / "scenario.yaml", copy)
+    monkeypatch.chdir(tmp_path)
+    shipped = find_scenario(str(copy))
+    assert shipped.aircraft.airframe == "examples/arduplane/airframe.yaml"
+    assert load_airframe(shipped.aircraft.airframe).name == "arduplane"
+    beside = copy.parent / "airframe.yaml"
+    text = (example / "airframe.yaml").read_text()
+    beside.write_text(text.replace("name: arduplane", "name: mine", 1))
+    scenario = find_scenario(str(copy))
+    assert load_airframe(scenario.aircraft.airframe).name == "mine"
+    overrides = parameter_overrides(AIRCRAFT, scenario, tmp_path, 0.0, lockstep=False)
+    assert overrides["airframe"] == str(beside)
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:
