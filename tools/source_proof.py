@@ -91,6 +91,23 @@ OPTIONS = (
     "-warn-special-float", "non-finite", "-c11",
 )  # fmt: skip
 
+ALLOCATION = [
+    "pass_on",
+    "moved",
+    "take_inside",
+    "towards",
+    "add_by_priority",
+    "allocate",
+    "is_inside",
+]
+"""Functions whose paths Eva joins: a path for each effector at each stop is too many. The bounds of
+the effectors need none apart."""
+
+JOINED = (
+    "-eva-slevel-function", ",".join(f"{name}:0" for name in ALLOCATION),
+    "-eva-slevel-merge-after-loop", ",".join((*ALLOCATION, "step")),
+)  # fmt: skip
+
 
 class Result(NamedTuple):
     """What Eva says of an export."""
@@ -116,9 +133,11 @@ def eva(folder: Path, ticks: int) -> Result:
     program = PROGRAM.format(ticks=ticks, bound=BOUND)
     (folder / "eva.c").write_text(program, encoding="utf-8")
     share = _output(["frama-c", "-print-share-path"], folder).strip()
+    header = (folder / "rise_di_parameters.h").read_text(encoding="utf-8")
+    options = OPTIONS if "#define RISE_DI_P 0 " in header else (*OPTIONS, *JOINED)
     evaluation = "-D__FLT_EVAL_METHOD__=0 -DFLT_EVAL_METHOD=0"
     sources = ["rise_di.c", "eva.c", f"{share}/libc/__fc_builtin.c"]
-    text = _output(["frama-c", *OPTIONS, f"-cpp-extra-args=-I. {evaluation}", *sources], folder)
+    text = _output(["frama-c", *options, f"-cpp-extra-args=-I. {evaluation}", *sources], folder)
     functions = re.search(r"(\d+) functions analyzed", text)
     count = re.search(r"(\d+) alarms? generated", text)
     if functions is None or count is None:

@@ -298,7 +298,9 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "is_inside": ("inside && (u[j] >= low[j])", "(u[j] >= low[j])"),
     "pass_on": ("inside = false;\n                for", "for"),
     "moved": ("(part * move[j])", "move[j]"),
-    "towards": ("(step > ZERO) ?", "(step < ZERO) ?"),
+    "take_inside": ("(raised > high[j]) ? high[j] : raised", "low[j]"),
+    "part_of": ("(step > magnitude(room))", "(step < magnitude(room))"),
+    "towards": ("part_of(u[j] - low[j], -step)", "ONE"),
     "add_by_priority": ("(int32_t)p->order[k]", "k"),
     "allocate": (
         "product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);",

@@ -529,6 +529,17 @@ static bool moved(const rise_di_parameters *p, const rise_di_real *begin, rise_d
     return is_inside(target, low, high);
 }
 
+/* u = values that are inside their limits. The limits stand here for the proof of the source, which cannot know it. */
+static void take_inside(const rise_di_real *values, const rise_di_real *low, const rise_di_real *high, rise_di_real *u) {
+    for (int32_t j = 0; j < RISE_DI_P; j++) {
+        const rise_di_real raised = (values[j] < low[j]) ? low[j] : values[j];
+        u[j] = (raised > high[j]) ? high[j] : raised;
+    }
+}
+
+/* The part of a step that has room, at most 1. */
+static rise_di_real part_of(rise_di_real room, rise_di_real step) { return (step > magnitude(room)) ? (room / step) : ONE; }
+
 /* u after a move as far as the limits let it, from a u inside; the halvings find the part of it, then the way is straight. */
 static void towards(const rise_di_parameters *p, const rise_di_real *move, const rise_di_real *low, const rise_di_real *high,
                     rise_di_real *u) {
@@ -537,7 +548,7 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
     rise_di_real halfway[RISE_DI_P];
     copy(u, begin, RISE_DI_P);
     if (moved(p, begin, ONE, move, low, high, target)) {
-        copy(target, u, RISE_DI_P);
+        take_inside(target, low, high, u);
     } else {
         rise_di_real part = ZERO;
         rise_di_real size = ONE;
@@ -545,7 +556,7 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
         for (int32_t k = 0; k < RISE_DI_HALVINGS; k++) {
             size = size / TWO;
             if (moved(p, begin, part + size, move, low, high, halfway)) {
-                copy(halfway, u, RISE_DI_P);
+                take_inside(halfway, low, high, u);
                 part = part + size;
             } else {
                 copy(halfway, target, RISE_DI_P);
@@ -553,9 +564,12 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
         }
         for (int32_t j = 0; j < RISE_DI_P; j++) {
             const rise_di_real step = target[j] - u[j];
-            const rise_di_real room = (step > ZERO) ? (high[j] - u[j]) : (low[j] - u[j]);
-            if (magnitude(step) > greater(magnitude(room), LEAST_DIVISOR)) {
-                last = lesser(last, room / step);
+            if (step > LEAST_DIVISOR) {
+                last = lesser(last, part_of(high[j] - u[j], step));
+            } else if (step < -LEAST_DIVISOR) {
+                last = lesser(last, part_of(u[j] - low[j], -step));
+            } else {
+                /* it stays */
             }
         }
         for (int32_t j = 0; j < RISE_DI_P; j++) {
@@ -775,7 +789,6 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     const rise_di_parameters *p = c->parameters;
     const rise_di_real measured = seconds(elapsed_ns(y->stamp_ns, c->y_stamp_ns));
     const rise_di_real dt = clipped(measured, p->dt_least, p->dt_largest);
-    const rise_di_law *before = &c->law;
     rise_di_law after;
     rise_di_real u_trim[RISE_DI_M];
     rise_di_real u_free[RISE_DI_M];
@@ -791,6 +804,7 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
 #endif
 #if RISE_DI_S > 0
     rise_di_law predicted = c->law;
+    const rise_di_law *before = &predicted;
     const rise_di_real periods = rounded(dt / p->period);
     const int32_t missed = (int32_t)periods - 1;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -799,7 +813,8 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     for (int32_t k = 0; k < missed; k++) {
         predict(p, c->u, u_trim, predicted.z);
     }
-    before = &predicted;
+#else
+    const rise_di_law *before = &c->law;
 #endif
 #if RISE_DI_N > 0
     step_feedforward(p, &c->feedforward, y_m, dt, c->u_ff);
