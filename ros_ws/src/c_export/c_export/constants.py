@@ -63,6 +63,20 @@ TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
 """Unit and bounds of the reals; a matrix of the model, which has no row here, has any finite values
 in SI."""
 
+REALS: Mapping[str, float] = MappingProxyType(
+    {
+        "MAX_ANGLE": MAX_ANGLE,
+        "INVERSE_PI": INVERSE_PI,
+        "PI_HIGH": PI_HIGH,
+        "PI_LOW": PI_LOW,
+        "RELAXATION": RELAXATION,
+        "EXCHANGE_LEAST": SMALL,
+        "TIMES": TIMES,
+        "MEMORY": MEMORY,
+    }
+)
+"""Reals of the algorithms, equal for every scenario."""
+
 
 class Constant(NamedTuple):
     """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a
@@ -246,7 +260,6 @@ def header(
     """The text of rise_di_parameters.h; without a reference model where `reference` is None.
     `samples` of y and of y_m are kept.
     """
-    m, p, n, s, schedule = sizes(controller)
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
     real = np.float32 if float32 else np.float64
@@ -259,26 +272,13 @@ def header(
 
     members = constants(controller)
     rows = _rows(members, numbers)
-    single = {
-        "MAX_ANGLE": MAX_ANGLE,
-        "INVERSE_PI": INVERSE_PI,
-        "PI_HIGH": PI_HIGH,
-        "PI_LOW": PI_LOW,
-    }
-    single |= {
-        "RELAXATION": RELAXATION,
-        "EXCHANGE_LEAST": SMALL,
-        "TIMES": TIMES,
-        "MEMORY": MEMORY,
-    }
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
         " * SPDX-License-Identifier: Apache-2.0",
         " *",
         (
             f" * Parameters of the controller of {scenario}, written by `rise-di export`. "
-            "rise_di.h "
-            "has units and meaning."
+            "rise_di.h has units and meaning."
         ),
         (
             f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; "
@@ -288,23 +288,10 @@ def header(
         "#ifndef RISE_DI_PARAMETERS_H",
         "#define RISE_DI_PARAMETERS_H",
         "",
-        f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
-        f"#define RISE_DI_INPUTS {_strings(controller.inputs)}",
-        *([f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []),
-        f"#define RISE_DI_M {m} /* channels */",
-        f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
-        f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
-        f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
-        f"#define RISE_DI_R {r} /* states of the reference model, 0: no reference model */",
-        (
-            f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic "
-            "pressure */"
-        ),
-        f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
-        f"#define RISE_DI_SAMPLES {samples} /* samples kept of y and of y_m */",
+        *_names_and_sizes(controller, r, samples, float32=float32),
         f"#define RISE_DI_AGREEING {AGREEING} /* samples in a row after a jump of y */",
-        (f"#define RISE_DI_FIRST_NS {FIRST_NS} /* after the first y, in which it may jump */"),
-        *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
+        f"#define RISE_DI_FIRST_NS {FIRST_NS} /* after the first y, in which it may jump */",
+        *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in REALS.items()),
         f"#define RISE_DI_SWEEPS {SWEEPS}",
         f"#define RISE_DI_HALVINGS {HALVINGS}",
         f"#define RISE_DI_SINE_COEFFICIENTS {{{numbers(np.array(SINE_COEFFICIENTS))}}}",
@@ -320,6 +307,27 @@ def header(
         "#endif",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
+    """Lines of the header: names of the channels, dimensions, and what is compiled."""
+    m, p, n, s, schedule = sizes(controller)
+    return [
+        f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
+        f"#define RISE_DI_INPUTS {_strings(controller.inputs)}",
+        *([f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []),
+        f"#define RISE_DI_M {m} /* channels */",
+        f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
+        f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
+        f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
+        f"#define RISE_DI_R {r} /* states of the reference model, 0: no reference model */",
+        (
+            f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic "
+            "pressure */"
+        ),
+        f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
+        f"#define RISE_DI_SAMPLES {samples} /* samples kept of y and of y_m */",
+    ]
 
 
 def _macro(name: str, parts: list[str], *, braces: bool = True) -> list[str]:

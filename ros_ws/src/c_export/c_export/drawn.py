@@ -32,7 +32,7 @@ from reference_model.reference import Reference
 from rise_di_controller import feedforward
 from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, fields, restored
-from rise_di_controller.feedforward import FeedforwardState
+from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.guard import DT_RANGE, SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import saturate
@@ -271,20 +271,8 @@ def _stepped(
     missed = np.round(dt / period) - 1.0
     for k in range(round(DT_RANGE[1])):
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
-    u_trim = before["u_trim"]
-    u_ff = before["u_ff"]
-    model_state = {}
-    if guard.nominal is not None:
-        x, u, dt_before, ticks, u_0 = (
-            before[f"feedforward.{name}"] for name in FeedforwardState._fields
-        )
-        now, u_ff = feedforward.step(
-            FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal)
-        )
-        u_trim = u_trim + u_ff
-        model_state = {
-            f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()
-        }
+    u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
+    u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
     measured = Measurements(y, y_m, zero, u_trim, u_before)
     stepped, u_free = law.control_law.step(state, measured, dt, params)
     last = before.get("effectors")
@@ -311,6 +299,25 @@ def _stepped(
         "output.dt": dt[None],
     }
     return after | {"y": y, "y_m": y_m} | output
+
+
+def _fed_forward(
+    nominal: Nominal | None,
+    before: Mapping[str, FloatArray],
+    y_m: FloatArray,
+    dt: FloatArray,
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """u_ff after a step of the feedforward, and the states of its model, by column."""
+    if nominal is None:
+        return before["u_ff"], {}
+    x, u, dt_before, ticks, u_0 = (
+        before[f"feedforward.{name}"] for name in FeedforwardState._fields
+    )
+    now, u_ff = feedforward.step(
+        FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(nominal)
+    )
+    states = now._asdict().items()
+    return u_ff, {f"feedforward.{name}": np.atleast_2d(value) for name, value in states}
 
 
 def _given(

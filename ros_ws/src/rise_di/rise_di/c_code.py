@@ -105,25 +105,32 @@ def export(
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU))
     if not proof:
         return Exported(files, None, "")
-    logged = ""
     if run is None:
-        length = min(chosen.flight.duration, LONGEST) if duration is None else duration
         sets = parameter_sets(controller)
+        length = min(chosen.flight.duration, LONGEST) if duration is None else duration
         flight = chosen.vary(flight={"duration": length})
         recordings = _recordings(flight, sets, 0 if float32 else drawn, seed, kept)
+        logged = ""
     else:
-        sets, recording, equal = run_recording(
-            run if isinstance(run, RecordedRun) else read_run(run)
-        )
-        same = sets[0].digest() == controller.digest()
-        require(same, "run", "a flight with other parameters", f"those of {title}")
-        recordings = iter([recording])
-        logged = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
+        sets, recordings, logged = _logged(run, controller, title)
     proved = prove(code, commands, sets, recordings, float32=float32, runner=starter)
     text = report(proved, title) + logged
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
+
+
+def _logged(
+    run: FilePath | RecordedRun, controller: RiseDiConfig, title: str
+) -> tuple[list[RiseDiConfig], Iterator[Recording], str]:
+    """The parameters and the ticks of a flight, and a line on their u. Raises ParameterError for a
+    flight with other parameters.
+    """
+    sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
+    same = sets[0].digest() == controller.digest()
+    require(same, "run", "a flight with other parameters", f"those of {title}")
+    line = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
+    return sets, iter([recording]), line
 
 
 def _recordings(
