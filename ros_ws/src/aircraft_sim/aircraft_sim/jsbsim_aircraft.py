@@ -199,7 +199,7 @@ def aircraft_names() -> tuple[str, ...]:
 
 
 def root() -> Path:
-    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or that of the
+    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or in the
     package jsbsim.
 
     Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such
@@ -267,7 +267,7 @@ def root_of(model: Path) -> Path:
 
 
 def _model_file(path: Path, airframe: str) -> Path:
-    """The XML file of a model, from its path or that of its folder. Raises ParameterError."""
+    """The XML file of a model, from the path of the file or the folder. Raises ParameterError."""
     expected = "the XML file of an aircraft of JSBSim (fdm_config), or its folder"
     if not path.is_dir():
         require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)

@@ -35,7 +35,7 @@ def confine(folder: Path) -> list[str]:
     """Take this process off the network, and let it change files beneath `folder` alone; it must
     have one thread.
 
-    Returns a sentence for each of the two that the kernel does not permit.
+    Returns a sentence for a measure without support by the kernel.
     """
     ways = []
     if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):

@@ -184,7 +184,7 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
 
 
 def display_path(path: Path) -> str:
-    """A path relative to the working folder if it is below it, else as it is; unprintable
+    """A path, relative to the working folder where the path is below; unprintable
     characters as escapes.
     """
     return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))

@@ -60,7 +60,7 @@ IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service cal
 
 
 class _Stop:
-    """Set by a signal handler. It has no lock: that of an Event deadlocks when a second signal
+    """Set by a signal handler, without a lock: the lock of an Event deadlocks when a second signal
     interrupts the first handler.
     """
 
@@ -152,7 +152,7 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
-    """Serve one pending request, and further ones until an instant of the monotonic clock."""
+    """Serve a pending request, and further requests until an instant of the monotonic clock."""
     while True:
         if (execute := ready_callback(executor)) is None:
             return
@@ -248,14 +248,14 @@ class RealTime:
         self._after_each = 1  # reports after each tick
 
     def run_due_tick(self) -> bool:
-        """Run the newest tick that is due. Returns whether there was one."""
+        """Run the newest due tick. Returns whether there was a tick."""
         if (tick := self.ticker.due()) is None:
             return False
         self.node.run_tick(tick, self._start_ns + tick.number * self.ticker.period_ns)
         return True
 
     def report(self) -> None:
-        """Do the next reports. After each tick some of them: all of them together may exceed a
+        """Do the next reports, some after a tick: the reports together may exceed a
         period of 2 ms.
         """
         now_ns = time.monotonic_ns()
@@ -275,7 +275,7 @@ class RealTime:
 def _start_instants(
     nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
 ) -> list[int]:
-    """The start of each node, ns of the system clock, once all are known; none after a signal."""
+    """The starts of the nodes, ns of the system clock, once known; none after a signal."""
     known: dict[FlightNode[Any], int] = {}
     awaiting = [node for node in nodes if node.waits_for_start()]
     while not stop.requested:
@@ -295,7 +295,7 @@ def _start_instants(
 
 
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    """Run nodes in one thread, a tick at a time: of several that are due the first node's, by the
+    """Run nodes in a thread, a tick at a time: of several due nodes the first node's, by the
     order of the nodes.
     """
     executor = _start(nodes)

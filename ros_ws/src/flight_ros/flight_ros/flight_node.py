@@ -67,8 +67,8 @@ CLOCK_STEP_NS = (
 
 
 class FlightNode(Node, Generic[P]):
-    """A node that runs at fixed ticks or in lockstep. A subclass defines its rate and the work of
-    one tick or step.
+    """A node with fixed ticks or in lockstep. A subclass defines its rate and the work of
+    a tick or step.
     """
 
     def __init__(self, name: str, schema: type[P]) -> None:
@@ -130,10 +130,10 @@ class FlightNode(Node, Generic[P]):
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
-        """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic
+        """System time of tick 0, ns: the parameter `start_time`; where it is -1 the topic
         `start`, None before its message.
 
-        Where that is 0 the next whole period of the system clock, so that nodes of equal rates tick
+        Where it is 0 the next whole period of the system clock, so that nodes of equal rates tick
         together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
@@ -146,9 +146,7 @@ class FlightNode(Node, Generic[P]):
         raise NotImplementedError
 
     def advance(self) -> bool:
-        """Lockstep: take every step that the received messages allow. Returns whether there was
-        one.
-        """
+        """Lockstep: take every step with its messages. Returns whether there was a step."""
         raise NotImplementedError
 
     def awaited_topic(self) -> str:
@@ -223,7 +221,7 @@ class FlightNode(Node, Generic[P]):
         return receiver
 
     def encoder(self, names: Sequence[str]) -> Encoder:
-        """Encoder of samples that this node publishes."""
+        """Encoder of the samples of the node."""
         return Encoder(names, self.instance)
 
     def now_ns(self) -> int:
@@ -240,8 +238,8 @@ class FlightNode(Node, Generic[P]):
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
-        """Replace the parameters by a valid set that this node chose itself: one parameter event,
-        without another check.
+        """Replace the parameters by a valid set of the node's own choice: a parameter event
+        without a check.
         """
         before, after = (
             dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
@@ -318,7 +316,7 @@ class FlightNode(Node, Generic[P]):
     # Called by the event loop
 
     def _received_start_ns(self) -> int | None:
-        """The instant on the topic `start`, ns. One long ago belongs to another flight."""
+        """The instant on the topic `start`, ns. An old instant is of an earlier flight."""
         messages = () if self._start_subscription is None else self._start_subscription.take()
         instants = (stamp_of(received.message) for received in messages)
         return next(
@@ -331,7 +329,7 @@ class FlightNode(Node, Generic[P]):
         )
 
     def match(self) -> None:
-        """Real time: publish once that each input has a publisher."""
+        """Real time: publish once when every input has a publisher."""
         awaited = [
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
@@ -343,7 +341,7 @@ class FlightNode(Node, Generic[P]):
             self.publish_state(NodeState.MATCHED)
 
     def run_tick(self, tick: Tick, now_ns: int) -> None:
-        """Run one tick; measure its period, its compute time and its overruns."""
+        """Run a tick; measure the period, the compute time and the overruns."""
         self._tick_times.begin(tick)
         for receiver in self.receivers:
             if receiver.lock is not None:
@@ -352,8 +350,8 @@ class FlightNode(Node, Generic[P]):
         self._tick_times.end()
 
     def check_clock(self) -> None:
-        """Log an error after a step of the system clock. This node keeps its time; a node that
-        starts now has another time.
+        """Log an error after a step of the system clock. The node keeps its time; a node
+        with a later start has the new time.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
@@ -370,8 +368,8 @@ class FlightNode(Node, Generic[P]):
             self._clock_step_ns = step_ns
 
     def compare_clocks(self) -> None:
-        """Exchange the clocks of the nodes. Log a warning for each that begins to differ from this
-        one, and once it agrees.
+        """Exchange the clocks of the nodes. Log a warning where a clock begins to differ from
+        the node's own, and once it agrees.
         """
         if self.clocks is not None:
             self.clocks.exchange(time.time_ns() - self.now_ns())
@@ -387,7 +385,7 @@ class FlightNode(Node, Generic[P]):
         """Checks of the graph, a topic each: to ask the middleware for all topics takes about a
         period of 2 ms.
 
-        They log an error for each peer with another message type or incompatible QoS: its topic
+        They log an error for a peer with a wrong message type or incompatible QoS: its topic
         would stay silent.
         """
         return [

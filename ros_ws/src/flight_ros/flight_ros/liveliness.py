@@ -28,12 +28,12 @@ ROLES = NODES[:-1]  # a bridge flies in real time alone
 
 
 class LivelinessMonitor:
-    """Asserts the liveliness of a node on `alive/<role>` and monitors that of the other roles.
+    """Asserts the liveliness of a node on `alive/<role>` and monitors the further roles.
 
     The middleware sends the heartbeats. It reports the end of a process within the lease duration
     of `LIVELINESS`, or within that of the participant, two seconds, if the process ended before its
-    first heartbeat. A role that never appeared is not lost: a flight can run without a recorder.
-    The only message of a role is its report: the name of the role that it lost.
+    first heartbeat. A role is lost after an appearance alone: a flight can run without a recorder.
+    The only message of a role is a report: the name of the lost role.
     """
 
     def __init__(self, node: Node, role: str) -> None:
@@ -58,10 +58,10 @@ class LivelinessMonitor:
         ]
 
     def lost(self) -> str:
-        """The role that was lost; empty if none was.
+        """The lost role; empty without one.
 
-        A role that shut down cleanly is lost after SHUTDOWN_GRACE_NS, unless a report names the
-        role that ended first.
+        After a clean shutdown a role is lost after SHUTDOWN_GRACE_NS, unless a report names the
+        role with the first end.
         """
         for subscription in (
             self._subscriptions
@@ -73,7 +73,7 @@ class LivelinessMonitor:
         return self._left
 
     def report(self, role: str) -> None:
-        """Publish the role that was lost, so that all peers name the role that ended first."""
+        """Publish the lost role, so that the peers name the role with the first end."""
         self._publisher.publish(String(data=role))
         self._publisher.wait_for_all_acked(REPORT_TIMEOUT)
 

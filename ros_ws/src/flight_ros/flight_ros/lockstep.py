@@ -10,9 +10,7 @@ from flight_core.vectors import StampedVector
 
 
 class Instant(NamedTuple):
-    """An instant of y. `others`: the samples of the second signal up to it that were not in an
-    earlier one.
-    """
+    """An instant of y. `others`: the new samples of the second signal up to this instant."""
 
     now_ns: int
     due: bool  # whether the node steps at this instant

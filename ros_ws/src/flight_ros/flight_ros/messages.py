@@ -4,9 +4,9 @@
 = the sample's instant.
 
 The channels are constant during a flight. So the bytes of a message are laid out once, and each
-sample changes only its stamp and its values. This is several times faster than the serialisation of
-the middleware. It is also repeatable to the byte: the middleware leaves uninitialised memory
-between two strings.
+sample changes only its stamp and its values. The layout is several times faster than the
+serialisation of the middleware, and repeatable to the byte: the middleware leaves uninitialised
+memory between two strings.
 """
 
 import math
@@ -64,9 +64,9 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
 
 
 class Encoder:
-    """Encodes the samples of one publisher as the bytes of a message.
+    """Encodes the samples of a publisher as the bytes of a message.
 
-    Without names the message is a vector without channels: in lockstep, no sample exists at that
+    Without names the message is a vector without channels: in lockstep, no sample exists at the
     instant. Layout: CDR (OMG Common Object Request Broker Architecture, 9.3). The offset of each
     value from the encapsulation is a multiple of its size; padding bytes are 0.
     """
@@ -99,14 +99,14 @@ class Encoder:
         self._bytes += encoded
 
     def encode(self, stamp_ns: int, values: FloatArray) -> bytes:
-        """The message of one sample; values in the order of the names."""
+        """The message of a sample; values in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
         return bytes(self._bytes)
 
 
 class Decoder:
-    """Decodes the wanted channels of the messages of one topic."""
+    """Decodes the wanted channels of the messages of a topic."""
 
     def __init__(self, wanted: Sequence[str]) -> None:
         self._wanted = list(wanted)
@@ -157,7 +157,7 @@ class Decoder:
 
 
 class NamedSample(NamedTuple):
-    """A sample with all of its channels."""
+    """A sample with its channels."""
 
     stamp_ns: int
     channels: dict[str, float]

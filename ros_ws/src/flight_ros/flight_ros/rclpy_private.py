@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""All private names of rclpy 7.1 that the stack uses; tests/ros/flight_ros/test_rclpy_private.py
-checks them.
+"""The private names of rclpy 7.1 in the stack, checked by
+tests/ros/flight_ros/test_rclpy_private.py.
 """
 
 from collections.abc import Callable, Sequence
@@ -99,10 +99,10 @@ def answer_invalid_transitions(node: Node) -> None:
 
 
 def refuse_foreign_parameters(node: Node) -> None:
-    """Let a node refuse a request to set parameters of which it lacks one, as a whole.
+    """Let a node refuse a request with an unknown parameter as a whole.
 
     `ros2 param load` joins the sections of all nodes of a file. Without the refusal a node takes
-    the values of names that it shares with another node, such as an age limit.
+    the values of shared names, for example an age limit, from the section of a further node.
     """
     (service,) = (
         service for service in node.services if service.srv_name.endswith("/set_parameters")

@@ -106,11 +106,11 @@ class Refusals:
 
 
 class Receiver(Generic[S]):
-    """The samples of one topic. Checks go from cheap to costly: size, publisher, content, stamp.
+    """The samples of a topic. Checks go from cheap to costly: size, publisher, content, stamp.
 
-    A message that is too long, or of a conflicting publisher, is refused without decoding names and
-    values: a flood of these messages costs no more than as many right ones. Under the name of the
-    locked publisher, too long is GROWTH times its longest valid message, until the publisher times
+    A message too long, or of a conflicting publisher, is refused without decoding names and
+    values: a flood of these messages costs no more than valid messages. Under the name of the
+    locked publisher, too long is GROWTH times the longest valid message, until the publisher times
     out. `decode` returns None for a vector without channels. `take` gets a sample and the present
     instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of
     a stamp and the lead over the clock; None is for a sender without the clock of the flight.

@@ -32,9 +32,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's
     profile until u_m is received.
 
-    In lockstep it publishes every y_m up to the instant of clock and computes the next one ahead.
-    Where `u_m_rate` is set it computes it once u_m has arrived: each instant of u_m has exactly
-    one, without channels where there is no command.
+    In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
+    Where `u_m_rate` is set u_m comes first: every instant of u_m has exactly one y_m,
+    without channels where there is no command.
     """
 
     def __init__(self) -> None:
