@@ -64,21 +64,9 @@ def import_airframe(
     label = str(source) if isinstance(source, str | Path) else type(source).__name__
     entered_speed = None if speed is None else in_si(speed, "speed", "m/s")
     if isinstance(source, str | Path) and Path(source).suffix in {".yaml", ""}:
-        options = {
-            "speed": speed,
-            "states": states,
-            "inputs": inputs,
-            "outputs": outputs,
-            "thrust": thrust,
-            "text": text,
-            **body,
-        }
-        for key, value in options.items():
-            require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
-        loaded = load_airframe(source)
-        return (
-            loaded.model_copy(update={"name": name}) if name else loaded
-        ), f"airframe file {label}"
+        options = {"speed": speed, "states": states, "inputs": inputs, "outputs": outputs}
+        options |= {"thrust": thrust, "text": text, **body}
+        return _of_file(source, name, options), f"airframe file {label}"
     named_states = _named(states, "states")
     named_inputs = _named(inputs, "inputs")
     model = read_model(source, named_states, named_inputs, entered_speed, body)
@@ -86,18 +74,23 @@ def import_airframe(
     if speed_used is None:
         raise ParameterError("speed: found none, expected the trim speed, as 53.6 or 176 ft/s")
     title = name or Path(label).stem
-    effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
-    units = tuple(channel["unit"] for channel in model.inputs.values())
-    none = np.zeros_like(model.A)
-    identities.check(
-        identities.Model(title, model.states, effects, units, speed_used, model.A, model.B, none)
-    )
+    _check_identities(model, title, speed_used)
     if thrust:
         model = _with_thrust(model)
     frame = _airframe(
         model, title, speed_used, outputs, text or f"{model.note or 'matrices'} of {label}"
     )
     return frame, model.note or f"matrices of {label}"
+
+
+def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airframe:
+    """The airframe of an airframe file, with another name unless empty; no option fits beside
+    the file.
+    """
+    for key, value in options.items():
+        require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
+    loaded = load_airframe(source)
+    return loaded.model_copy(update={"name": name}) if name else loaded
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
@@ -110,6 +103,16 @@ def _named(names: Named, key: str) -> dict[str, Any]:
     if isinstance(names, Mapping):
         return dict(names)
     return dict.fromkeys(names, "")
+
+
+def _check_identities(model: Model, name: str, speed: float) -> None:
+    """Raise ParameterError for a model that breaks an identity of physics; trim speed in m/s."""
+    effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
+    units = tuple(channel["unit"] for channel in model.inputs.values())
+    none = np.zeros_like(model.A)
+    identities.check(
+        identities.Model(name, model.states, effects, units, speed, model.A, model.B, none)
+    )
 
 
 def _with_thrust(model: Model) -> Model:

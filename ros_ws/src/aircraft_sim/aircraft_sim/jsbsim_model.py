@@ -169,7 +169,11 @@ class JsbsimModel:
         self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (
             before + self._velocity
         )
-        now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
+        self._require_flight(t_ns + duration_ns, sink)
+
+    def _require_flight(self, t_ns: int, sink: float) -> None:
+        """Raise FlightEnded on the ground, after a sink in m/s, and where an engine stopped."""
+        now = f"at t = {seconds(t_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             on_wheels = not any(node.get_double_value() for node in self._structure)
             if on_wheels and sink <= SOFT:

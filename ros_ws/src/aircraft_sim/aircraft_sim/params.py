@@ -4,7 +4,7 @@
 equations.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -47,6 +47,7 @@ from aircraft_sim.sections import (
     TurbulenceConfig,
     UncertaintyConfig,
     VaneSensorsConfig,
+    by_state,
     require_one_wind,
     wind_field_of,
 )
@@ -58,7 +59,6 @@ from flight_core import parameters
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.parameters import (
-    Config,
     NodeConfig,
     NonNegative,
     Numbers,
@@ -288,30 +288,23 @@ class AircraftConfig(NodeConfig):
                 airframe.span is not None, "turbulence.rotary", "true", f"false: {has_none} span"
             )
         if self.over_airspeed is not None:
-            over_airspeed(airframe, self.over_airspeed)
-            require(
-                self.kinematics == "linear",
-                "over_airspeed",
-                "kinematics euler beside it",
-                "linear kinematics",
-            )
-            require(
-                self.drift is None,
-                "over_airspeed",
-                "a drift beside it",
-                "none: a drift is that of the trim speed",
-            )
-        for name in self.vanes.channels:
-            require(
-                name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}"
-            )
-            require(
-                name not in airframe.outputs,
-                "vanes.channels",
-                name,
-                f"none: {name} is an output of {airframe.name}",
-            )
-            require(airframe.speed > 0.0, "vanes.channels", name, f"none: {has_none} speed")
+            self._check_over_airspeed(airframe, self.over_airspeed)
+        self.vanes.require_fit(airframe)
+
+    def _check_over_airspeed(self, airframe: Airframe, thrust: str) -> None:
+        over_airspeed(airframe, thrust)
+        require(
+            self.kinematics == "linear",
+            "over_airspeed",
+            "kinematics euler beside it",
+            "linear kinematics",
+        )
+        require(
+            self.drift is None,
+            "over_airspeed",
+            "a drift beside it",
+            "none: a drift is that of the trim speed",
+        )
 
     def _stops(self) -> dict[str, Sequence[float]]:
         """The end stops by their keys."""
@@ -451,8 +444,8 @@ class AircraftConfig(NodeConfig):
             Coupling(self.inertial_coupling * gain, first, second)
             if self.inertial_coupling > 0.0
             else None,
-            Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
-            Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
+            Bias(*by_state(biases, Bias._fields, airframe.states)) if biases else None,
+            Sines(*by_state(sines, Sines._fields, airframe.states)) if sines else None,
             euler_kinematics(airframe) if self.kinematics == "euler" else None,
         )
 
@@ -593,15 +586,3 @@ def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
         if not values or (zero_is_none and not any(values))
         else np.array(values, dtype=np.float64)
     )
-
-
-def _by_state(
-    named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe
-) -> list[FloatArray]:
-    """An array per key, over the states, with 0 for an unnamed state."""
-    sections = [named.get(state) for state in airframe.states]
-    arrays = []
-    for key in keys:
-        values = [float(getattr(section, key, 0.0)) for section in sections]
-        arrays.append(np.array(values))
-    return arrays

@@ -3,11 +3,14 @@
 """The sections of the parameters of the simulated aircraft."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+
 from aircraft_sim import effector_faults, wind_field
+from aircraft_sim.airframe import Airframe
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
 from flight_core import parameters
@@ -20,6 +23,7 @@ from flight_core.parameters import (
     require,
     require_length,
 )
+from flight_core.vectors import FloatArray
 
 
 class Gust(Config):
@@ -360,6 +364,16 @@ class VaneSensorsConfig(Config):
         if self.frozen_at:
             parameters.require_length("frozen_at", self.frozen_at, self.channels)
 
+    def require_fit(self, airframe: Airframe) -> None:
+        """Raise ParameterError for a vane that an airframe cannot have."""
+        key = "vanes.channels"
+        has_none = f"none: the airframe {airframe.name} has no"
+        for name in self.channels:
+            require(name in airframe.states, key, name, f"{has_none} state {name}")
+            is_output = f"none: {name} is an output of {airframe.name}"
+            require(name not in airframe.outputs, key, name, is_output)
+            require(airframe.speed > 0.0, key, name, f"{has_none} speed")
+
 
 PerPose = dict[str, Number]
 
@@ -396,3 +410,11 @@ class StartConfig(Config):
     heading: Number = Field(
         default=0.0, description="the heading, rad, positive to the right of north"
     )
+
+
+def by_state(
+    named: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
+) -> list[FloatArray]:
+    """An array per key, over the states, with 0 for an unnamed state."""
+    sections = [named.get(state) for state in states]
+    return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]
