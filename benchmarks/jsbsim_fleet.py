@@ -14,10 +14,9 @@ import numpy as np
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
+from flight_design.identification.manoeuvre import ManoeuvreResult, fly_all
 from flight_design.identification.step_identification import (
     IdentifiedAircraft,
-    ManoeuvreResult,
-    fly_all,
     identify,
     without_beta,
 )

@@ -33,17 +33,16 @@ from flight_core.units import GRAVITY
 from flight_design.identification import open_loop_fit
 from flight_design.identification.bridge_identification import (
     Channels,
-    Flyable,
     channel_models,
     channel_pairs,
     experiment,
-    flying_scenario,
     join,
     map_text,
     measured_trims,
     over_link,
     within_range,
 )
+from flight_design.identification.flying_scenario import Flyable, flying_scenario
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import Response, identify_response
 

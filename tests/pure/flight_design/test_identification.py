@@ -26,20 +26,20 @@ from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_design.identification import step_identification
+from flight_design.identification.manoeuvre import AUTHORITY_FRACTION, HEIGHTS, reference_parameters
 from flight_design.identification.step_identification import (
-    AUTHORITY_FRACTION,
-    HEIGHTS,
+    IdentifiedAircraft,
+    identify,
+    slowest_trim,
+    that_learns,
+)
+from flight_design.identification.step_responses import (
     SIZES,
     SPAN,
     Fly,
-    IdentifiedAircraft,
     Responses,
-    identify,
-    reference_parameters,
-    slowest_trim,
     steepest_tangent,
     step_responses,
-    that_learns,
 )
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference

@@ -9,11 +9,8 @@ from scipy.signal import cont2discrete
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
-from flight_design.identification.response_identification import (
-    Response,
-    begins_with_Omega,
-    identify_response,
-)
+from flight_design.identification.response_identification import Response, identify_response
+from flight_design.identification.step_response_fit import begins_with_Omega
 
 OUTPUTS, INPUTS = ("p", "r"), ("aileron", "rudder")
 OMEGA: FloatArray = np.array([[40.0, 3.0], [-2.0, 8.0]])  # rad/s^2 per rad

@@ -31,12 +31,10 @@ from flight_design.gains.requirement import Requirement
 from flight_design.identification.bridge_identification import (
     Channels,
     Experiment,
-    Flyable,
     channel_models,
     channel_pairs,
     cut_short,
     experiment,
-    flying_scenario,
     has_airspeed,
     join,
     map_text,
@@ -45,6 +43,7 @@ from flight_design.identification.bridge_identification import (
     require_envelope,
     within_range,
 )
+from flight_design.identification.flying_scenario import Flyable, flying_scenario
 from flight_design.identification.log_import import COMMANDS, median_trims, require_map_of_import
 from flight_design.identification.open_loop_fit import FASTEST_ZERO, ChannelModel
 from flight_design.identification.response_identification import Response, identify_response

@@ -58,10 +58,10 @@ from flight_design.gains.relaxation import lacking as what_lacks
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording
+from flight_design.identification.manoeuvre import manoeuvre_result
 from flight_design.identification.model_identification import Identification, model_yaml
 from flight_design.identification.model_identification import identify as identify_model
 from flight_design.identification.step_identification import identify as identify_aircraft
-from flight_design.identification.step_identification import manoeuvre_result
 from flight_log.tape_reader import read_run
 from rise_di_controller.params import ControllerConfig
 

@@ -328,6 +328,76 @@ def wind_model(
     return np.array([constants[axis] for axis in axes]), np.array([noises[axis] for axis in axes])
 
 
+class Air:
+    """The winds of a filter and how the winds move the aircraft, see `filter_bank`."""
+
+    def __init__(
+        self, names: Names, speed: float, span: float | None, shear: FloatArray | None
+    ) -> None:
+        self._names = names
+        self._speed = speed
+        self._span = span
+        self._shear = shear
+        self._time, self._noise = wind_model(names.winds, speed, span)
+        self._is_rotary = np.array([axis in ROTARY for axis in names.winds], dtype=bool)
+        self._smooth = np.flatnonzero(~self._is_rotary)
+        smooth_axes = [names.winds[k] for k in self._smooth]
+        self.states = (
+            *(f"wind.{axis}" for axis in names.winds),
+            *(f"{kind}.{axis}" for kind, axis in product(("rate", "change"), smooth_axes)),
+            *("slow.vertical",) * (shear is not None),
+        )
+
+    def around(self, model: NominalModel) -> NominalModel:
+        """The models with the states of the winds, A (N, 1, s, s) and B (N, 1, s, m)."""
+        (N, n, m), G = model.B.shape, model.wind.shape[-1]
+        s = n + len(self.states)
+        x, w, v, a, slow = np.split(np.arange(s), np.cumsum([n, G, *2 * [len(self._smooth)]]))
+        A = np.zeros((N, s, s))
+        B = np.zeros((N, s, m))
+        gravity = np.zeros((s, s))
+        A[:, x[:, None], x] = model.A
+        A[:, x[:, None], w] = model.wind
+        B[:, x] = model.B
+        gravity[:n, :n] = model.gravity
+        A[:, w, w] = -1.0 / self._time
+        A[:, v, v] = -1.0 / GUST_TIME
+        A[:, a, a] = -1.0 / RATE_TIME
+        A[:, w[self._smooth], v] = A[:, v, a] = 1.0
+        if self._shear is not None and self._span is not None:
+            lag = 4.0 * self._span / (np.pi * self._speed)
+            alpha, q = (self._names.states.index(name) for name in SHEARED)
+            vertical = w[self._names.winds.index("vertical")]
+            turning = np.stack([self._shear[:, 0], self._shear[:, 1] * model.A[:, q, q]], axis=1)
+            effects = turning / (self._speed * lag)
+            A[:, [alpha, q], vertical] -= effects
+            A[:, [alpha, q], slow] += effects
+            A[:, slow, vertical] = 1.0 / lag
+            A[:, slow, slow] = -1.0 / lag
+        return model._replace(
+            A=A[:, None],
+            B=B[:, None],
+            C=np.hstack([model.C, np.zeros((m, s - n))]),
+            gravity=gravity,
+            wind=np.zeros((s, 0)),
+            kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(s - n)]),
+            size=np.concatenate([model.size, np.ones(s - n)]),
+        )
+
+    def noises(self, strength: FloatArray, levels: NDArray[np.int64] | slice) -> FloatArray:
+        """Noises of all states at some levels, (N, levels, s), of winds of a strength, (N, G)."""
+        winds, changes, rolls = (LEVELS[levels, None, k] for k in range(3))
+        noise = self._noise
+        smooth = self._smooth
+        gust = strength[:, None] * np.where(self._is_rotary, rolls, winds) * noise
+        largest = np.max(noise[smooth], initial=0.0)
+        change = strength[:, None, smooth] * changes * (noise[smooth] / largest)
+        aircraft = np.full((*gust.shape[:2], len(self._names.states)), LOOSE)
+        slow = np.zeros((*gust.shape[:2], int(self._shear is not None)))
+        parts = [aircraft, gust, 0.0 * change, change + LEAST_RATE, slow]
+        return np.concatenate(parts, axis=-1)
+
+
 def filter_bank(
     model: NominalModel,
     names: Names,
@@ -357,64 +427,13 @@ def filter_bank(
     G); `drift` as in `observer_design.Weights`. Models `near` the first one have gains exact to
     first order.
     """
-    wind_time, noise = wind_model(names.winds, speed, span)
-    (N, n, m), G = model.B.shape, model.wind.shape[-1]
-    is_rotary = np.array([axis in ROTARY for axis in names.winds], dtype=bool)
-    smooth = np.flatnonzero(~is_rotary)
-    ends = np.cumsum([n, G, len(smooth), len(smooth)])
-    x, w, v, a, slow = np.split(np.arange(ends[-1] + (shear is not None)), ends)
-    s = ends[-1] + len(slow)
-    A = np.zeros((N, s, s))
-    B = np.zeros((N, s, m))
-    gravity = np.zeros((s, s))
-    A[:, x[:, None], x] = model.A
-    A[:, x[:, None], w] = model.wind
-    B[:, x] = model.B
-    gravity[:n, :n] = model.gravity
-    A[:, w, w] = -1.0 / wind_time
-    A[:, v, v] = -1.0 / GUST_TIME
-    A[:, a, a] = -1.0 / RATE_TIME
-    A[:, w[smooth], v] = A[:, v, a] = 1.0
-    if shear is not None and span is not None:
-        lag = 4.0 * span / (np.pi * speed)
-        alpha, q = (names.states.index(name) for name in SHEARED)
-        vertical = w[names.winds.index("vertical")]
-        effects = np.stack([shear[:, 0], shear[:, 1] * model.A[:, q, q]], axis=1) / (speed * lag)
-        A[:, [alpha, q], vertical] -= effects
-        A[:, [alpha, q], slow] += effects
-        A[:, slow, vertical] = 1.0 / lag
-        A[:, slow, slow] = -1.0 / lag
-    each = model._replace(
-        A=A[:, None],
-        B=B[:, None],
-        C=np.hstack([model.C, np.zeros((m, s - n))]),
-        gravity=gravity,
-        wind=np.zeros((s, 0)),
-        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(s - n)]),
-        size=np.concatenate([model.size, np.ones(s - n)]),
-    )
-    smooth_axes = [names.winds[k] for k in smooth]
-    wind_states = tuple(f"wind.{axis}" for axis in names.winds) + tuple(
-        f"{kind}.{axis}" for kind, axis in product(("rate", "change"), smooth_axes)
-    )
-    wind_states += ("slow.vertical",) * len(slow)
+    air = Air(names, speed, span, shear)
+    m = model.B.shape[-1]
+    each = air.around(model)
     sampled = observer_design.aircraft_model(
-        each, names._replace(states=names.states + wind_states, winds=()), np.zeros(0)
+        each, names._replace(states=names.states + air.states, winds=()), np.zeros(0)
     )
-    winds, changes, rolls = (LEVELS[levels, None, k] for k in range(3))
-    gust = strength[:, None] * np.where(is_rotary, rolls, winds) * noise
-    largest = np.max(noise[smooth], initial=0.0)
-    change = strength[:, None, smooth] * changes * (noise[smooth] / largest)
-    loose = np.concatenate(
-        [
-            np.full((*gust.shape[:2], n), LOOSE),
-            gust,
-            0.0 * change,
-            change + LEAST_RATE,
-            np.zeros((*gust.shape[:2], len(slow))),
-        ],
-        axis=-1,
-    )
+    loose = air.noises(strength, levels)
     weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
     L = observer_design.aircraft_correction(
         sampled, each, weights, corrections_near if near else correction_of
@@ -423,7 +442,7 @@ def filter_bank(
     covariance = np.linalg.solve(
         np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))
     )
-    return FilterBank(sampled, L, np.asarray(covariance), gravity, model.period)
+    return FilterBank(sampled, L, np.asarray(covariance), each.gravity, model.period)
 
 
 class Block(NamedTuple):
@@ -433,6 +452,15 @@ class Block(NamedTuple):
     inputs: NDArray[np.int64]
     outputs: NDArray[np.int64]
     winds: NDArray[np.int64]
+
+    def named(self, airframe: Airframe) -> Names:
+        """The names of the indices."""
+        every = (airframe.states, airframe.inputs, airframe.outputs, airframe.gusts)
+        parts = (
+            tuple(map(tuple(names).__getitem__, places))
+            for names, places in zip(every, self, strict=True)
+        )
+        return Names(*parts)
 
     def restricted(self, model: NominalModel) -> NominalModel:
         """The model of this part alone."""

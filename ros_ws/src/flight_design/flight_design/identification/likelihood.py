@@ -14,7 +14,6 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import ROTARY
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions
 from control_laws.nominal_model import NominalModel
-from control_laws.observer_design import Names
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import (
@@ -191,25 +190,15 @@ class Likelihood:
         The starts of the search take means of `factor` periods, by default of the shortest lag. If
         `coupled`, the entries that are 0 are identified too.
         """
-        factor = (
-            max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
-            if factor is None
-            else factor
-        )
+        if factor is None:
+            factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
         self.coarse = self
         if factor > 1:
-            slow = model._replace(
-                noise=model.noise / np.sqrt(factor), period=factor * recorded.period
-            )
+            period = factor * recorded.period
+            slow = model._replace(noise=model.noise / np.sqrt(factor), period=period)
+            means = coarser(recorded, factor)
             self.coarse = type(self)(
-                coarser(recorded, factor),
-                slow,
-                block,
-                airframe,
-                delay,
-                unknown,
-                factor=1,
-                coupled=coupled,
+                means, slow, block, airframe, delay, unknown, factor=1, coupled=coupled
             )
         self._period = recorded.period
         self._delay = delay / recorded.period
@@ -221,17 +210,7 @@ class Likelihood:
         self._model = block.restricted(model)
         self._block = block
         self._airframe = airframe
-        named = (
-            tuple(airframe.states),
-            tuple(airframe.inputs),
-            airframe.outputs,
-            tuple(airframe.gusts),
-        )
-        parts = [
-            tuple(map(names.__getitem__, places))
-            for names, places in zip(named, block, strict=True)
-        ]
-        self.names = Names(*parts)
+        self.names = block.named(airframe)
         rolls = any(axis in ROTARY for axis in self.names.winds)
         in_part = set(SHEARED) <= set(self.names.states) and "vertical" in self.names.winds
         self._is_sheared = airframe.span is not None and in_part

@@ -93,19 +93,7 @@ def imported(
     kind = kind_of_map(channel_map)
     logged_kind = log.vehicle
     log = log._replace(vehicle=logged_kind or kind)
-    require(
-        log.vehicle in {PLANE, COPTER},
-        "the log",
-        f"one of a {log.vehicle}",
-        "one of a plane or a multicopter",
-    )
-    fits = log.vehicle == kind
-    require(
-        fits,
-        "the log",
-        f"one of a {log.vehicle}",
-        f"one of a {kind} as in the map {channel_map.name}, or another --map",
-    )
+    _require_kind(log.vehicle, channel_map)
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
@@ -139,6 +127,15 @@ def imported(
         raise ParameterError("; ".join([str(error), *notes])) from None
     tape = _tape(channel_map, log, sources, readers, (first, last))
     return Imported(tape, parameters, tuple(filter(None, notes)))
+
+
+def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:
+    """Raise ParameterError for a log of another kind of vehicle than that of the map."""
+    vehicle_found = f"one of a {vehicle}"
+    require(vehicle in {PLANE, COPTER}, "the log", vehicle_found, "one of a plane or a multicopter")
+    kind = kind_of_map(channel_map)
+    expected = f"one of a {kind} as in the map {channel_map.name}, or another --map"
+    require(vehicle == kind, "the log", vehicle_found, expected)
 
 
 def _speed(
@@ -369,12 +366,7 @@ def _flight(
         f"no time in the air {where}",
         "a flight, or --from and --until",
     )
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
-    runs = [
-        (int(stamps[first]), int(stamps[end - 1]))
-        for first, end in zip(edges[::2], edges[1::2], strict=True)
-    ]
-    first, last = max(runs, key=lambda run: run[1] - run[0])
+    first, last = _longest_run(stamps, keep)
     length = 1e-9 * (last - first)
     require(
         length >= LEAST,
@@ -383,6 +375,16 @@ def _flight(
         f"{LEAST:g} s or more in one stretch",
     )
     return first, last
+
+
+def _longest_run(stamps: Stamps, keep: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last instant of the longest stretch that is kept, mask (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    runs = [
+        (int(stamps[first]), int(stamps[end - 1]))
+        for first, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
+    return max(runs, key=lambda run: run[1] - run[0])
 
 
 def _complete(stamp_ns: Stamps, values: FloatArray) -> tuple[Stamps, FloatArray]:

@@ -171,33 +171,23 @@ def identify(
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
     keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
-    bound; `unknown` what else is identified; `flown` the model in flight, a further start of the
-    search; `progress` is called with the steps `completed` of the search, and their largest number
-    `total`. Raises ParameterError for an output that does not move.
+    bound; `unknown` what else is identified; `flown` the model in flight, a further start;
+    `progress` takes the steps `completed` and their largest number `total`. Raises ParameterError
+    for an output that does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
-    still = [
-        name
-        for name, y in zip(airframe.outputs, recorded.y[known].T, strict=True)
-        if not np.diff(y).any()
-    ]
-    require(
-        not still,
-        "record",
-        f"a constant {', '.join(still)}",
-        "outputs that move, or the noise of their sensors",
-    )
+    _require_motion(airframe.outputs, recorded.y[known])
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every = blocks(model)
     step_count = count(1)
     starts = len(STARTS) + len(SIGNS) + (flown is not None)
-    total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (
-        START_STEPS + STEPS
-    )
+    total = len(every) * (starts * START_STEPS + REFINED * STEPS)
+    total += (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     study = _Study(recorded, blown, actuation.delay, unknown, validating, paired, at_bound)
+    used = known & ~validating
 
     def step() -> None:
         progress(completed=next(step_count), total=total)
@@ -205,18 +195,17 @@ def identify(
     fits = []
     for search in (study.search(model, block) for block in every):
         also = None if flown is None else search.model_errors(flown)
-        fits.append((search, search.fit(known & ~validating, step, flown=also)))
+        fits.append((search, search.fit(used, step, flown=also)))
     parts = [study.part(*each) for each in fits]
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
-    others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
     follows = [
-        correlation(fit.after.normalised, u, known)
-        for (_, fit), u in zip(fits, others, strict=True)
+        correlation(fit.after.normalised, np.delete(recorded.u, block.inputs, axis=1), known)
+        for (_, fit), block in zip(fits, every, strict=True)
     ]
     if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
         search = study.search(model, whole_aircraft(model), coupled=True)
-        fit = search.fit(known & ~validating, step, begin=search.joined(fits))
+        fit = search.fit(used, step, begin=search.joined(fits))
         part = study.part(search, fit)
         gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
         white = part.after.whiteness.max() <= MAX_WHITENESS
@@ -225,10 +214,17 @@ def identify(
             first = fit.before
             last = fit.after
     identified = with_entries(airframe, chain.from_iterable(part.entries for part in parts))
-    figures = prediction(first, validating), prediction(last, validating)
-    return Identification(
-        identified, recorded, validating, (first.r, last.r), *figures, tuple(parts)
-    )
+    before = prediction(first, validating)
+    after = prediction(last, validating)
+    both = (first.r, last.r)
+    return Identification(identified, recorded, validating, both, before, after, tuple(parts))
+
+
+def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:
+    """Raise ParameterError for an output that never changes; y (T, m)."""
+    still = [name for name, values in zip(outputs, y.T, strict=True) if not np.diff(values).any()]
+    expected = "outputs that move, or the noise of their sensors"
+    require(not still, "record", f"a constant {', '.join(still)}", expected)
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:

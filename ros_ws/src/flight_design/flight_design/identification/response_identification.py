@@ -15,16 +15,21 @@ reduced one).
 import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+from flight_design.identification.step_response_fit import (
+    RESOLUTION,
+    Column,
+    fitted_column,
+    no_column,
+)
 
 # s, width of the windows over which u and older y are averaged: shorter than a servo's lag
 WINDOW = 0.02
@@ -36,7 +41,6 @@ FINE_U = 0.45
 # controller
 FAR = 2.0
 HORIZON = 0.8  # s of the step response
-MAX_DELAY = 0.3  # s
 DRAWS = 200  # of the predictor's coefficients, for the covariance of the step response
 # of a coefficient: it turns a typical y or u into so many typical changes of y within a window
 PRIOR = 10.0
@@ -58,29 +62,6 @@ LEAST_DELAY = 0.01
 ITERATIONS = 3  # of the variance of a prediction and the coefficients
 MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
 
-RANK = 1e-10  # of the largest eigenvalue of the normal equations: smaller ones are rounding
-MAX_LAG = 1.0  # s
-RESOLUTION = 0.025  # s between the points of the step response that are fitted
-FLOOR = 0.01  # of the largest value of a step response: what windows and a linear model leave out
-STARTS_DELAY = (0.02, 0.1, 0.2)  # s
-STARTS_LAG = (0.03, 0.2)  # of the search
-# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest
-# value of the step response
-LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
-UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
-SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
-SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
-ORDERS = (
-    (1, 1, 1, 0, 0, 0),
-    (1, 1, 1, 1, 0, 0),
-    (1, 1, 1, 1, 1, 1),
-)  # an integrator, first order, second order
-MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
-# of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can
-# show
-TOLERANCE = 1e-6
-EARLY = 0.3  # s after delay and lag in which the sign of a response shows
-COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
 
 Spans = Sequence[tuple[int, int]]
 
@@ -394,16 +375,6 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
 # The step response
 
 
-class _Column(NamedTuple):
-    Omega: FloatArray  # (m,)
-    deviation: FloatArray  # (m,)
-    lag: float
-    lag_deviation: float
-    delay: float
-    delay_deviation: float
-    sign_ratio: float
-
-
 def _moves(parts: Iterable[FloatArray]) -> bool:
     """Whether a channel moves in any part of the log."""
     return any(len(part) and np.ptp(part) > 0.0 for part in parts)
@@ -429,7 +400,9 @@ def _responses(
         }
         still = next((name for name, parts in recorded.items() if not _moves(parts)), "")
         usable = not still and bool(np.isfinite(responses[..., j]).all())
-        columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
+        columns.append(
+            fitted_column(t, responses[..., j], j) if usable else no_column(len(outputs))
+        )
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
     counts = (share >= MIN_SHARE) & ~(
         (share < 1.0) & (np.array([column.delay for column in columns]) < LEAST_DELAY)
@@ -451,13 +424,7 @@ def _responses(
     )
 
 
-def _no_column(m: int) -> _Column:
-    return _Column(
-        np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0
-    )
-
-
-def _refusal(output: str, name: str, column: _Column, j: int, still: str, share: float) -> str:
+def _refusal(output: str, name: str, column: Column, j: int, still: str, share: float) -> str:
     if still:
         return f"{output} by {name}: found {still} constant, expected it to move"
     if not np.isfinite(column.Omega[j]):
@@ -494,164 +461,3 @@ def _more_excitation(name: str, ratio: float) -> str:
     """Errors fall with the excitation, and with the root of time."""
     factor = MIN_RATIO / max(ratio, 0.5)
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"
-
-
-def second_order(
-    t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
-) -> tuple[FloatArray, FloatArray]:
-    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t
-    - delay) - v.
-
-    Shapes (N,).
-    """
-    begin = np.maximum(t - delay, 0.0)
-    A = np.array(
-        [[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]]
-    )  # z, z', v; y = z' or z
-    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
-    parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
-    product = values[:, None] * begin
-    small = np.abs(product) < 1e-6
-    grown = np.where(
-        small, begin, np.expm1(product) / np.where(values == 0.0, 1.0, values)[:, None]
-    )
-    z = (vectors @ (parts[:, None] * grown)).real
-    return z[1], z[0]
-
-
-def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
-    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs with
-    this delay and lag.
-
-    Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
-    """
-    step = responses[0]
-    size = max(float(np.max(np.abs(step[:, j]))), np.finfo(float).tiny)
-    whiten = _whitener(responses[:, :, j])
-    best = _search(t, whiten, step[:, j] / size, size, ORDERS[0], None)
-    for free in ORDERS[1:]:
-        tried = _search(t, whiten, step[:, j] / size, size, free, best.theta)
-        if best.chi_squared - tried.chi_squared > MIN_GAIN * (
-            sum(free) - sum(best.free)
-        ) and begins_with_Omega(t, tried.theta):
-            best = tried
-    inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
-    misfit = max(
-        best.chi_squared / max(len(t) - sum(best.free), 1), 1.0
-    )  # R. T. Birge, Phys. Rev. 40, 1932
-    deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
-    J = best.jacobian[:, inside]
-    deviation[inside] = np.sqrt(misfit * np.diag(np.linalg.pinv(J.T @ J)))
-    delay = float(best.theta[0])
-    lag = float(best.theta[1])
-    sign = math.sqrt(_significance(t, responses[:, :, j], best.theta, size) / misfit)
-    early = (t > delay) & (t <= delay + lag + COUPLING_SPAN)
-    basis = np.stack(second_order(t[early], delay, lag, 0.0, 0.0), axis=1)
-    Omega = np.zeros(step.shape[1])
-    error = np.zeros(step.shape[1])
-    for i in range(step.shape[1]):
-        whiten = _whitener(responses[:, early, i])
-        solve = np.linalg.pinv(whiten @ basis)
-        Omega[i] = (solve @ (whiten @ step[early, i]))[0]
-        error[i] = np.linalg.norm(solve[0])
-    Omega[j] = best.theta[2] * size
-    error[j] = deviation[2] * size
-    return _Column(Omega, error, lag, float(deviation[1]), delay, float(deviation[0]), sign)
-
-
-def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Whether a fitted response has the sign of Omega up to EARLY after delay and lag.
-
-    Otherwise the slow part is the whole response, two poles are in the place of a pole and a lag,
-    and Omega is about 0.
-    """
-    delay, lag, Omega, damping, stiffness, slow = theta
-    first, second = second_order(t[t <= delay + lag + EARLY], delay, lag, damping, stiffness)
-    return bool(np.sum(Omega * first + slow * second) * Omega > 0.0)
-
-
-def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Chi squared of no response against the fitted response, up to EARLY after delay and lag, less
-    the parameters.
-    """
-    early = t <= theta[0] + theta[1] + EARLY
-    first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
-    fitted = size * (theta[2] * first + theta[5] * second)
-    whiten = _whitener(responses[:, early])
-    none = whiten @ responses[0, early]
-    misfit = whiten @ (responses[0, early] - fitted)
-    return (
-        max(float(none @ none - misfit @ misfit) - len(theta), 0.0)
-        if begins_with_Omega(t, theta)
-        else 0.0
-    )
-
-
-def _whitener(responses: FloatArray) -> FloatArray:
-    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the
-    largest value.
-
-    0 for the responses of a constant output.
-    """
-    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
-    floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
-    deviations = np.sqrt(np.maximum(values, 0.0) + floor)
-    return np.asarray(vectors.T / np.where(deviations > 0.0, deviations, np.inf)[:, None])
-
-
-class _Curve(NamedTuple):
-    """A fitted step response: delay, lag, Omega, damping, stiffness, slow part."""
-
-    theta: FloatArray
-    free: tuple[int, ...]  # 1 where an entry is fitted
-    chi_squared: float
-    jacobian: FloatArray
-
-
-def _search(
-    t: FloatArray,
-    whiten: FloatArray,
-    step: FloatArray,
-    size: float,
-    free: tuple[int, ...],
-    start: FloatArray | None,
-) -> _Curve:
-    """Least squares over the free entries, from several delays and lags and from `start`."""
-    fitted = np.array(free, dtype=bool)
-
-    def expanded(theta: FloatArray) -> FloatArray:
-        values = np.zeros(len(free))
-        values[fitted] = theta
-        return values
-
-    def residuals(theta: FloatArray) -> FloatArray:
-        delay, lag, Omega, damping, stiffness, slow = expanded(theta)
-        first, second = second_order(t, delay, lag, damping, stiffness)
-        return np.concatenate(
-            [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
-        )
-
-    starts = [] if start is None else [start]
-    for delay in STARTS_DELAY:
-        for lag in STARTS_LAG:
-            first, _ = second_order(t, delay, lag, 2.0, 0.0)
-            seen = whiten @ first
-            slope = float(seen @ whiten @ step) / max(float(seen @ seen), np.finfo(float).tiny)
-            starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
-    bounds = LOWER[fitted], UPPER[fitted]
-    best: Any = min(
-        (
-            least_squares(
-                residuals,
-                np.clip(start[fitted], *bounds),
-                bounds=bounds,
-                x_scale=SCALE[fitted],
-                ftol=TOLERANCE,
-            )
-            for start in starts
-        ),
-        key=lambda fit: float(fit.cost),
-    )
-    jacobian = np.zeros((len(best.fun), len(free)))
-    jacobian[:, fitted] = best.jac
-    return _Curve(expanded(best.x), free, 2.0 * float(best.cost), jacobian)

@@ -8,7 +8,6 @@ engineering procedure of `rise-di gains`, with the slew of the inputs measured i
 in this module is specific to an aircraft.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,15 +29,13 @@ from aircraft_sim.jsbsim_aircraft import (
 )
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import NOT_BALANCED, nearest_trim, sideslip_zero, trim_solution
-from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
+from aircraft_sim.turbulence import MODERATE_SIGMA
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
-from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.channel_signs import require_channels
@@ -52,7 +49,24 @@ from flight_design.gains.observer_selection import (
     with_extended_state_observer,
 )
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
+from flight_design.identification.manoeuvre import (
+    CLIMB,
+    CLIMB_START,
+    DURATION,
+    GUST_LENGTH,
+    GUST_SPEED,
+    GUST_START,
+    HEIGHTS,
+    RATE,
+    TURN,
+    TURN_START,
+    ManoeuvreResult,
+    fly_all,
+    moderate_turbulence,
+    reference_parameters,
+)
 from flight_design.identification.sketch import sketch
+from flight_design.identification.step_responses import Responses, step_responses
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import coupling
 from rise_di_controller.law import total_lag
@@ -60,20 +74,7 @@ from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 # The step tests
 
-SIZES = (0.05, 0.1, 0.2)
-"""Steps, in normalised commands: the small ones stay linear, the large ones exceed a hysteresis and
-reach a rate limit."""
 
-MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
-WINDOWS = {"V": 10.0}  # s, length of a response: engines and propellers need seconds to spin up
-WINDOW = 0.5  # s, the same for body rates
-SPAN = 0.025  # s, length of a chord
-TANGENT_CUTOFF = (
-    0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
-)
-
-# Hz, Hz, s: of y, of the law, of the integration
-RATE = 200.0
 CONTROL_RATE = 100.0
 STEP = 0.005
 SAMPLES = (
@@ -83,6 +84,8 @@ SAMPLES = (
 # transport
 DELAY = 0.006
 
+THROTTLE = list(INPUTS).index("throttle")
+
 NOISE_SHARE = (
     100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 )
@@ -91,226 +94,16 @@ NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
 """rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first
 flight."""
 
-Fly = Callable[[FloatArray, float], FloatArray]
-"""(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m),
-deviations from trim."""
-
-
-class Tangent(NamedTuple):
-    """The steepest chord of a step response, an estimate of the steepest tangent: y = slope (t -
-    lag).
-    """
-
-    slope: float
-    lag: float  # s
-    first: int  # samples at its ends
-    last: int
-
-
-class Responses(NamedTuple):
-    """Result of the step tests, outputs and inputs in their canonical order, output i driven by
-    input i.
-    """
-
-    Omega: FloatArray  # (m, m) effective C B: slopes of y per unit of u
-    lag: FloatArray  # (m,) s, of each input's own output
-    size: FloatArray  # (m,) of the step with the steepest tangent
-    spread: FloatArray  # (m,) smallest slope of all sizes / largest one: 1 is linear
-    rejected: tuple[str, ...]  # steps without a result, with the reason
-
-
-def steepest_tangent(y: FloatArray, dt: float) -> Tangent | None:
-    """The steepest tangent of a unit step response, y of shape (N,) every dt; None if y is
-    constant.
-
-    A chord joins samples 25 ms apart. The result is the chord at the first maximum of the slope:
-    the search ends when the slope has fallen to 0.7 of it. For y_dot = slope (1 - exp(-t / lag)) it
-    gives slope and lag, up to exp(-t / lag) at the end. Source: the process reaction curve of J. G.
-    Ziegler, N. B. Nichols, Trans. ASME 64, 1942.
-    """
-    count = max(round(SPAN / dt), 1)
-    slopes = (y[count:] - y[:-count]) / (count * dt)
-    sizes = np.abs(slopes)
-    passed = np.flatnonzero(sizes < TANGENT_CUTOFF * np.maximum.accumulate(sizes))
-    k = int(np.argmax(sizes[: passed[0]] if len(passed) else sizes))
-    if sizes[k] == 0.0:
-        return None
-    lag = (k + count / 2.0) * dt - (y[k] + y[k + count]) / 2.0 / slopes[k]
-    return Tangent(float(slopes[k]), max(float(lag), 0.0), k, k + count)
-
-
-def step_responses(
-    fly: Fly,
-    lower: FloatArray,
-    upper: FloatArray,
-    outputs: Sequence[str],
-    inputs: Sequence[str],
-    dt: float,
-    progress: Callable[[str], None] = lambda _: None,
-) -> Responses:
-    """Step each input in both directions, by several sizes, and take Omega and the lags from the
-    tangents of its output.
-
-    The response is the odd part, (y(+s) - y(-s)) / 2s: a drift of the trim and all even parts
-    cancel. The steepest response of all sizes gives the column, Omega_ij = y_i / (t - lag) at the
-    middle of the chord of j, and the longest lag is used: too large an Omega or lag costs little
-    performance, too small a one costs stability. Raises FlightEnded if an output does not respond
-    to any step.
-
-    Arguments: `lower`, `upper` the end stops of u from trim, (m,); `dt` that of `fly`.
-    """
-    m = len(inputs)
-    Omega = np.zeros((m, m))
-    lag = np.zeros(m)
-    size = np.zeros(m)
-    spread = np.zeros(m)
-    rejected: list[str] = []
-    for j, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
-        progress(f"steps of {name}")
-        responses: list[tuple[Tangent, float, FloatArray]] = []
-        for step in sorted(
-            {min(size, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for size in SIZES}
-        ):
-            u = step * np.eye(m)[j]
-            try:
-                y = (fly(u, WINDOWS.get(output, WINDOW)) - fly(-u, WINDOWS.get(output, WINDOW))) / (
-                    2.0 * step
-                )
-            except FlightEnded as error:
-                rejected.append(f"{name} by {step:.3g}: {error}")
-                continue
-            chord = steepest_tangent(y[:, j], dt)
-            if chord is None:
-                rejected.append(f"{name} by {step:.3g}: {output} does not move")
-                continue
-            middle = (chord.first + chord.last) / 2.0 * dt
-            responses.append(
-                (chord, step, (y[chord.first] + y[chord.last]) / 2.0 / (middle - chord.lag))
-            )
-        if not responses:
-            raise FlightEnded(f"{output} does not respond to {name}: {'; '.join(rejected)}")
-        steepest, size[j], Omega[:, j] = max(responses, key=lambda response: abs(response[0].slope))
-        lag[j] = max(chord.lag for chord, *_ in responses)
-        spread[j] = min(abs(chord.slope) for chord, *_ in responses) / abs(steepest.slope)
-    return Responses(Omega, lag, size, spread, tuple(rejected))
-
 
 # The manoeuvre: one rule for all aircraft
 
-PULSE_Q = 0.05  # rad/s
-PULSE_P = 0.15  # rad/s
-PULSE_V = 2.0  # m/s: heights of the pulses
-HEIGHTS = {
-    "q": PULSE_Q,
-    "V": PULSE_V,
-    "p": PULSE_P,
-    "r": PULSE_Q,
-}  # also the units of the outputs in the coupling
-NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
-DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
-AUTHORITY_FRACTION = (
-    1.0 / 3.0
-)  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
 # rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no
 # lag alone
 FASTEST_V = 0.46
-DURATION = 60.0  # s
-# m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
-GUST_SPEED = 5.0
-GUST_LENGTH = 30.48
-GUST_START = 50.0  # s
-TURN = math.pi / 2.0  # rad
-CLIMB = 100.0  # m: the targets of guidance in place of the pulses
-# s
-TURN_START = 2.0
-CLIMB_START = 30.0
 LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
 
 
-def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
-    """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of
-    the throttle (m/s^2).
-
-        q
-            0.05 rad/s, or 1 g / speed if that is less, up and down for 1 s each: each pair restores
-            the flight path
-        V
-            2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority,
-            omega up to 1.2 rad/s
-        p   0.15 rad/s right and left for 1 s each: banks of 9 degrees
-        r   the coordinated turn g/V0 sin(bank)
-
-    The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not
-    commanded: the nose drops in them.
-    """
-    q = min(PULSE_Q, GRAVITY / speed)
-    p = PULSE_P
-    slow = min(NATURAL_FREQUENCY["V"], AUTHORITY_FRACTION * authority * math.e / PULSE_V)
-    return {
-        "rate": RATE,
-        "outputs": list(OUTPUTS),
-        "second_order": {
-            "natural_frequency": [
-                slow if name == "V" else NATURAL_FREQUENCY[name] for name in OUTPUTS
-            ],
-            "damping": [DAMPING[name] for name in OUTPUTS],
-        },
-        "rise": 0.1,
-        "pulses": {
-            "q": {
-                "start": [2.0, 4.0, 40.0, 42.0],
-                "stop": [3.0, 5.0, 41.0, 43.0],
-                "value": [q, -q, -q, q],
-            },
-            "V": {"start": [10.0], "stop": [30.0], "value": [PULSE_V]},
-            "p": {
-                "start": [12.0, 14.0, 18.0, 20.0],
-                "stop": [13.0, 15.0, 19.0, 21.0],
-                "value": [p, -p, -p, p],
-            },
-        },
-        "coordinated_turn": {"bank_rate": "p", "turn_rate": "r", "speed": speed},
-    }
-
-
-def moderate_turbulence(altitude: float) -> dict[str, Any]:
-    """Parameters of moderate turbulence at an altitude, m; at high altitude the intensity is 10
-    ft/s.
-    """
-    values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
-    if altitude < HIGH:
-        values["wind"] = MODERATE_WIND
-    if altitude > LOW:
-        values["sigma"] = MODERATE_SIGMA
-    return values
-
-
 # Identification
-
-
-LEAST_SHARE = 0.01
-"""Of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
-
-
-class ManoeuvreResult(NamedTuple):
-    """Result of a simulation of the manoeuvre in one process."""
-
-    outcome: str
-    rms: dict[str, float]  # of the error by output, SI
-    largest: dict[str, float]  # abs(u) by input
-    at_stop: dict[
-        str, float
-    ]  # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
-
-    @property
-    def text(self) -> str:
-        """The outcome, and the inputs that were at their limits."""
-        return ", ".join(
-            [
-                self.outcome,
-                *(f"{name} at its stop {share:.0%}" for name, share in self.at_stop.items()),
-            ]
-        )
 
 
 class IdentifiedAircraft(NamedTuple):
@@ -371,27 +164,54 @@ def identify(
     altitude in m.
 
     1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs
-       in units of the manoeuvre,
-    and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the
-    lags; all other terms count as f. 5. A simulation in moderate turbulence with K and Lambda
-    alone: the slew of its u replaces that of the ideal control and gives beta; that of V is K
-    bandwidth / 4 times the rms of light turbulence. With `observer_margin`, the delay margin in s
-    of the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them.
-    The margins of that loop meet `needed`, with 35 degrees of phase beside an observer. 6.
-    Simulations of the result: in calm air, with a gust, in turbulence. With `guided` the scenario
-    has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its
-    stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft whose
-    `sideslip_zero` is positive, too. With `learns` the scenario learns in moderate turbulence: the
-    gains begin alone, `observer_margin` is the margin of the designs, and the rough model is the
-    `sketch` of Omega and speed.
+    in units of the manoeuvre, and D from the minors. 4. Gains by the engineering procedure for
+    y_dot = Omega u behind the lags; all other terms count as f. 5. A simulation in moderate
+    turbulence with K and Lambda alone, whose slew of u gives beta: `_flown_slew`. With
+    `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, an extended-state
+    observer and the gains beside it replace them. The margins of that loop meet `needed`, with 35
+    degrees of phase beside an observer. 6. Simulations of the result: in calm air, with a gust, in
+    turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by 90
+    degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip
+    feedback flies an aircraft whose `sideslip_zero` is positive, too. With `learns` the scenario
+    learns in moderate turbulence: the gains begin alone, `observer_margin` is the margin of the
+    designs, and the rough model is the `sketch` of Omega and speed.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
     """
     condition = FlightCondition(require_aircraft(name), speed, altitude, nanoseconds(STEP), named)
-    progress("trim")
     trim = _trim(condition, progress)
     stall = slowest_trim(condition) if guided else None
+    measured = _measured(condition, trim, progress)
+    Omega = measured.Omega
+    range_ = min(-trim.lower[THROTTLE], trim.upper[THROTTLE])
+    authority = float(abs(Omega[THROTTLE, THROTTLE]) * range_)
+    commands = reference_parameters(speed, authority)
+    scaled = _in_units_of_the_manoeuvre(Omega, trim)
+    V_bandwidth = airspeed_bandwidth(authority, float(measured.lag[THROTTLE]))
+    setting = _setting(trim, measured.lag, V_bandwidth)._replace(requirement=needed)
+
+    def scenario_text(selection: Selection) -> str:
+        return _text(condition, trim, measured, commands, selection, stall)
+
+    progress("slew of the inputs")
+    studied = _study(condition, Omega, commands)
+    first = gain_selection.select_gains(studied, setting)
+    slew = _flown_slew(_load(scenario_text(first)), measured, V_bandwidth)
+    chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
+    if observer_margin is not None and not learns:
+        chosen = with_observer(chosen, Omega, observer_margin)
+    text = scenario_text(chosen)
+    flights = fly_all(_load(text), progress)
+    if observer_margin is not None and learns:
+        text = scenario_text(that_learns(chosen, condition, Omega, observer_margin))
+    return IdentifiedAircraft(
+        condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights
+    )
+
+
+def _measured(condition: FlightCondition, trim: Trim, progress: Callable[[str], None]) -> Responses:
+    """The step tests of an aircraft."""
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
         vehicle = _vehicle(condition)
@@ -401,53 +221,45 @@ def identify(
             rows.append(vehicle.y())
         return np.array(rows)
 
+    return step_responses(
+        fly, trim.lower, trim.upper, tuple(OUTPUTS), tuple(INPUTS), STEP, progress
+    )
+
+
+def _in_units_of_the_manoeuvre(Omega: FloatArray, trim: Trim) -> FloatArray:
+    """Omega with outputs in units of the manoeuvre. Raises ParameterError where outputs and inputs
+    cannot be paired.
+    """
     outputs = tuple(OUTPUTS)
     inputs = tuple(INPUTS)
-    measured = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
-    throttle = inputs.index("throttle")
-    authority = abs(measured.Omega[throttle, throttle]) * min(
-        -trim.lower[throttle], trim.upper[throttle]
-    )
-    commands = reference_parameters(speed, float(authority))
-    scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
+    scaled = Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     try:
         require_channels(scaled, ChannelPairing(outputs, inputs))
     except ParameterError as error:
-        weak = _too_weak(measured.Omega, trim, outputs, inputs)
+        weak = _too_weak(Omega, trim, outputs, inputs)
         raise ParameterError(f"{error}{weak}") from None
-    studied = _study(condition, measured.Omega, commands)
-    V_bandwidth = airspeed_bandwidth(float(authority), float(measured.lag[throttle]))
-    setting = _setting(trim, measured.lag, V_bandwidth)._replace(requirement=needed)
+    return np.asarray(scaled)
 
-    def scenario_text(selection: Selection) -> str:
-        return _text(condition, trim, measured, commands, selection, stall)
 
-    progress("slew of the inputs")
-    first = gain_selection.select_gains(studied, setting)
-    turbulent = _load(scenario_text(first)).vary(
-        aircraft={"turbulence": moderate_turbulence(altitude)}
-    )
-    tape = simulate(without_beta(turbulent))
+def _flown_slew(scenario: Scenario, measured: Responses, V_bandwidth: float) -> FloatArray:
+    """The slew of the inputs in moderate turbulence by K and Lambda alone, (m,), 1/s.
+
+    V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no
+    faster than the Lambda of the rule would, bandwidth / 4; the phase margin may ask for less
+    Lambda.
+    """
+    turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
+    tape = simulate(without_beta(scenario.vary(aircraft={"turbulence": turbulence})))
     slew = _slew(tape, measured.lag)
-    # V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no
-    # faster than the Lambda of the rule would, bandwidth / 4; the phase margin may ask for less
-    # Lambda
     sign = V_bandwidth**2 / 4.0 * LIGHT_SIGMA  # m/s^3
-    slew[throttle] = sign / (gain_selection.BETA_TO_SLEW * abs(measured.Omega[throttle, throttle]))
-    chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
-    if observer_margin is not None and not learns:
-        chosen = with_observer(chosen, measured.Omega, observer_margin)
-    text = scenario_text(chosen)
-    flights = fly_all(_load(text), progress)
-    if observer_margin is not None and learns:
-        text = scenario_text(that_learns(chosen, condition, measured.Omega, observer_margin))
-    return IdentifiedAircraft(
-        condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights
-    )
+    effect = abs(measured.Omega[THROTTLE, THROTTLE])
+    slew[THROTTLE] = sign / (gain_selection.BETA_TO_SLEW * effect)
+    return slew
 
 
 def _trim(condition: FlightCondition, progress: Callable[[str], None]) -> Trim:
     """The trim of an aircraft. Raises FlightEnded, with the nearest condition that has a trim."""
+    progress("trim")
     try:
         return _vehicle(condition).trim
     except FlightEnded as error:
@@ -537,36 +349,6 @@ def that_learns(
     observer = designed.observer.model_copy(update={"part": 0.0})
     sections = {"feedforward": designed.feedforward, "observer": observer, "learn": LearnConfig()}
     return replace(selection, chosen=start.model_copy(update=sections))
-
-
-def fly_all(
-    scenario: Scenario, progress: Callable[[str], None] = lambda _: None
-) -> dict[str, ManoeuvreResult]:
-    """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate
-    "turbulence" without the gust.
-    """
-    turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
-    flights = {}
-    for title, changes in (
-        ("calm", {"gusts": {}}),
-        ("gust", {}),
-        ("turbulence", {"gusts": {}, "turbulence": turbulence}),
-    ):
-        progress(f"flight: {title}")
-        flights[title] = manoeuvre_result(simulate(scenario.vary(aircraft=changes)))
-    return flights
-
-
-def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
-    """Rms errors, the largest commands and the inputs at their limits of a tape."""
-    _, error = best_error(tape)
-    rms = {name: error_metrics(error[name]).rms for name in error.names}
-    largest = {
-        name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names
-    }
-    shares = {name: kinds["magnitude"] for name, kinds in saturation_shares(tape).items()}
-    at_stop = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
-    return ManoeuvreResult(tape.outcome, rms, largest, at_stop)
 
 
 def without_beta(scenario: Scenario) -> Scenario:

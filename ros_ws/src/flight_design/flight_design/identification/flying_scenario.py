@@ -1,0 +1,381 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A scenario for an aircraft with identified channels: gains, commands and margins."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.uncertainty import nominal_and_sampled
+from autopilot_bridge.map_rows import UNITS
+from autopilot_bridge.params import ChannelMap
+from flight_analysis.closed_loop.loop_margins import (
+    LoopMargins,
+    law_order,
+    linear_loop,
+    loop_assessment,
+)
+from flight_core.vectors import FloatArray
+from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.gain_conditions import bandwidths
+from flight_design.gains.gain_selection import LoopSetting
+from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
+from flight_design.gains.requirement import (
+    REQUIREMENT,
+    Candidate,
+    Requirement,
+    unmet,
+    within_requirement,
+)
+from flight_design.identification.bridge_identification import (
+    RATE,
+    WAIT,
+    Channels,
+    airframe_yaml,
+    channel_pairs,
+    controller_values,
+    motions,
+    scenario_text,
+)
+from flight_design.identification.manoeuvre import (
+    DAMPING,
+    NATURAL_FREQUENCY,
+    PULSE_P,
+    PULSE_V,
+    reference_parameters,
+)
+from reference_model.params import ReferenceModelConfig
+from rise_di_controller.law import Sign
+from rise_di_controller.linear_loop import Loop
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+REFERENCE_BANDWIDTH = (
+    0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
+)
+# of the limit of thrust, which the command of V or climb needs in the end; the rest is for
+# disturbances
+HELD_FRACTION = 0.5
+HOVER = {
+    "q": PULSE_P,
+    "p": PULSE_P,
+    "r": PULSE_P,
+}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
+FULL_RANGE_TIME = (
+    1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+)
+# of the uncertain aircraft whose phase margin counts
+UNCERTAINTY = 0.3
+SAMPLES = 20
+MAX_SENSITIVITY = (
+    2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+)
+INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
+
+
+class Flyable(NamedTuple):
+    """A controller for an identified aircraft, and the files for a flight."""
+
+    controller: RiseDiConfig
+    delay_margin: (
+        float | None
+    )  # s, of the identified channels with the lags and the delay; None without a softened sign
+    lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
+    airframe: str  # text of the airframe file
+    scenario: str  # text of the scenario file
+
+
+def flying_scenario(
+    channel_map: ChannelMap,
+    channels: Channels,
+    speed: float | None,
+    airframe_file: str,
+    needed: Requirement = REQUIREMENT,
+) -> Flyable:
+    """Gains for identified channels, and the texts of airframe and scenario.
+
+    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega
+    u. The integrals follow from damping and stiffness. Integrals and bandwidths fall until the loop
+    around the identified channels has the margins `needed`. The feedforward has the airframe as
+    model, in coordinated turns without sideslip.
+    """
+    identified = _Identified(channel_map, channels, speed)
+    commands = identified.commands()
+    reference = ReferenceModelConfig.validate_mapping(commands, "reference_model")
+    manoeuvre = Manoeuvre(reference, {}, WAIT + 60.0)
+    source = "identified in flight"
+    flying = ideal_control.study_airframe(identified.airframe(source), manoeuvre, samples=1)
+    studied = identified.of_integrators(manoeuvre)
+    studied = studied._replace(slew=np.maximum(flying.slew, identified.reach / FULL_RANGE_TIME))
+    selection = gain_selection.select_gains(studied, identified.setting(needed))
+    flown, margins = _within_margins(
+        _with_integrals(selection.chosen, identified.pairing, channels, identified.loop),
+        flying,
+        needed,
+    )
+    turning = identified
+    if commands["coordinated_turn"] is not None:
+        turning = identified._replace(channels=_without_sideslip(channels, identified.pairing))
+    model = turning.airframe("identified in flight, without sideslip")
+    flown = gain_selection.with_feedforward(flown, model)
+    heading = (
+        f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
+    )
+    heading += f"\n# {gain_yaml.margins_sentence(flown, margins)}"
+    values = flown.model_dump(exclude_defaults=True)
+    text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, values)
+    lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
+    delay = None if margins is None else margins.delay
+    return Flyable(flown, delay, lacking, identified.airframe_text(source), text)
+
+
+class _Identified(NamedTuple):
+    """The identified channels of a map, and the trim speed, m/s, None in hover."""
+
+    channel_map: ChannelMap
+    channels: Channels
+    speed: float | None
+
+    @property
+    def pairing(self) -> ChannelPairing:
+        """Outputs and their inputs."""
+        return channel_pairs(self.channel_map)[0]
+
+    @property
+    def loop(self) -> Loop:
+        """The loop with one delay: what a channel has beyond it counts as its lag."""
+        channels = self.channels
+        delay = float(np.min(channels.delay))
+        return Loop(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
+
+    @property
+    def products(self) -> dict[str, float]:
+        """Crossover times lag, by output."""
+        moved = motions(self.channel_map).items()
+        return {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved}
+
+    @property
+    def reach(self) -> FloatArray:
+        """The smaller limit of each input, (m,)."""
+        rows = [self.channel_map.inputs[name] for name in self.pairing.inputs]
+        return np.array([min(-row.lower, row.upper) for row in rows])
+
+    def commands(self) -> dict[str, Any]:
+        """Commands within reach of the loop: `_commands`."""
+        crossover = bandwidths(self.loop, np.array(list(self.products.values())))
+        authority = np.abs(np.diag(self.channels.Omega)) * self.reach
+        held = HELD_FRACTION * authority / np.maximum(self.channels.damping, 1e-3)
+        by_output = (
+            dict(zip(self.pairing.outputs, values.tolist(), strict=True))
+            for values in (crossover, authority, held)
+        )
+        return _commands(motions(self.channel_map), self.speed, *by_output)
+
+    def airframe_text(self, source: str) -> str:
+        """The text of the airframe file."""
+        return airframe_yaml(self.channel_map, self.pairing, self.channels, self.speed, source)
+
+    def airframe(self, source: str) -> Airframe:
+        """The airframe."""
+        return Airframe.validate_mapping(yaml.safe_load(self.airframe_text(source)), "airframe")
+
+    def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
+        """The study of y_dot = Omega u.
+
+        Over 1 s alone: the literal gain set needs more of the manoeuvre than the slew, and is not
+        used.
+        """
+        none = np.zeros_like(self.channels.damping)
+        channels = self.channels._replace(damping=none, stiffness=none, zero=none)
+        integrators = self._replace(channels=channels).airframe("none")
+        short = manoeuvre._replace(duration=1.0)
+        return ideal_control.study_airframe(integrators, short, samples=1)
+
+    def setting(self, needed: Requirement) -> LoopSetting:
+        """What the gains are selected for; each gain is 1 before."""
+        loop = self.loop
+        lag = loop.lag.tolist()
+        ones = [1.0] * len(lag)
+        base = RiseDiConfig.validate_mapping(
+            controller_values(self.channel_map, self.pairing)
+            | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
+            | {
+                "k_g": 1.0,
+                "k_d": ones[1:],
+                "D": [1] * len(ones),
+                "sign": "auto",
+                "softening": gain_selection.SOFTENING,
+                "lag": lag,
+                "delay": loop.delay,
+            },
+            "controller",
+        )
+        lags = dict(zip(self.pairing.inputs, lag, strict=True))
+        return LoopSetting(
+            base,
+            RATE,
+            lags,
+            loop.delay,
+            {},
+            crossover_lag_products=self.products,
+            requirement=needed,
+        )
+
+
+def _within_margins(
+    controller: RiseDiConfig, study: Study, needed: Requirement
+) -> tuple[RiseDiConfig, LoopMargins | None]:
+    """The controller with slower integrals and lower bandwidths where the loop around the airframe
+    of a study lacks margins; the margins.
+
+    A bandwidth falls with the input scale: K of (22) stays.
+    """
+    if controller.sampled_sign()[0] is not Sign.SOFT:
+        return controller, None
+    airframe = study.airframe
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, SAMPLES, 1)
+    _, columns = law_order(airframe, controller)
+
+    def build(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
+        ones = np.ones(len(controller.outputs))
+        changes: dict[str, FloatArray] = {
+            "Lambda": np.array(controller.Lambda) / (slower * lower) * ones,
+            "softening": np.array(controller.softening) * (slower * lower) * ones,
+            "input_scale": np.array(controller.input_scale) / lower * ones,
+            "omega": np.array(controller.omega) / lower * ones,
+            "beta": np.array(controller.beta) * lower * ones,  # the same rate of u
+        }
+        values = controller.model_dump() | {key: value.tolist() for key, value in changes.items()}
+        chosen = RiseDiConfig.validate_mapping(values, "controller")
+        return Candidate(chosen, linear_loop(chosen, airframe, A, B))
+
+    chosen = within_requirement(build, needed, study.u_dot[:, 0][:, columns])
+    return chosen.controller, loop_assessment(chosen.loop)
+
+
+def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
+    """Channels of r with damping alone: the stiffness of a straight flight would skid in a
+    coordinated turn.
+
+    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the
+    stiffness would skid.
+    """
+    turns = np.array([name == "r" for name in pairing.outputs])
+    damping = np.where(turns, channels.damping - channels.zero, channels.damping)
+    return channels._replace(
+        damping=damping,
+        stiffness=np.where(turns, 0.0, channels.stiffness),
+        zero=np.where(turns, 0.0, channels.zero),
+    )
+
+
+def _with_integrals(
+    controller: RiseDiConfig, pairing: ChannelPairing, channels: Channels, loop: Loop
+) -> RiseDiConfig:
+    """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
+
+    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s
+    + integral) / s. For first order the integral is the damping, and the loop is K / s. A stiff
+    channel answers u with a rate and needs a larger integral, but a lower integral where the
+    sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
+    """
+    places = [pairing.outputs.index(name) for name in controller.outputs]
+    params = controller.law_params()
+    crossover = params.K * params.input_scale * np.abs(np.diag(channels.Omega)[places])
+    sign_slope = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
+    Lambda = [
+        max(float(least), _integral(channels, i, float(K), float(loop.total[i])) - float(slope))
+        for least, i, K, slope in zip(controller.Lambda, places, crossover, sign_slope, strict=True)
+    ]
+    return RiseDiConfig.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
+
+
+def _integral(channels: Channels, i: int, crossover: float, total_lag: float) -> float:
+    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the
+    largest safe integral below.
+    """
+    omega = np.geomspace(0.1, 1e3, 400) * crossover
+
+    def response(omega: Any) -> Any:
+        """Of K times the model, without the delay."""
+        s = 1j * omega
+        return (
+            crossover
+            * (s + channels.zero[i])
+            / (s**2 + channels.damping[i] * s + channels.stiffness[i])
+        )
+
+    wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
+    delayed = response(omega) * np.exp(-1j * omega * total_lag)
+    safe = (
+        integral
+        for integral in wanted * INTEGRALS
+        if np.min(np.abs(1.0 + delayed * (1.0 - 1j * integral / omega))) > 1.0 / MAX_SENSITIVITY
+    )
+    return float(next(safe, 0.0))
+
+
+def _commands(
+    moved: Mapping[str, str],
+    speed: float | None,
+    bandwidth: Mapping[str, float],
+    authority: Mapping[str, float],
+    held: Mapping[str, float],
+) -> dict[str, Any]:
+    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held`
+    m/s.
+
+    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel
+    after another and a climb. Arguments, by output: the motion, the bandwidth, rad/s, the
+    authority, y_dot, and the speed that half of it holds.
+    """
+    motion_of = {motion: name for name, motion in moved.items()}
+    cruise = None if speed is None else reference_parameters(speed, authority.get("V", 1.0))
+    fastest = {"climb": NATURAL_FREQUENCY["V"], **NATURAL_FREQUENCY}
+    if cruise is not None:
+        fastest |= dict(
+            zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True)
+        )
+    limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
+    pulses = {}
+    for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items():
+        if motion in motion_of:
+            edges = {
+                "start": [WAIT + t for t in pulse["start"]],
+                "stop": [WAIT + t for t in pulse["stop"]],
+            }
+            pulses[motion_of[motion]] = pulse | edges
+    for name, pulse in pulses.items():
+        if UNITS[moved[name]] == "m/s":
+            pulse["value"] = [round(min(value, held[name]), 4) for value in pulse["value"]]
+    turns = cruise["coordinated_turn"] if cruise is not None and {"p", "r"} <= set(moved) else None
+    return (cruise or {}) | {
+        "rate": RATE,
+        "outputs": list(moved),
+        "second_order": {
+            "natural_frequency": [
+                round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()
+            ],
+            "damping": [DAMPING.get(motion, DAMPING["V"]) for motion in moved.values()],
+        },
+        "rise": 0.5,
+        "pulses": pulses,
+        "coordinated_turn": turns,
+    }
+
+
+def _hover_pulses() -> dict[str, dict[str, list[float]]]:
+    """By motion: doublets of 1 s of the rates, back to the attitude before, then a climb of 8 s."""
+    starts = zip(HOVER, (2.0, 8.0, 14.0), strict=True)
+    pulses = {
+        motion: {
+            "start": [t, t + 2.0],
+            "stop": [t + 1.0, t + 3.0],
+            "value": [HOVER[motion], -HOVER[motion]],
+        }
+        for motion, t in starts
+    }
+    return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}
