@@ -34,6 +34,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import Prediction, another_airframe
 from flight_design.learning import learner as design_learner
+from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
 from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner
@@ -257,7 +258,7 @@ def test_lost_ticks_are_unknown_in_record() -> None:
     made, period_ns = made_learner(scenario()), 10_000_000
     for k in (0, 1, 3, 3, 6):
         made.take(k * period_ns + 400, np.full(4, float(k)), np.array([1.0, 2.0, 3.0, 4.0]) * k, 0)
-    recorded = made.recording()
+    recorded = made._record.recording()
     # y is q, p, r, V in the law and q, V, p, r in the airframe; u is held
     np.testing.assert_array_equal(recorded.y[:, 0], [0.0, 1.0, np.nan, 3.0, np.nan, np.nan, 6.0])
     np.testing.assert_array_equal(
@@ -436,14 +437,14 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
         Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0),
     )
     part = Part(("elevator", "thrust"), ("q", "V"), effects, white, white, "", 0.0, gusts=True)
-    assert design_learner.weaker(part, flown).startswith(
+    assert part_checks.weaker(part, flown).startswith(
         "B[q, elevator]: found 70 % of that of the model that flies"
     )
     # a first model, one without gusts, and one that is within the deviation that is allowed
-    assert design_learner.weaker(part, None) == ""
-    assert design_learner.weaker(part._replace(gusts=False), flown) == ""
+    assert part_checks.weaker(part, None) == ""
+    assert part_checks.weaker(part._replace(gusts=False), flown) == ""
     near = effects[0]._replace(error=-0.09), effects[1]
-    assert design_learner.weaker(part._replace(entries=near), flown) == ""
+    assert part_checks.weaker(part._replace(entries=near), flown) == ""
 
 
 LATERAL = (

@@ -9,9 +9,9 @@ own checks at load.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -20,34 +20,40 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
-from flight_design.identification.likelihood import HELD_OUT, KNOWN, MAX_DELAY_ERROR, PRIOR, Unknown
+from flight_design.identification.likelihood import HELD_OUT, KNOWN, PRIOR, Unknown
 from flight_design.identification.model_identification import (
     Identification,
-    Part,
     identify,
     with_entries,
 )
 from flight_design.identification.model_quality import (
-    MAX_DEVIATION,
     MAX_WHITENESS,
     another_airframe,
-    best_known,
 )
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
-from rise_di_controller import divergence
+from flight_design.learning.flight_record import SPREAD, FlightRecord, Sample, about, steady_end
+from flight_design.learning.part_checks import (
+    DELAY_DEVIATION,
+    changed,
+    explains,
+    is_within,
+    not_white,
+    sentence,
+    too_late,
+    unchanged,
+    uncoupled,
+    weaker,
+)
 from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
 from rise_di_controller.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 AT_BOUND = 1
-DELAY_DEVIATION = (
-    0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
-)
 DELAY_LEFT = (
     0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
 )
@@ -55,10 +61,6 @@ FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
 SHORTEST = (
     20.0 * TRANSIENT
 )  # s, of a record: two held-out seconds of the six that `identify` needs at least
-
-# 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4
-# %
-SPREAD = 0.02
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
 """A controller with the feedforward and the observer of a model, and its delay margin. Raises
@@ -80,13 +82,13 @@ class Known(NamedTuple):
         return self.delay + 2.0 * self.delay_deviation
 
 
-class Sample(NamedTuple):
-    """A tick of the record; y and u in the law's order."""
+class Verdict(NamedTuple):
+    """What shall fly after an identification, and what is said about its parts."""
 
-    stamp_ns: int
-    y: FloatArray  # (m,)
-    u: FloatArray  # (m,), after its limits
-    flown: int  # digest of the parameters
+    model: Airframe
+    known: dict[tuple[str, ...], Known]
+    sentences: list[str]
+    refusals: list[str]
 
 
 class Learner:
@@ -127,13 +129,12 @@ class Learner:
         # None too once the rough model has not flown, or the law fell back
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
-        self._period = 1.0 / controller.rate
         self._believed = rough
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
         self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
-        self._record: deque[Sample] = deque()
+        self._record = FlightRecord(controller, airframe, settings.window)
         self._window_ns = nanoseconds(settings.window)
         self._planned = deque(map(nanoseconds, settings.updates))
         self._first_ns: int | None = None
@@ -165,33 +166,7 @@ class Learner:
         its parameters.
         """
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
-        if not self._record or stamp_ns > self._record[-1][0]:
-            self._record.append(Sample(stamp_ns, y, u, flown))
-        while stamp_ns - self._record[0].stamp_ns >= self._window_ns:
-            self._record.popleft()
-
-    def recording(self, after_ns: int = -1) -> Recording:
-        """The record after an instant in equal periods, in the airframe's order; y of a lost tick
-        is NaN, u is held.
-        """
-        record = [sample for sample in self._record if sample.stamp_ns > after_ns]
-        stamp_ns = np.array([sample.stamp_ns for sample in record])
-        place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
-        place, first_places = np.unique(place, return_index=True)
-        y = np.array([sample.y for sample in record])[first_places]
-        u = np.array([sample.u for sample in record])[first_places]
-        t = seconds(int(stamp_ns[0])) + self._period * np.arange(place[-1] + 1)
-        padded_y = np.full((len(t), y.shape[1]), np.nan)
-        padded_y[place] = y
-        held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
-        y = np.stack(
-            [padded_y[:, self._controller.outputs.index(name)] for name in self._rough.outputs],
-            axis=1,
-        )
-        u = np.stack(
-            [held[:, self._controller.inputs.index(name)] for name in self._rough.inputs], axis=1
-        )
-        return Recording(self._period, t, y, u)
+        self._record.take(Sample(stamp_ns, y, u, flown))
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
         """Parameters with the observer and the feedforward of what was identified, or the sentence
@@ -222,11 +197,9 @@ class Learner:
 
     def _proposal(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """The proposal of `propose`. Raises ParameterError where there is none."""
-        end_ns = self._record[-1].stamp_ns if self._record else 0
-        length = (
-            seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0
-        )  # lost ticks included
-        if length < SHORTEST - self._period:
+        end_ns = self._record.end_ns
+        length = self._record.length
+        if length < SHORTEST - self._record.period:
             return LearnerResult(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
@@ -240,19 +213,20 @@ class Learner:
                 else "each part flies the law of the start from now on: no part is left to learn",
             )
         changes = self._changes(end_ns)
-        dead = {change.outputs: change.dead for change in changes if change.dead}
         damaged = [change for change in changes if change.found]
         due = self._is_due(end_ns) or lost
         if not (due or damaged or self._changed):
             return LearnerResult(None, unchanged(changes))
         if damaged:
-            self._record = deque(
-                sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD)
-            )
+            self._record.forget_before(end_ns - nanoseconds(RECORD))
             self._prior = self._model
             self._changed |= {change.outputs for change in damaged}
         identified = self.identification = self._identified()
-        dead = {part: name for part, name in dead.items() if not self._acts(name, identified)}
+        dead = {
+            change.outputs: change.dead
+            for change in changes
+            if change.dead and not self._acts(change.dead, identified)
+        }
         without_model = self._dead | dead
         sentences = [
             f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
@@ -260,10 +234,33 @@ class Learner:
             if name
         ]
         sentences += [changed(change) for change in damaged if change.outputs not in dead]
-        known, model = (
-            {part: value for part, value in self._known.items() if part not in without_model},
-            self._model,
-        )
+        verdict = self._verdict(identified, without_model, lost=lost)
+        if self._changed and any(
+            another_airframe(part.entries, self._rough.name, AT_BOUND, self._believed.factor)
+            for part in identified.parts
+        ):
+            # the model that flew may have been the wrong one, and not the aircraft have changed
+            self._prior = self._model if self._prior is self._rough else self._rough
+        sentences += verdict.sentences
+        if not sentences:
+            nothing = "each part flies the law of the start from before on"
+            return LearnerResult(None, "; ".join(verdict.refusals) or nothing)
+        self._adopt(verdict, without_model)
+        refused = [f"refused: {refusal}" for refusal in verdict.refusals]
+        return LearnerResult(self._last, "; ".join(sentences + refused))
+
+    def _verdict(
+        self,
+        identified: Identification,
+        without_model: Mapping[tuple[str, ...], str],
+        *,
+        lost: bool,
+    ) -> Verdict:
+        """Which parts of an identification shall fly."""
+        end_ns = self._record.end_ns
+        known = {part: value for part, value in self._known.items() if part not in without_model}
+        model = self._model
+        sentences = []
         refusals = []
         for part in identified.parts:
             if any(
@@ -284,9 +281,9 @@ class Learner:
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
                 continue
-            entries = (
-                [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
-            )
+            entries = part.entries
+            if rough:
+                entries = tuple(entry._replace(error=0.0) for entry in entries)
             model = with_entries(model, entries)
             deviation = {
                 entry.name: abs(entry.deviation * entry.unit / entry.value)
@@ -300,32 +297,34 @@ class Learner:
                 if rough
                 else sentence(part)
             )
-        if self._changed and any(
-            another_airframe(part.entries, self._rough.name, AT_BOUND, self._believed.factor)
-            for part in identified.parts
-        ):
-            # the model that flew may have been the wrong one, and not the aircraft have changed
-            self._prior = self._model if self._prior is self._rough else self._rough
-        if not sentences:
-            return LearnerResult(
-                None, "; ".join(refusals) or "each part flies the law of the start from before on"
-            )
-        proposed = self._designed(model, known, without_model)
-        new = [*without_model, *(part for part, value in known.items() if value.end_ns == end_ns)]
+        return Verdict(model, known, sentences, refusals)
+
+    def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> None:
+        """Design for a verdict, and take it as proposed. Raises ParameterError without a design."""
+        proposed = self._designed(verdict.model, verdict.known, without_model)
+        end_ns = self._record.end_ns
+        new = [
+            *without_model,
+            *(part for part, value in verdict.known.items() if value.end_ns == end_ns),
+        ]
         self._changed = {
             part for part in self._changed if not any(is_within(part, outputs) for outputs in new)
         }
-        self._known, self._model, self._dead = known, model, without_model
-        self._last, self._proposed = proposed, proposed.digest()
+        self._known = verdict.known
+        self._model = verdict.model
+        self._dead = without_model
+        self._propose(proposed)
+
+    def _propose(self, proposed: RiseDiConfig) -> None:
+        """Note what is proposed."""
+        self._last = proposed
+        self._proposed = proposed.digest()
         self._proposals.add(self._proposed)
-        return LearnerResult(
-            proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals])
-        )
 
     def _distrust(self, *, lost: bool) -> None:
         """No longer fly the rough model where it was refused, or the law fell back."""
         is_rough_alone = not self._known and not self._dead
-        if lost and (is_rough_alone or self._fell_back(-1)):
+        if lost and (is_rough_alone or self._record.fell_back(-1, self._proposals)):
             self._design_of_rough = None
 
     def _rough_proposal(self) -> LearnerResult:
@@ -336,9 +335,7 @@ class Learner:
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
-        self._last = proposed
-        self._proposed = proposed.digest()
-        self._proposals.add(self._proposed)
+        self._propose(proposed)
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
@@ -367,7 +364,7 @@ class Learner:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""
         assert self._first_ns is not None  # noqa: S101 - there is a record
         due = False
-        while end_ns - self._first_ns > self._planned[0] - nanoseconds(self._period):
+        while end_ns - self._first_ns > self._planned[0] - nanoseconds(self._record.period):
             due = True
             last = self._planned.popleft()
             if not self._planned:
@@ -385,7 +382,7 @@ class Learner:
         gain = (
             identified.after.log_likelihood - self._identified(dead_input=name).after.log_likelihood
         )  # of a sample
-        return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN
+        return gain * len(self._record.recording().t) / HELD_OUT > MAX_GAIN
 
     def _identified(self, dead_input: str = "") -> Identification:
         """A and B from the record, about the prior, without the effect of `dead_input`; also from
@@ -410,14 +407,14 @@ class Learner:
             prior = without_effect(prior, dead_input)
             model = model and without_effect(model, dead_input)
         if not self._has_speeds:
-            return identified(self.recording(), prior, flown=model)
-        steady, ratio = self._steady(self.recording())
-        length = self._period * len(steady.t)
+            return identified(self._record.recording(), prior, flown=model)
+        steady, ratio = self._steady(self._record.recording())
+        length = self._record.period * len(steady.t)
         expected = (
             f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
         )
         require(
-            length > SHORTEST - self._period,
+            length > SHORTEST - self._record.period,
             "airspeed",
             f"it steady over the last {length:.3g} s",
             expected,
@@ -476,27 +473,15 @@ class Learner:
         if not old or self._believed.drift > DRIFT:
             return []
         begin_ns = end_ns - nanoseconds(RECORD)
-        if self._fell_back(begin_ns) or self._oscillated(begin_ns):
+        if self._record.fell_back(begin_ns, self._proposals) or self._record.oscillated(begin_ns):
             return []
-        whole = self.recording(begin_ns)
+        whole = self._record.recording(begin_ns)
         recent, ratio = self._steady(whole)
         if len(recent.t) < len(whole.t):
             return []
         delays = {part: known.delay for part, known in old.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         return [change for change in changes if change.outputs in old]
-
-    def _fell_back(self, after_ns: int) -> bool:
-        """Whether the law fell back after an instant: other parameters than a proposal replaced
-        those that flew.
-        """
-        flown = [sample.flown for sample in self._record if sample.stamp_ns > after_ns]
-        return any(new != old and new not in self._proposals for old, new in pairwise(flown))
-
-    def _oscillated(self, after_ns: int) -> bool:
-        """Whether an output oscillated after an instant, over the whole time."""
-        y = np.array([sample.y for sample in self._record if sample.stamp_ns > after_ns])
-        return bool(divergence.oscillating(y, divergence.least(self._controller.outputs)).any())
 
     def _designed(
         self,
@@ -574,16 +559,6 @@ def margin_behind(delay: float, start: RiseDiConfig) -> float:
     )  # 0.1 ms, as few digits as the file of a scenario
 
 
-def unchanged(changes: Iterable[Change]) -> str:
-    """The sentence of tests without a change."""
-    effects = ", ".join(
-        f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items()
-    )
-    if not effects:
-        return "no identification is due, and no part is tested for a change"
-    return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"
-
-
 def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """A controller whose model of the feedforward has the standard deviations of B, given by entry
     and relative to it, PRIOR for an entry that no flight has shown.
@@ -607,122 +582,3 @@ def without_effect(model: Airframe, name: str) -> Airframe:
         model,
         [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value],
     )
-
-
-def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
-    """Whether the outputs of a part are among those of another."""
-    return set(part) <= set(outputs)
-
-
-def changed(change: Change) -> str:
-    """The part that has changed, and its weakest input."""
-    name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
-    weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
-    return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
-
-
-def explains(part: Part) -> bool:
-    """Whether the nominal airframe predicts the held-out samples as well as the identified
-    model.
-    """
-    return bool(part.after.log_likelihood <= part.before.log_likelihood)
-
-
-def not_white(part: Part) -> str:
-    """The output with the least white innovations, if above MAX_WHITENESS."""
-    worst = int(np.argmax(part.after.whiteness))
-    white = float(part.after.whiteness[worst])
-    if white <= MAX_WHITENESS:
-        return ""
-    name = part.outputs[worst]
-    return (
-        f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
-        f"{MAX_WHITENESS:g}, 1 being white"
-    )
-
-
-def too_late(part: Part, delay: float) -> str:
-    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of
-    the loop, s.
-    """
-    bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
-    if part.delay < bound - 1e-6:  # s, of rounding
-        return ""
-    names = " and ".join(part.inputs)
-    return (
-        f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than "
-        f"{1e3 * bound:.0f} ms"
-    )
-
-
-def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
-    """The refusal of a part alone where the flown model couples the part with another; empty where
-    it does not.
-    """
-    if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
-        return ""
-    return (
-        f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that "
-        "which flies"
-    )
-
-
-def weaker(part: Part, flown: Airframe | None) -> str:
-    """The effect that a record of gusts has weaker than the model that flies, if by more than
-    MAX_DEVIATION.
-
-    Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
-    """
-    if flown is None or not part.gusts:
-        return ""
-    for entry in best_known(part.entries, part.outputs):
-        share = (
-            entry.value
-            / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
-        )
-        if share < 1.0 - MAX_DEVIATION:
-            expected = (
-                f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which "
-                "hide effects"
-            )
-            return (
-                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, "
-                f"{expected}"
-            )
-    return ""
-
-
-def sentence(part: Part) -> str:
-    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with
-    deviations.
-    """
-    effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
-    known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
-    text = ", ".join(
-        f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known
-    )
-    return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
-
-
-def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
-    """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
-
-    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then
-    vary twice as much.
-    """
-    V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
-    known = np.isfinite(V)[::-1]
-    ratio = np.where(known, 1.0 + V[::-1], 0.0)
-    count = np.maximum(np.cumsum(known), 1)
-    mean = np.cumsum(ratio) / count
-    square = np.cumsum(ratio**2) / count - mean**2
-    length = int(np.flatnonzero(square <= (SPREAD * mean) ** 2)[-1]) + 1
-    first = len(V) - length
-    return recorded._replace(
-        t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]
-    ), float(mean[length - 1])
-
-
-def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:
-    """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
-    return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
@@ -18,7 +19,8 @@ from flight_core.files import comment
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Tape
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched
@@ -68,18 +70,7 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     if prior is not None and prior.off is not None:
         rough = rough._replace(error=prior.off, effect=prior.off)
 
-    speeds = None
-    if controller.schedule is not None:
-        slow, fast = (there.ratio for there in controller.schedule.models)
-        speeds = (slow, fast)
-        V0 = controller.schedule.speed
-        require(
-            airframe.speed == V0,
-            "controller.schedule.speed",
-            f"{V0:g} m/s",
-            f"{airframe.speed:g} m/s, that of the model",
-        )
-
+    speeds = _speeds(controller, airframe)
     sketch = aircraft.is_jsbsim
 
     def design(start: RiseDiConfig, model: Airframe, *, errs: bool = False) -> RiseDiConfig:
@@ -97,6 +88,19 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         rough,
         None if sketch else partial(design, errs=True),
     )
+
+
+def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
+    """The speeds of the models of a schedule, over the trim speed; None without one. Raises
+    ParameterError for a schedule about another speed than that of the rough model.
+    """
+    if controller.schedule is None:
+        return None
+    V0 = controller.schedule.speed
+    expected = f"{airframe.speed:g} m/s, that of the model"
+    require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", expected)
+    slow, fast = controller.schedule.models
+    return slow.ratio, fast.ratio
 
 
 def _prior(path: str, flown: Airframe) -> Airframe:
@@ -129,6 +133,48 @@ class LearnResult(NamedTuple):
     entries: tuple[Entry, ...]  # of the last identification
 
 
+class _Ticks(NamedTuple):
+    """The ticks of a log, and what flew there."""
+
+    stamp_ns: NDArray[np.int64]
+    instant_ns: NDArray[np.int64]
+    mode: FloatArray
+    y: FloatArray  # (N, m)
+    u: FloatArray  # (N, m)
+    flown: FloatArray | None  # digests; None where the log has other settings of the learner
+    given_up: Signal
+
+    def left(self, k: int) -> tuple[str, ...]:
+        """The outputs that the controller had given up at a tick."""
+        names = self.given_up.names
+        return tuple(name for name in names if self.flown is not None and self.given_up[name][k])
+
+
+def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
+    """The ticks of a log. Raises ParameterError for a log without internals."""
+    flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
+    require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
+    ticks = tape["internals"]
+    flown = ticks["parameters"]
+    is_of_log = bool(np.any(flown == controller.digest()))
+    given_up = ticks.group(GIVEN_UP)
+    require(
+        not is_of_log or given_up.names == controller.outputs,
+        "the log",
+        f"no channels {GIVEN_UP}.* of internals",
+        "a log that has the outputs that the controller gave up",
+    )
+    return _Ticks(
+        ticks.stamp_ns,
+        ticks.stamp_ns + np.round(ticks["age"] * NANOSECONDS).astype(np.int64),
+        ticks["mode"],
+        ticks.group("y").values,
+        ticks.group("u").values,
+        flown if is_of_log else None,
+        given_up,
+    )
+
+
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises
     ParameterError.
@@ -149,53 +195,33 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         assert isinstance(made, Learner)  # noqa: S101 - `learner` makes no other
         return made, Updates(settings)
 
-    flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
-    require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
-    ticks = tape["internals"]
+    ticks = _ticks(tape, controller)
     steps = list[LearnStep]()
-    y = ticks.group("y").values
-    u = ticks.group("u").values
-    mode = ticks["mode"]
-    instants_ns = ticks.stamp_ns + np.round(ticks["age"] * NANOSECONDS).astype(np.int64)
-    flown = ticks["parameters"]
-    start = controller.digest()
-    is_of_log = bool(np.any(flown == start))
-    given_up = ticks.group(GIVEN_UP)
-    is_complete = not is_of_log or given_up.names == controller.outputs
-    require(
-        is_complete,
-        "the log",
-        f"no channels {GIVEN_UP}.* of internals",
-        "a log that has the outputs that the controller gave up",
-    )
-    (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
-    for k, (stamp_ns, now_ns) in enumerate(
-        zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)
-    ):
-        if mode[k] == Mode.INACTIVE:
+    learned, updates = begun()
+    proposed = controller.digest()
+    begin_ns = int(ticks.instant_ns[0])
+    longest_ns = 0
+    for k, now_ns in enumerate(ticks.instant_ns.tolist()):
+        if ticks.mode[k] == Mode.INACTIVE:
             continue
-        if k and mode[k - 1] == Mode.INACTIVE:
-            (learned, updates), proposed, begin_ns = begun(), start, now_ns
+        if k and ticks.mode[k - 1] == Mode.INACTIVE:
+            learned, updates = begun()
+            proposed = controller.digest()
+            begin_ns = now_ns
         longest_ns = max(longest_ns, now_ns - begin_ns)
-        if mode[k] == Mode.ENGAGED:
-            learned.take(
-                stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed
-            )
+        flown = proposed if ticks.flown is None else int(ticks.flown[k])
+        if ticks.mode[k] == Mode.ENGAGED:
+            learned.take(int(ticks.stamp_ns[k]), ticks.y[k].copy(), ticks.u[k].copy(), flown)
         if updates.due(now_ns):
-            left = tuple(name for name in given_up.names if is_of_log and given_up[name][k])
-            proposal = learned.propose(int(flown[k]) if is_of_log else proposed, left)
+            proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
             # the rough model, proposed before there is a record, teaches nothing
             if proposal.sentence and now_ns > begin_ns:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
-    require(
-        bool(steps),
-        "the log",
-        f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller",
-        first,
-    )
+    length = f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller"
+    require(bool(steps), "the log", length, first)
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
 

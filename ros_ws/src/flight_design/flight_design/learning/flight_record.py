@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The record of a learner: y, u and the flown parameters of the ticks of the last seconds."""
+
+from collections import deque
+from collections.abc import Collection
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
+from flight_design.identification.innovation_filters import Recording
+from rise_di_controller import divergence
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+# 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4
+# %
+SPREAD = 0.02
+
+
+class Sample(NamedTuple):
+    """A tick of the record; y and u in the law's order."""
+
+    stamp_ns: int
+    y: FloatArray  # (m,)
+    u: FloatArray  # (m,), after its limits
+    flown: int  # digest of the parameters
+
+
+class FlightRecord:
+    """The last samples of a flight, over a window."""
+
+    def __init__(self, controller: RiseDiConfig, airframe: Airframe, window: float) -> None:
+        """`window`: length, s. Samples have the order of the controller, recordings that of the
+        airframe.
+        """
+        self._rows = [controller.outputs.index(name) for name in airframe.outputs]
+        self._columns = [controller.inputs.index(name) for name in airframe.inputs]
+        self._least = divergence.least(controller.outputs)
+        self._window_ns = nanoseconds(window)
+        self._samples = deque[Sample]()
+        self.period = 1.0 / controller.rate
+
+    @property
+    def end_ns(self) -> int:
+        """Stamp of the last sample, 0 without one."""
+        return self._samples[-1].stamp_ns if self._samples else 0
+
+    @property
+    def length(self) -> float:
+        """The time that the record covers, lost ticks included, s."""
+        if not self._samples:
+            return 0.0
+        return seconds(self.end_ns - self._samples[0].stamp_ns) + self.period
+
+    def take(self, sample: Sample) -> None:
+        """Take a sample, if later than the last one, and forget what is older than the window."""
+        if not self._samples or sample.stamp_ns > self.end_ns:
+            self._samples.append(sample)
+        while sample.stamp_ns - self._samples[0].stamp_ns >= self._window_ns:
+            self._samples.popleft()
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Keep what is later than an instant alone."""
+        self._samples = deque(self._after(stamp_ns))
+
+    def recording(self, after_ns: int = -1) -> Recording:
+        """The record after an instant in equal periods, in the airframe's order; y of a lost tick
+        is NaN, u is held.
+        """
+        record = self._after(after_ns)
+        stamp_ns = np.array([sample.stamp_ns for sample in record])
+        place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self.period).astype(int)
+        place, first_places = np.unique(place, return_index=True)
+        y = np.array([sample.y for sample in record])[first_places]
+        u = np.array([sample.u for sample in record])[first_places]
+        t = seconds(int(stamp_ns[0])) + self.period * np.arange(place[-1] + 1)
+        padded_y = np.full((len(t), y.shape[1]), np.nan)
+        padded_y[place] = y
+        held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
+        return Recording(self.period, t, padded_y[:, self._rows], held[:, self._columns])
+
+    def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
+        """Whether the law fell back after an instant: other parameters than one of the proposals,
+        by digest, replaced those that flew.
+        """
+        flown = [sample.flown for sample in self._after(after_ns)]
+        return any(new != old and new not in proposals for old, new in pairwise(flown))
+
+    def oscillated(self, after_ns: int) -> bool:
+        """Whether an output oscillated after an instant, over the whole time."""
+        y = np.array([sample.y for sample in self._after(after_ns)])
+        return bool(divergence.oscillating(y, self._least).any())
+
+    def _after(self, stamp_ns: int) -> list[Sample]:
+        return [sample for sample in self._samples if sample.stamp_ns > stamp_ns]
+
+
+def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
+    """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
+
+    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then
+    vary twice as much.
+    """
+    V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
+    known = np.isfinite(V)[::-1]
+    ratio = np.where(known, 1.0 + V[::-1], 0.0)
+    count = np.maximum(np.cumsum(known), 1)
+    mean = np.cumsum(ratio) / count
+    square = np.cumsum(ratio**2) / count - mean**2
+    length = int(np.flatnonzero(square <= (SPREAD * mean) ** 2)[-1]) + 1
+    first = len(V) - length
+    return recorded._replace(
+        t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]
+    ), float(mean[length - 1])
+
+
+def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:
+    """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
+    return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The model of a part beside what flies: reasons against the model, and sentences about it."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
+from flight_design.identification.model_identification import Part
+from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, best_known
+from flight_design.learning.change_test import Change
+
+DELAY_DEVIATION = (
+    0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
+)
+
+
+def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
+    """Whether the outputs of a part are among those of another."""
+    return set(part) <= set(outputs)
+
+
+def changed(change: Change) -> str:
+    """The part that has changed, and its weakest input."""
+    name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
+    weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
+    return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
+
+
+def explains(part: Part) -> bool:
+    """Whether the nominal airframe predicts the held-out samples as well as the identified
+    model.
+    """
+    return bool(part.after.log_likelihood <= part.before.log_likelihood)
+
+
+def not_white(part: Part) -> str:
+    """The output with the least white innovations, if above MAX_WHITENESS."""
+    worst = int(np.argmax(part.after.whiteness))
+    white = float(part.after.whiteness[worst])
+    if white <= MAX_WHITENESS:
+        return ""
+    name = part.outputs[worst]
+    return (
+        f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
+        f"{MAX_WHITENESS:g}, 1 being white"
+    )
+
+
+def too_late(part: Part, delay: float) -> str:
+    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of
+    the loop, s.
+    """
+    bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
+    if part.delay < bound - 1e-6:  # s, of rounding
+        return ""
+    names = " and ".join(part.inputs)
+    return (
+        f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than "
+        f"{1e3 * bound:.0f} ms"
+    )
+
+
+def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
+    """The refusal of a part alone where the flown model couples the part with another; empty where
+    it does not.
+    """
+    if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
+        return ""
+    return (
+        f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that "
+        "which flies"
+    )
+
+
+def weaker(part: Part, flown: Airframe | None) -> str:
+    """The effect that a record of gusts has weaker than the model that flies, if by more than
+    MAX_DEVIATION.
+
+    Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
+    """
+    if flown is None or not part.gusts:
+        return ""
+    for entry in best_known(part.entries, part.outputs):
+        share = (
+            entry.value
+            / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
+        )
+        if share < 1.0 - MAX_DEVIATION:
+            expected = (
+                f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which "
+                "hide effects"
+            )
+            return (
+                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, "
+                f"{expected}"
+            )
+    return ""
+
+
+def sentence(part: Part) -> str:
+    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with
+    deviations.
+    """
+    effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
+    known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
+    text = ", ".join(
+        f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known
+    )
+    return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
+
+
+def unchanged(changes: Iterable[Change]) -> str:
+    """The sentence of tests without a change."""
+    effects = ", ".join(
+        f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items()
+    )
+    if not effects:
+        return "no identification is due, and no part is tested for a change"
+    return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"
