@@ -216,6 +216,13 @@ def test_commands_and_options_are_few() -> None:
     assert {name: found for name in COMMANDS if len(found := options_of(name)) > 10} == {}
 
 
+def test_what_a_command_writes_is_its_output() -> None:
+    """A user who knows one command guesses --output in the next."""
+    for name in ("export", "gains", "identify", "learn", "compare"):
+        command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
+        assert any("--output" in parameter.opts for parameter in command.params), name
+
+
 def test_option_that_is_a_setting_names_it() -> None:
     result = invoke("gains", "osprey", "--y-rate", "50")
     assert str(result.exception) == "--y-rate: found no option, expected --set y_rate"

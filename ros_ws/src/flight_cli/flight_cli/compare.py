@@ -35,7 +35,7 @@ from flight_cli.output import (
     progress_bar,
     write_text,
 )
-from flight_cli.words import argument, option, setting
+from flight_cli.words import WRITE, argument, option, setting
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -107,7 +107,8 @@ def compare(
         Path | None,
         option(
             "File for the gains of one law as a section of a scenario, which flies with "
-            "the score shown."
+            "the score shown.",
+            *WRITE,
         ),
     ] = None,
     to_json: Annotated[Path | None, option("File to write the figures to, SI.", "--json")] = None,

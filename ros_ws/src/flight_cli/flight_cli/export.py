@@ -22,7 +22,8 @@ DIFFERS = 1
 def export(
     scenario: Annotated[str, argument("Name of a scenario, or path of a scenario file (.yaml).")],
     folder: Annotated[
-        Path | None, option("Folder to write the C code and the report of the proof to.", "--c")
+        Path | None,
+        option("Folder to write the C code and the report of the proof to.", "--c", "--output"),
     ] = None,
     px4: Annotated[
         Path | None, option("Folder to write an external module of PX4 to, in place of --c.")

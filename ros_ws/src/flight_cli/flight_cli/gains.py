@@ -35,7 +35,7 @@ from flight_cli.gains_guarantee import (
     write_unstable,
 )
 from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
-from flight_cli.words import AsJson
+from flight_cli.words import WRITE, AsJson
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
@@ -129,7 +129,7 @@ def gains(
     ] = 1,
     write: Annotated[
         Path | None,
-        typer.Option(help="File for the engineering gains, as a section of a scenario."),
+        typer.Option(*WRITE, help="File for the engineering gains, as a section of a scenario."),
     ] = None,
     feedforward: Annotated[
         bool,

@@ -46,7 +46,7 @@ from flight_cli.output import (
     say,
     write_text,
 )
-from flight_cli.words import AsJson, argument, option, setting, warn
+from flight_cli.words import WRITE, AsJson, argument, option, setting, warn
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -89,7 +89,8 @@ def identify(
         Path | None,
         option(
             "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
-            "airframe file for the model, with a page. With --bridge: folder for what flies it."
+            "airframe file for the model, with a page. With --bridge: folder for what flies it.",
+            *WRITE,
         ),
     ] = None,
     scenario: Annotated[

@@ -27,7 +27,7 @@ from flight_cli.output import (
     write_text,
 )
 from flight_cli.settings import Settings, with_settings
-from flight_cli.words import AsJson, argument, option
+from flight_cli.words import WRITE, AsJson, argument, option
 from flight_core.files import display_path
 from flight_core.text import printable
 from flight_design.learning.scenario_learner import learn_again, learned_yaml
@@ -39,7 +39,9 @@ NOTHING_LEARNED = 1
 def learn(
     run: Annotated[Path, argument("Folder of a run, or an MCAP file.")] = LATEST,
     settings: Settings = None,
-    write: Annotated[Path | None, option("File for the learned model, an airframe file.")] = None,
+    write: Annotated[
+        Path | None, option("File for the learned model, an airframe file.", *WRITE)
+    ] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     as_json: AsJson = False,

@@ -29,6 +29,9 @@ def argument(text: str, **rules: Any) -> Any:
     return typer.Argument(help=text, **rules)
 
 
+WRITE = ("--write", "--output")
+"""Names of the option of a file or folder to write, in every command."""
+
 AsJson = Annotated[bool, option("Print the result as JSON, nothing else.", "--json")]
 Namespace = Annotated[str, option("Namespace of the aircraft.")]
 """Options of several commands."""
