@@ -33,10 +33,16 @@ from tests.ros.autopilot import Autopilot
 from typer.testing import CliRunner
 
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.node import ACTIVATION_TIMEOUT_NS, RELEASES_AT_SHUTDOWN, BridgeNode
+from autopilot_bridge.node import (
+    ACTIVATION_TIMEOUT_NS,
+    RELEASES_AT_SHUTDOWN,
+    BridgeNode,
+    no_publisher,
+)
 from autopilot_bridge.params import LIBRARY
 from flight_cli.cli import COMMANDS, application
 from flight_core.channels import UNKNOWN
+from flight_core.environment import PROFILE_VARIABLE
 from flight_core.modes import Mode
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
@@ -583,12 +589,16 @@ def test_bridge_without_topics_of_autopilot_ends_with_the_cause_of_each(tmp_path
             setup.run(4.0)
         sentence = str(ended.value)
         assert sentence.startswith("no y after 3 s: ")
-        assert (
-            "/ap/twist/filtered: no publisher. The autopilot's agent needs the same DDS "
-            "profile, FASTRTPS_DEFAULT_" in sentence
-        )
+        assert "/ap/twist/filtered: no publisher" in sentence
         expected = "geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
         assert f"/ap/airspeed: /peer publishes {expected}" in sentence
+
+
+def test_domain_or_profile_named_where_a_topic_has_no_publisher() -> None:
+    """A user with a domain of their own in the shell, and an agent in domain 0."""
+    assert no_publisher({"ROS_DOMAIN_ID": "37"}).startswith("no publisher in domain 37. The ")
+    sentence = no_publisher({PROFILE_VARIABLE: "mine.xml"})
+    assert "needs the same DDS profile, FASTRTPS_DEFAULT_PROFILES_FILE=mine.xml" in sentence
 
 
 def test_topic_of_another_version_is_error_that_names_both_types(setup: Setup) -> None:

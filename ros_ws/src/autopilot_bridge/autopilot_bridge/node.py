@@ -7,7 +7,7 @@ a channel map.
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -481,11 +481,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if not publishers and (fault := version_fault(subscription.name, subscription.topic.type)):
             return f"no publisher. {fault}"
         if not publishers:
-            profile = os.environ.get(PROFILE_VARIABLE, "")
-            return (
-                "no publisher. The autopilot's agent needs the same DDS profile, "
-                f"{PROFILE_VARIABLE}={profile}"
-            )
+            return no_publisher(os.environ)
         faults = self.endpoints.mismatches(subscription)
         refused = (
             what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: ")
@@ -578,6 +574,21 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 time.sleep(0.01)
         if self._link is not None:
             self._link.close()
+
+
+def no_publisher(environment: Mapping[str, str]) -> str:
+    """Why a topic of an autopilot has no publisher, as a sentence."""
+    domain = environment.get("ROS_DOMAIN_ID") or "0"
+    if domain != "0":
+        return (
+            f"no publisher in domain {domain}. The autopilot's agent is in domain 0 unless "
+            "DDS_DOMAIN_ID (ArduPilot) or UXRCE_DDS_DOM_ID (PX4) has another: unset ROS_DOMAIN_ID"
+        )
+    return (
+        "no publisher. The autopilot's agent needs the same DDS profile, "
+        f"{PROFILE_VARIABLE}={environment.get(PROFILE_VARIABLE, '')}, and DDS_DOMAIN_ID "
+        "(ArduPilot) or UXRCE_DDS_DOM_ID (PX4) 0"
+    )
 
 
 def _qos(row: QosRow) -> QoSProfile:
