@@ -513,6 +513,50 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
     assert made.lost() == ""
 
 
+@pytest.mark.parametrize(
+    ("parameters", "dropped", "watched"),
+    [
+        ({"SYSID_MYGCS": 254}, "254, or SYSID_MYGCS to 255", 254),
+        ({"MAV_GCS_SYSID": 254}, "254, or MAV_GCS_SYSID to 255", 254),
+        (
+            {"MAV_GCS_SYSID": 250, "MAV_GCS_SYSID_HI": 253},
+            "250 to 253, or MAV_GCS_SYSID and MAV_GCS_SYSID_HI to a range with it",
+            252,
+        ),
+        ({"MAV_GCS_SYSID": 255, "MAV_GCS_SYSID_HI": 0}, "", 255),
+        ({"MAV_GCS_SYSID": 250, "MAV_GCS_SYSID_HI": 255}, "", 250),
+    ],
+)
+def test_numbers_of_ground_stations_are_those_of_the_autopilot(
+    ends: Ends, clock: Clock, parameters: dict[str, float], dropped: str, watched: int
+) -> None:
+    """ArduPilot, GCS.h, sysid_is_gcs: from MAV_GCS_SYSID to MAV_GCS_SYSID_HI; before, SYSID_MYGCS.
+    Overrides of another number have no effect. The bridge sends as 255.
+    """
+    made, _ = ends.link()
+    made._take(received(BEAT), SENDER, 0)
+    for name, value in parameters.items():
+        message = mavlink.MAVLink_param_value_message(name.encode(), value, 9, 1, 0)
+        made._take(received(message), SENDER, 0)
+    assert made.refusal().endswith(dropped)
+    assert bool(made.refusal()) is bool(dropped)
+    station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    made._take(received(station, system=watched, component=190), SENDER, 0)
+    clock.now += STATION_SILENCE + 0.1
+    assert made.lost().endswith("is silent for 5 s")
+    sticks = mavlink.MAVLink_manual_control_message(1, 0, 0, 0, 0, 0)
+    made._take(received(sticks, system=watched, component=190), SENDER, 0)
+    assert "takes its RC overrides" in made.conflict
+
+
+def test_autopilot_of_another_number_is_named(ends: Ends, clock: Clock) -> None:
+    made, _ = ends.link()
+    made._take(received(BEAT, system=7), SENDER, 0)
+    clock.now += 60.0
+    assert "no message of system 1 over" in made.problem()
+    assert "an autopilot is system 7 there: set link.system" in made.problem()
+
+
 def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:
     made, port = ends.started()
     station = ends.peer(port, system=254)

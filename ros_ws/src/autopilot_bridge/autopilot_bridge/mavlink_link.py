@@ -45,6 +45,10 @@ SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
 GCS = 6  # MAV_TYPE_GCS
 ONBOARD = 18  # MAV_TYPE_ONBOARD_CONTROLLER
 INVALID = 8  # MAV_AUTOPILOT_INVALID
+# ArduPilot takes RC overrides of these systems: since 4.7, to MAV_GCS_SYSID_HI where that is not 0,
+# and before
+STATION, LAST_STATION, OLD_STATION = "MAV_GCS_SYSID", "MAV_GCS_SYSID_HI", "SYSID_MYGCS"
+STATION_PARAMETERS = (STATION, LAST_STATION, OLD_STATION)
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
 BEAT = 1.0  # s
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
@@ -107,14 +111,17 @@ class Link:
     there is none.
 
     Messages of the sender in `AutopilotLock` alone are taken, and over UDP no other address gets
-    messages. `parameters` are names of parameters of the autopilot that are read.
+    messages. `parameters` are names of parameters of the autopilot that are read; `further` are
+    those that some releases lack.
 
     With a passphrase each message is signed, and messages without a valid signature are refused.
     Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy and Mission
     Planner.
     """
 
-    def __init__(self, config: LinkConfig, parameters: Sequence[str] = ()) -> None:
+    def __init__(
+        self, config: LinkConfig, parameters: Sequence[str] = (), further: Sequence[str] = ()
+    ) -> None:
         require_package("pymavlink")
         from pymavlink import mavutil  # noqa: PLC0415 - an extra
         from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -158,6 +165,8 @@ class Link:
         self._queues: dict[str, deque[ReceivedMessage]] = {}
         self.parameters: dict[str, float] = {}  # of the autopilot, as it last told
         self._to_read = tuple(parameters)
+        self._further = tuple(further)
+        self._systems: set[int] = set()  # of autopilots beside that of the map
         self._to_request = dict(config.rates)
         self._requested: tuple[str, float] | None = (
             None  # the message whose interval was requested, and when
@@ -169,7 +178,7 @@ class Link:
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
         self._station_heard: float | None = (
-            None  # the ground station with the number of the RC overrides
+            None  # the ground station with a number of the RC overrides
         )
         self._sending = Lock()
         self._closed = Event()
@@ -215,7 +224,9 @@ class Link:
                 f"no message of system {self._config.system} over {self._config.url} for "
                 f"{SILENCE:g} s"
             )
-            return sentences(silence, self._refused, self.conflict)
+            systems = ", ".join(map(str, sorted(self._systems)))
+            known = f"an autopilot is system {systems} there: set link.system" if systems else ""
+            return sentences(silence, known, self._refused, self.conflict)
         names = [name] if name else list(self._config.rates)
         slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
         refusals = {
@@ -229,10 +240,31 @@ class Link:
         return sentences(self.conflict, *slow, *denied, *([TAKEN] if slow else []))
 
     def refusal(self) -> str:
-        """Why an engagement would not have the rates of the map, as a sentence."""
+        """Why an engagement would not have the rates of the map, or no effect, as a sentence."""
         unknown = self._rates.unknown(time.monotonic())
-        return self.problem() or (
-            f"the rate of {', '.join(unknown)} is not known yet" if unknown else ""
+        rates = f"the rate of {', '.join(unknown)} is not known yet" if unknown else ""
+        return self.problem() or self._dropped_overrides() or rates
+
+    def _station_numbers(self) -> range:
+        """The systems of which the autopilot takes RC overrides, by its parameters where known."""
+        first = self.parameters.get(STATION, self.parameters.get(OLD_STATION))
+        if first is None:
+            first = self._config.source_system
+        last = max(first, self.parameters.get(LAST_STATION, 0.0))
+        return range(int(first), int(last) + 1)
+
+    def _dropped_overrides(self) -> str:
+        """Why the autopilot drops the RC overrides, as a sentence; empty where it does not."""
+        numbers = self._station_numbers()
+        system = self._config.source_system
+        if system in numbers:
+            return ""
+        name = STATION if STATION in self.parameters else OLD_STATION
+        mend = f"{name} and {LAST_STATION} to a range with it"
+        mend = mend if LAST_STATION in self.parameters else f"{name} to {system}"
+        return (
+            f"the autopilot drops RC overrides of system {system}: set link.source_system to "
+            f"{self._stations_text()}, or {mend}"
         )
 
     def lost(self) -> str:
@@ -247,9 +279,7 @@ class Link:
             and now - self._station_heard > limit
         )
         station = (
-            f"ground station {self._config.source_system} is silent for {limit:g} s"
-            if is_silent
-            else ""
+            f"ground station {self._stations_text()} is silent for {limit:g} s" if is_silent else ""
         )
         return sentences(self._rates.lasting(now), station)
 
@@ -257,7 +287,7 @@ class Link:
         """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a
         sentence.
         """
-        system = self._config.source_system
+        system = self._stations_text()
         limit = self._config.station_silence
         counted = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
         if self._station_heard is None:
@@ -269,6 +299,10 @@ class Link:
             "is not watched" if limit is None else f"ends the engagement by {limit:g} s of silence"
         )
         return f"{counted}: station {system}, which is heard, {watched}"
+
+    def _stations_text(self) -> str:
+        numbers = self._station_numbers()
+        return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
     def _send(self, message: Any, system: int) -> None:
         """Send as a system, with the component COMPANION."""
@@ -354,9 +388,9 @@ class Link:
         now = time.monotonic()
         system = message.get_srcSystem()
         is_station = name == "HEARTBEAT" and message.type == GCS
-        if system == self._config.source_system and (
-            name in STICKS or (name == "HEARTBEAT" and not is_station)
-        ):
+        joystick = name in STICKS and system in self._station_numbers()
+        namesake = name == "HEARTBEAT" and system == self._config.source_system
+        if joystick or (namesake and not is_station):
             self._clash = (
                 f"another sender on {self._config.url} has system {system} too, and the "
                 "autopilot takes its RC overrides:"
@@ -366,9 +400,10 @@ class Link:
             self._clash = f"another bridge is on {self._config.url}: end it"
         elif is_station:
             self.stations.add(system)
-            self._station_heard = (
-                now if system == self._config.source_system else self._station_heard
-            )
+            if system in self._station_numbers():
+                self._station_heard = now
+        elif name == "HEARTBEAT" and message.autopilot != INVALID and system != self._config.system:
+            self._systems.add(system)
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = self._signature_fault(bytes(message.data))
         if (message.get_srcSystem(), message.get_srcComponent()) != (
@@ -464,7 +499,7 @@ class Link:
         if now - self._alive > SILENCE or now - self._read < (READ_AGAIN if known else ANSWER):
             return
         self._read = now
-        for name in self._to_read:
+        for name in (*self._to_read, *self._further):
             encode = self._connection.mav.param_request_read_encode
             self._send(
                 encode(self._config.system, AUTOPILOT, name.encode(), -1), self._config.system

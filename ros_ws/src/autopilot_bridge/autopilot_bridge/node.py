@@ -85,11 +85,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._logged = self._bridge.phase, self._bridge.reason
         self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
         self._began_ns = self._boot_ns()
-        self._link = self._open_link()
-        self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._overrides_sticks = any(
             message.topic == RC_OVERRIDE for message in self._map.messages.values()
         )
+        self._link = self._open_link()
+        self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._conflict = ""  # the topics that have two publishers, as a sentence
         self._recorded: dict[
             str, tuple[Callable[[bytes], None], Encoder]
@@ -150,7 +150,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         key = f"{self.get_name()}.use_sim_time"
         cause = "false: an autopilot on MAVLink ticks by its own clock"
         require(self.simulated is None, key, "true", cause)
-        return mavlink_link.Link(self._map.link, tuple(self._map.parameters))
+        further = mavlink_link.STATION_PARAMETERS if self._overrides_sticks else ()
+        return mavlink_link.Link(self._map.link, tuple(self._map.parameters), further)
 
     def _read_topics(self) -> list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]]:
         """Subscribe to the topics of the map. Returns each with its rows."""
