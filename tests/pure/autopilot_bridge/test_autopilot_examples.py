@@ -12,11 +12,14 @@ import pytest
 from tests.conftest import REPOSITORY, refusing
 
 from aircraft_sim.airframe import load_airframe
+from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.graph import AIRCRAFT, find_autopilot, parameter_overrides, require_limits
+from flight_cli.bridge_experiment import guided_scenario
 from flight_design.identification.sign_check import require_signs
 
+EXAMPLE = "examples/arduplane/scenario.yaml"
 OF_PX4 = ("px4_airplane", "px4_quadrotor")
 EXAMPLES = {"arduplane": "ardupilot"} | {
     name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4
@@ -68,6 +71,18 @@ def test_copy_of_scenario_takes_the_airframe_beside(
     assert load_airframe(scenario.aircraft.airframe).name == "mine"
     overrides = parameter_overrides(AIRCRAFT, scenario, tmp_path, 0.0, lockstep=False)
     assert overrides["airframe"] == str(beside)
+
+
+def test_identified_scenario_flies_under_guidance_where_map_has_a_pose(tmp_path: Path) -> None:
+    text = (REPOSITORY / "examples" / "arduplane" / "scenario.yaml").read_text()
+    path = tmp_path / "guided.yaml"
+    path.write_text(guided_scenario(text, load_map("ardupilot_mavlink"), 23.9))
+    guided = find_scenario(str(path))
+    assert guided.guidance is not None
+    assert guided.guidance.speed == 23.9
+    assert guided.reference_model.pulses == {}
+    assert guided.controller == find_scenario(str(REPOSITORY / EXAMPLE)).controller
+    assert guided_scenario(text, load_map(EXAMPLES["px4_quadrotor"]), None) == ""
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:

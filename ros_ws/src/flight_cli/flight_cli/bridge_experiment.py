@@ -22,7 +22,15 @@ from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import flight_progress, new_table, print_json, say
-from flight_core.files import display_path, link_latest, write_file, writing
+from flight_core.channels import RATES_AND_SPEED
+from flight_core.files import (
+    display_path,
+    dump_yaml,
+    link_latest,
+    parse_yaml,
+    write_file,
+    writing,
+)
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
@@ -49,6 +57,8 @@ from flight_design.identification.open_loop_fit import FASTEST_ZERO, ChannelMode
 from flight_design.identification.response_identification import Response, identify_response
 from flight_design.identification.sign_check import OPEN_LOOP
 from flight_log.tape_reader import read_run
+
+GUIDED = 600.0  # s, of a flight under guidance
 
 
 def identify_behind_bridge(
@@ -116,14 +126,37 @@ def identify_behind_bridge(
     )
     written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
-    _write(folder, files)
-    load_scenario(folder / "scenario.yaml")
+    guided = guided_scenario(flyable.scenario, channel_map, speed)
+    _write(folder, files | ({"guided": guided} if guided else {}))
+    for name in ("scenario", *(["guided"] if guided else [])):
+        load_scenario(folder / f"{name}.yaml")
     if as_json:
         print_json(_as_json(response, channels, flyable, trims, folder))
         return
     _show_gains(console, channels, response, flyable)
     scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
     say(console, f"to fly it: rise-di fly {scenario} --bridge {copied} --send")
+    if guided:
+        say(console, f"under guidance: {shlex.quote(str(folder / 'guided.yaml'))} in its place")
+
+
+def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str:
+    """The text of a scenario under guidance in place of its commands.
+
+    Empty where guidance cannot fly: a map without pose, or without the rates and the airspeed.
+    """
+    if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
+        return ""
+    content = parse_yaml(scenario.encode(), "scenario", "a scenario")
+    commands = content["/**/reference_model"]["ros__parameters"]
+    for key in ("pulses", "coordinated_turn"):
+        commands.pop(key, None)
+    commands["live"] = {"speed": speed}
+    content["/**/flight"]["ros__parameters"]["duration"] = GUIDED
+    max_age = max(row.max_age for row in channel_map.pose.values())
+    content["/**/guidance"] = {"ros__parameters": {"max_age": max_age}}
+    heading = [line for line in scenario.splitlines() if line.startswith("#")]
+    return "\n".join([*heading, dump_yaml(content)])
 
 
 def _identified(
