@@ -74,9 +74,8 @@ def control_law(model: NominalModel) -> ControlLaw:
     size = (model.C @ model.size)[:, None]
     unit = model.input_scale[:, None] * size
     nominal = nominal_theta(model)[..., None]
-    inverse_lag = (
-        1.0 / np.maximum(model.total_lag - 1.5 * model.period, 1e-6)[:, None]
-    )  # the hold is in the difference
+    # the hold is in the difference
+    inverse_lag = 1.0 / np.maximum(model.total_lag - 1.5 * model.period, 1e-6)[:, None]
 
     def covariance(params: SelfTunerParams) -> Array:
         xp = array_namespace(params.prior_A)
@@ -112,12 +111,7 @@ def control_law(model: NominalModel) -> ControlLaw:
         P_0 = covariance(params)
         theta = nominal + remembered * (state.theta - nominal)
         P = P_0 + remembered**2 * (state.P - P_0)
-        P_phi = xp.sum(P * phi[None, :, :], axis=1)
-        gain = dt * P_phi / (1.0 + dt * xp.sum(phi * P_phi, axis=0))
-        theta = (
-            theta + (y_dot - xp.sum(theta * phi[None, :, :], axis=1))[:, None, :] * gain[None, :, :]
-        )
-        P = P - gain[:, None, :] * P_phi[None, :, :]
+        theta, P = least_squares_step(theta, P, phi, y_dot, dt)
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         nu = measured.y_m_dot - params.K * (e + params.Lambda * integral_e)
@@ -128,15 +122,27 @@ def control_law(model: NominalModel) -> ControlLaw:
         integral_e = conditional_integration(
             state.integral_e, integral_e, effect, model.Omega @ excess
         )
-        return (
-            SelfTunerState(
-                e, integral_e, u_late, u_f, state.y_f + a * (measured.y - state.y_f), theta, P
-            ),
-            u_free,
-            u,
-        )
+        y_f = state.y_f + a * (measured.y - state.y_f)
+        after = SelfTunerState(e, integral_e, u_late, u_f, y_f, theta, P)
+        return after, u_free, u
 
     return campaign_law(SelfTunerState, engage, limited)
+
+
+def least_squares_step(
+    theta: Array, P: Array, phi: Array, y_dot: Array, dt: Array
+) -> tuple[Array, Array]:
+    """A step of recursive least squares: theta, shape (m, k, N), and P, shape (k, k, N), after.
+
+        g = dt P phi / (1 + dt phi' P phi),  theta += (y_dot - theta phi) g',  P -= g phi' P
+
+    phi: regressor, shape (k, N); y_dot, shape (m, N), in scaled units, 1/s.
+    """
+    xp = array_namespace(phi)
+    P_phi = xp.sum(P * phi[None, :, :], axis=1)
+    gain = dt * P_phi / (1.0 + dt * xp.sum(phi * P_phi, axis=0))
+    residual = y_dot - xp.sum(theta * phi[None, :, :], axis=1)
+    return theta + residual[:, None, :] * gain[None, :, :], P - gain[:, None, :] * P_phi[None, :, :]
 
 
 def nominal_theta(model: NominalModel) -> FloatArray:
