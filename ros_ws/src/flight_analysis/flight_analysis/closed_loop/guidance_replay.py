@@ -4,6 +4,7 @@
 before.
 """
 
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance, modes
-from flight_guidance.guidance_state import Begin, GuidanceState, Lateral
+from flight_guidance.guidance_state import Begin, GuidanceState, Inputs, Lateral
 from flight_guidance.notices import LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
@@ -67,63 +68,82 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
-    signal = tape["guidance"]
-    t = tape.time("guidance")
-    outputs = parameters.outputs
-    names = signal.names
-    if (
-        tuple(
-            name for name in guidance.names(outputs) if name in names or name not in guidance.ADDED
-        )
-        != names
-    ):
+    steps = len(tape.time("guidance"))
+    if not _has_known_channels(tape["guidance"].names, parameters.outputs):
         why = "a different version recorded their channels"
-        return GuidanceReplay(
-            len(t), 0, 0, None, (f"{len(t)} steps of guidance not checked: {why}",)
-        )
-    legs = {guidance.digest(None): None} | known_routes(tape, parameters)
-    published = (
-        {}
-        if "u_m" not in tape
-        else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
-    )
-    recorded_of = [name in names for name in guidance.names(outputs)]
-    params = parameters.params()
-    checked = 0
-    differing = 0
-    first: Difference | None = None
-    previous: GuidanceState | None = None
-    for k, (stamp_ns, row) in enumerate(zip(signal.stamp_ns.tolist(), signal.values, strict=True)):
-        inputs, recorded = guidance.restored(
-            stamp_ns, dict(zip(names, row.tolist(), strict=True)), outputs
-        )
-        flown = int(row[names.index("route")])
-        without_heading = recorded.lateral is Lateral.HEADING and guidance.HEADING not in names
-        if (
-            flown in legs
-            and not without_heading
-            and (previous is not None or inputs.begin is Begin.HOLD)
-        ):
-            checked += 1
-            link_age = row[names.index(LINK_AGE)] if LINK_AGE in names else 0.0
-            state, commands = modes.step(previous, inputs, legs[flown], params)
-            both = (
-                np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
-                np.append(
-                    guidance.row(inputs, state, commands, flown, link_age)[recorded_of],
-                    guidance.u_m(state),
-                ),
-            )
-            columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
-            if len(columns):
-                differing += 1
-                column = int(columns[0])
-                channel = (*names, *(f"published.{name}" for name in (*outputs, *ATTITUDE)))[column]
-                first = first or Difference(
-                    k + 1, float(t[k]), channel, float(both[0][column]), float(both[1][column])
-                )
-        previous = recorded
-    missing = len(t) - checked
+        return GuidanceReplay(steps, 0, 0, None, (f"{steps} steps of guidance not checked: {why}",))
+    comparison = _Comparison(tape, parameters)
+    differences = [*comparison.differences()]
+    missing = steps - comparison.checked
     why = "the log does not hold their route, or the state before them"
     notes = (f"{missing} steps of guidance not checked: {why}",) if missing else ()
-    return GuidanceReplay(len(t), checked, differing, first, notes)
+    first = next(iter(differences), None)
+    return GuidanceReplay(steps, comparison.checked, len(differences), first, notes)
+
+
+def _has_known_channels(names: tuple[str, ...], outputs: tuple[str, ...]) -> bool:
+    """Whether a log has the channels of guidance; `guidance.ADDED` may lack."""
+    expected = guidance.names(outputs)
+    known = [name for name in expected if name in names or name not in guidance.ADDED]
+    return tuple(known) == names
+
+
+class _Comparison:
+    """The steps of guidance in a log, and the published u_m of their instants."""
+
+    def __init__(self, tape: Tape, parameters: GuidanceConfig) -> None:
+        self.checked = 0
+        self._signal = tape["guidance"]
+        self._t = tape.time("guidance")
+        self._names = self._signal.names
+        self._outputs = parameters.outputs
+        self._params = parameters.params()
+        self._legs = {guidance.digest(None): None} | known_routes(tape, parameters)
+        u_m = tape.signals.get("u_m")
+        self._published = (
+            {} if u_m is None else dict(zip(u_m.stamp_ns.tolist(), u_m.values, strict=True))
+        )
+
+    def differences(self) -> Iterator[Difference]:
+        """The first different channel of each different step, in the order of the steps."""
+        previous: GuidanceState | None = None
+        rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
+        for k, (stamp_ns, row) in enumerate(rows):
+            channels = dict(zip(self._names, row.tolist(), strict=True))
+            inputs, recorded = guidance.restored(stamp_ns, channels, self._outputs)
+            without_heading = (
+                recorded.lateral is Lateral.HEADING and guidance.HEADING not in channels
+            )
+            begins = previous is not None or inputs.begin is Begin.HOLD
+            if int(channels["route"]) in self._legs and not without_heading and begins:
+                self.checked += 1
+                computed = self._computed(previous, inputs, channels)
+                u_m = self._published.get(stamp_ns, guidance.u_m(recorded))
+                if difference := self._difference(k, np.append(row, u_m), computed):
+                    yield difference
+            previous = recorded
+
+    def _computed(
+        self,
+        previous: GuidanceState | None,
+        inputs: Inputs,
+        channels: Mapping[str, float],
+    ) -> FloatArray:
+        """The channels of a step after a state, then its u_m."""
+        flown = int(channels["route"])
+        state, commands = modes.step(previous, inputs, self._legs[flown], self._params)
+        link_age = channels.get(LINK_AGE, 0.0)
+        row = guidance.row(inputs, state, commands, flown, link_age)
+        logged = [name in self._names for name in guidance.names(self._outputs)]
+        return np.append(row[logged], guidance.u_m(state))
+
+    def _difference(self, k: int, recorded: FloatArray, computed: FloatArray) -> Difference | None:
+        """The first channel of step k with a different bit."""
+        columns = np.flatnonzero(recorded.view(np.int64) != computed.view(np.int64))
+        if len(columns) == 0:
+            return None
+        column = int(columns[0])
+        published = (f"published.{name}" for name in (*self._outputs, *ATTITUDE))
+        channel = (*self._names, *published)[column]
+        values = float(recorded[column]), float(computed[column])
+        return Difference(k + 1, float(self._t[k]), channel, *values)
