@@ -202,74 +202,98 @@ def parameter_overrides(
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
-        return clock | (
-            {}
-            if autopilot is None
-            else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
-        )
+        if autopilot is None:
+            return clock
+        return clock | {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
-    guidance = scenario.guidance
-    further: list[str] = []
+    overrides = _stage_overrides(scenario, lockstep=lockstep)
+    overrides[RECORDER] |= _recording(scenario, run, autopilot)
+    if autopilot is not None:
+        overrides[CONTROLLER]["start_active"] = False  # the bridge activates it: only while engaged
+    if lockstep:
+        for node, rates in _lockstep_rates(scenario).items():
+            overrides[node] |= rates
+        # a recorder in the same process never lags
+        overrides[AIRCRAFT]["recorded"] = not one_process
+    if spec in (RECORDER, ONE_PROCESS):
+        sections = {node.executable: values for node, values in overrides.items()}
+        overrides[RECORDER] |= _attachments(scenario, run, sections, autopilot)
+    if not lockstep:
+        for node in (*SECOND_STAGE, GUIDANCE) if GUIDANCE in overrides else SECOND_STAGE:
+            overrides[node]["start_time"] = start_time
+    if not one_process:
+        return overrides[spec] | clock
+    if not lockstep:
+        overrides.pop(LEARNER, None)  # which has a process of its own
+    return {
+        f"{node.executable}:{name}": value
+        for node, values in overrides.items()
+        for name, value in (values | clock).items()
+    }
+
+
+def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, ParameterOverrides]:
+    """The parameters of both stages: the rules of guidance, the scenario of the learner."""
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {
         node: {"lockstep": lockstep} for node in stages
     }
     overrides[AIRCRAFT] |= _airframe(scenario)
-    if guidance is not None:
+    if scenario.guidance is not None:
         overrides[GUIDANCE] |= {
             name: list(value) if isinstance(value, tuple) else value
-            for name, value in guidance.by_rule()
+            for name, value in scenario.guidance.by_rule()
         }
-        further += topics.recorded_with("guidance")
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
+    return overrides
+
+
+def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> ParameterOverrides:
+    """The folder of the recorder, and its topics beside those of every flight."""
+    further: list[str] = []
+    if scenario.guidance is not None:
+        further += topics.recorded_with("guidance")
+    if scenario.learns():
         further += topics.recorded_with("learner")
-    further += topics.recorded_with("probe") if scenario.controller.probe else []
+    if scenario.controller.probe:
+        further += topics.recorded_with("probe")
     if autopilot is not None:
         further += autopilot.topics
-    if further:
-        overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further]
-    overrides[RECORDER]["directory"] = str(run)
-    if autopilot is not None:
-        overrides[CONTROLLER]["start_active"] = False  # the bridge activates it: only while engaged
-    if lockstep:
-        overrides[AIRCRAFT] |= {
-            "control_rate": scenario.controller.rate,
-            "duration": scenario.flight.duration,
-            "recorded": not one_process,  # a recorder in the same process never lags
-        }
-        overrides[CONTROLLER]["y_rate"] = scenario.aircraft.rate
-        if guidance is not None:
-            overrides[GUIDANCE]["y_rate"] = scenario.aircraft.rate
-            overrides[GUIDANCE]["authority_rate"] = (
-                scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
-            )
-            overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
-    if spec in (RECORDER, ONE_PROCESS):
-        maps = () if autopilot is None else (autopilot.map_path,)
-        files = attachments_for(
-            scenario, run, {node.executable: values for node, values in overrides.items()}, maps
-        )
-        overrides[RECORDER] |= {
-            "scenario_file": str(files.scenario),
-            "attach": [str(path) for path in files.files],
-            "metadata_file": str(files.metadata),
-        }
-    if one_process:
-        if not lockstep:
-            overrides.pop(LEARNER, None)  # which has a process of its own
-            for node in (*SECOND_STAGE, *(() if guidance is None else (GUIDANCE,))):
-                overrides[node]["start_time"] = start_time
-        return {
-            f"{node.executable}:{name}": value
-            for node, values in overrides.items()
-            for name, value in (values | clock).items()
-        }
-    return (
-        overrides[spec]
-        | clock
-        | ({"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {})
-    )
+    recorded = {"topics": [*scenario.recorder.topics, *further]} if further else {}
+    return {"directory": str(run), **recorded}
+
+
+def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
+    """The rates of the inputs that a node waits for in lockstep, and the duration."""
+    guidance = scenario.guidance
+    control_rate = scenario.controller.rate
+    y_rate: ParameterOverrides = {"y_rate": scenario.aircraft.rate}
+    rates: dict[NodeSpec, ParameterOverrides] = {
+        AIRCRAFT: {"control_rate": control_rate, "duration": scenario.flight.duration},
+        CONTROLLER: y_rate,
+    }
+    if guidance is not None:
+        authority_rate = scenario.learns() * control_rate / AUTHORITY_TICKS
+        rates[GUIDANCE] = {**y_rate, "authority_rate": authority_rate}
+        rates[REFERENCE_MODEL] = {"u_m_rate": guidance.rate}
+    return rates
+
+
+def _attachments(
+    scenario: Scenario,
+    run: Path,
+    overrides: dict[str, ParameterOverrides],
+    autopilot: Autopilot | None,
+) -> ParameterOverrides:
+    """The files that the recorder attaches to the log; they are written into the folder."""
+    maps = () if autopilot is None else (autopilot.map_path,)
+    files = attachments_for(scenario, run, overrides, maps)
+    return {
+        "scenario_file": str(files.scenario),
+        "attach": [str(path) for path in files.files],
+        "metadata_file": str(files.metadata),
+    }
 
 
 def replayed_topics(

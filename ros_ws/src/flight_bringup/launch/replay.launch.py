@@ -15,7 +15,6 @@ from pathlib import Path
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
-from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
@@ -27,7 +26,6 @@ from flight_bringup.graph import (
     CONTROLLER,
     RECORDER,
     REFERENCE_MODEL,
-    NodeSpec,
     find_autopilot,
     parameter_overrides,
     replayed_topics,
@@ -109,9 +107,8 @@ def _play(context: LaunchContext) -> list[Action]:
     autopilot = (
         find_autopilot(argument(context, "map"), dry_run=True) if argument(context, "map") else None
     )
-    nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"] + [
-        BRIDGE
-    ] * (autopilot is not None)
+    nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"]
+    nodes += [] if autopilot is None else [BRIDGE]
     others = [spec.executable for spec in nodes if spec not in (RECORDER, CONTROLLER)]
     require(
         not (lockstep and others),
@@ -119,53 +116,48 @@ def _play(context: LaunchContext) -> list[Action]:
         f"true with {', '.join(others)}",
         "controller and recorder alone",
     )
-    recorded = read_playback(log).types
-    recorded = recorded.keys() - unsendable(recorded)
+    types = read_playback(log).types
+    recorded = types.keys() - unsendable(types)
     topics = argument(context, "topics") or ",".join(
         replayed_topics(recorded, nodes, namespace, autopilot)
     )
     end_with_launch(context)
+    scenario = None
     run = Path()
+    if nodes:
+        name = argument(context, "scenario")
+        scenario = find_scenario(name) if name else recorded_scenario(log, namespace or None)
+        if RECORDER in nodes:
+            run = new_run(scenario, Path(argument(context, "runs")))
+    player = _player(context, topics, run, recorded=RECORDER in nodes)
+    if scenario is None:
+        return [player]
+    first_stage = {}
+    for spec in nodes:
+        overrides = parameter_overrides(
+            spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot
+        )
+        first_stage[spec] = flight_node(spec, scenario, overrides, run)
+    second_stage = [LogInfo(msg=f"playing {topics}"), player]
+    return start_in_stages(context, run, first_stage, lambda lead, start_time: second_stage)
+
+
+def _player(context: LaunchContext, topics: str, run: Path, *, recorded: bool) -> ExecuteProcess:
+    """`rise-di play` with the arguments of the launch; its end is that of the launch."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:
             fail_on_exit(event, context, run)
-        return (
-            complete(run, "playback completed")
-            if RECORDER in nodes
-            else [Shutdown(reason="playback completed")]
-        )
+        if recorded:
+            return complete(run, "playback completed")
+        return [Shutdown(reason="playback completed")]
 
+    lockstep = argument(context, "lockstep") == "true"
+    options = ["--topics", topics, "--stamps", "recorded" if lockstep else "now"]
+    for name in ("rate", "start"):
+        options += [f"--{name}", argument(context, name)]
+    if argument(context, "loop") == "true":
+        options.append("--loop")
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    loop = ["--loop"] if argument(context, "loop") == "true" else []
-    stamps = ["--stamps", "recorded" if lockstep else "now"]
-    options = [
-        "--topics",
-        topics,
-        "--rate",
-        argument(context, "rate"),
-        "--start",
-        argument(context, "start"),
-        *stamps,
-        *loop,
-    ]
-    player = ExecuteProcess(
-        cmd=[rise_di, "play", str(log), *options], name="play", output="screen", on_exit=end
-    )
-    if not nodes:
-        return [player]
-    name = argument(context, "scenario")
-    scenario = find_scenario(name) if name else recorded_scenario(log, namespace or None)
-    if RECORDER in nodes:
-        run = new_run(scenario, Path(argument(context, "runs")))
-
-    def node(spec: NodeSpec) -> Node:
-        overrides = parameter_overrides(
-            spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot
-        )
-        return flight_node(spec, scenario, overrides, run)
-
-    second_stage = [LogInfo(msg=f"playing {topics}"), player]
-    return start_in_stages(
-        context, run, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage
-    )
+    command = [rise_di, "play", argument(context, "run"), *options]
+    return ExecuteProcess(cmd=command, name="play", output="screen", on_exit=end)

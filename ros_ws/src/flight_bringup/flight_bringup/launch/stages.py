@@ -316,7 +316,7 @@ def start_in_stages(
     return [
         *handlers,
         *first.values(),
-        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_ready)]),
+        _after(READY_TIMEOUT, require_ready),
     ]
 
 
@@ -335,70 +335,78 @@ def begin_when_matched(
     the end. A node that does not get so far, and an aircraft that takes no u, end the launch with
     exit status 1.
     """
-    waiting = dict.fromkeys(nodes)
-    flying = []
-    start_ns = [0]
-    held_ns = [-1]
-    publish = (
-        get_ros_node(context)
-        .create_publisher(START.type, f"{_namespace(context)}/{START.name}", offered(START))
-        .publish
-    )
-
-    def matched(spec: NodeSpec) -> Sequence[Action]:
-        del waiting[spec]
-        if waiting:
-            return []
-        start_time = start_instant(LEAD, time.time())
-        publish(instant(nanoseconds(start_time)))
-        start_ns[0] = nanoseconds(start_time)
-        return [
-            TimerAction(period=LEAD + FIRST_U, actions=[OpaqueFunction(function=require_flight)]),
-            TimerAction(
-                period=LEAD + duration + 2.0 * LOG_TIMEOUT,
-                actions=[OpaqueFunction(function=give_up)],
-            ),
-        ]
-
-    def fly() -> Sequence[Action]:
-        flying.append(True)
-        return []
-
-    def require_matched(context: LaunchContext) -> None:
-        if waiting and not context.is_shutdown:
-            names = ", ".join(spec.executable for spec in waiting)
-            end_with(
-                run,
-                f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after "
-                f"{READY_TIMEOUT:g} s",
-            )
-
-    def require_flight(context: LaunchContext) -> None:
-        if not flying and not context.is_shutdown:
-            lines = "the lines of the nodes say what they wait for"
-            end_with(
-                run,
-                f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the "
-                f"aircraft; {lines}",
-            )
-
-    def give_up(context: LaunchContext) -> None:
-        if not context.is_shutdown:
-            end_with(run, ended_early((held_ns[0] - start_ns[0]) / NANOSECONDS, duration))
-
-    def held(stamp_ns: int) -> bool:
-        held_ns[0] = stamp_ns
-        return stamp_ns >= start_ns[0] + nanoseconds(duration) and start_ns[0] > 0
-
+    begin = _Begin(context, run, nodes, duration)
     return [
-        _complete_at(context, run, held, by_rosbag2=by_rosbag2),
+        _complete_at(context, run, begin.held, by_rosbag2=by_rosbag2),
         *(
-            on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec))
+            on_state(context, spec, NodeState.MATCHED, partial(begin.matched, spec))
             for spec in nodes
         ),
-        on_state(context, AIRCRAFT, NodeState.FLYING, fly),
-        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
+        on_state(context, AIRCRAFT, NodeState.FLYING, begin.fly),
+        _after(READY_TIMEOUT, begin.require_matched),
     ]
+
+
+class _Begin:
+    """The begin of a flight by the topic `start`, and the ends of a flight that does not begin."""
+
+    def __init__(
+        self, context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], duration: float
+    ) -> None:
+        self._run = run
+        self._duration = duration
+        self._waiting = dict.fromkeys(nodes)
+        self._flies = False
+        self._start_ns = 0  # of t = 0; 0 before it is sent
+        self._held_ns = -1  # the stamp up to which the log holds y, y_m and u
+        topic = f"{_namespace(context)}/{START.name}"
+        node = get_ros_node(context)
+        self._publish = node.create_publisher(START.type, topic, offered(START)).publish
+
+    def matched(self, spec: NodeSpec) -> Sequence[Action]:
+        """Send t = 0 once the last node is matched."""
+        del self._waiting[spec]
+        if self._waiting:
+            return []
+        self._start_ns = nanoseconds(start_instant(LEAD, time.time()))
+        self._publish(instant(self._start_ns))
+        return [
+            _after(LEAD + FIRST_U, self._require_flight),
+            _after(LEAD + self._duration + 2.0 * LOG_TIMEOUT, self._give_up),
+        ]
+
+    def fly(self) -> Sequence[Action]:
+        """The aircraft has taken its first u."""
+        self._flies = True
+        return []
+
+    def held(self, stamp_ns: int) -> bool:
+        """Whether a log up to a stamp holds the flight."""
+        self._held_ns = stamp_ns
+        return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
+
+    def require_matched(self, context: LaunchContext) -> None:
+        """End the launch for a node that waits too long."""
+        if self._waiting and not context.is_shutdown:
+            names = ", ".join(spec.executable for spec in self._waiting)
+            reason = "not ready, or with an input without a publisher, after"
+            end_with(self._run, f"{NEVER_FLEW}: {names} {reason} {READY_TIMEOUT:g} s")
+
+    def _require_flight(self, context: LaunchContext) -> None:
+        if not self._flies and not context.is_shutdown:
+            reason = "y did not reach the controller, or u did not reach the aircraft"
+            lines = "the lines of the nodes say what they wait for"
+            end_with(self._run, f"{NEVER_FLEW}: {reason}; {lines}")
+
+    def _give_up(self, context: LaunchContext) -> None:
+        if not context.is_shutdown:
+            flown = (self._held_ns - self._start_ns) / NANOSECONDS
+            end_with(self._run, ended_early(flown, self._duration))
+
+
+def _after(period: float, function: Callable[[LaunchContext], list[Action] | None]) -> TimerAction:
+    """Call a function after a period, s."""
+    return TimerAction(period=period, actions=[OpaqueFunction(function=function)])
 
 
 def end_with_log(
@@ -428,8 +436,7 @@ def end_with_log(
         moves = time.monotonic() < last[0] + LOG_TIMEOUT
         return [TimerAction(period=LOG_TIMEOUT, actions=complete(run))] if moves else complete(run)
 
-    timer = TimerAction(period=lead + duration, actions=[OpaqueFunction(function=end)])
-    return [timer, _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
+    return [_after(lead + duration, end), _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
 
 
 def _complete_at(
