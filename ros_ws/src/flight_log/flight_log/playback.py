@@ -6,7 +6,7 @@
 
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -76,45 +76,17 @@ def read_playback(
     skipped = {message.topic: _unsendable(message) for message in stored if _unsendable(message)}
     stored = [message for message in stored if message.topic not in skipped]
     if namespace is not None:
-        all_topics = {message.topic for message in stored}
-        inside = names_within(
-            chosen_namespace(all_topics, namespace, str(run)), all_topics
-        ).keys() | {*SHARED}
-        stored = [message for message in stored if message.topic in inside]
+        stored = _within(stored, namespace, str(run))
     known = {message.topic: message for message in stored}
     wanted = set[str]() if topics else set(known) - set(SHARED)
     for name in topics:
         wanted.update(_matching(name, known, str(run)))
-    require(
-        bool(wanted),
-        str(run),
-        f"no message{f' to play among {listed(skipped)}' if skipped else ''}",
-        A_FLIGHT,
-    )
-    begins_stamped = {
-        topic: begins_with_stamp(_definition(message)) for topic, message in known.items()
-    }
-    votes = [
-        _is_flight_time(message)
-        for message in stored
-        if message.type_name == JOINT_STATE and stamp_of(message.data)
-    ]
-    lockstep = 2 * sum(votes) > len(votes)
-    messages = []
-    now_ns = 0
-    for message in stored:
-        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is
-        # sent unchanged.
-        stamped = begins_stamped[message.topic] and _is_flight_time(message) is lockstep
-        if not lockstep:
-            now_ns = _sent_ns(message)
-        elif stamped:
-            now_ns = max(now_ns, stamp_of(message.data))
-        if message.topic in wanted:
-            messages.append(ScheduledMessage(now_ns, message.topic, message.data, stamped))
-    start_ns = _start_ns(
-        (message for message in stored if _is_flight_time(message) is lockstep), messages[0].due_ns
-    )
+    among = f" to play among {listed(skipped)}" if skipped else ""
+    require(bool(wanted), str(run), f"no message{among}", A_FLIGHT)
+    lockstep = _is_lockstep(stored)
+    messages = [*_scheduled(stored, known, wanted, lockstep=lockstep)]
+    timed = (message for message in stored if _is_flight_time(message) is lockstep)
+    start_ns = _start_ns(timed, messages[0].due_ns)
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
     require(
@@ -123,17 +95,53 @@ def read_playback(
         f"{start:g} s",
         f"a flight time before the end of the log, {end:g} s",
     )
-    played = (
-        messages
-        if start <= 0.0
-        else [
-            *_latched(messages, known, begin_ns),
-            *(later for later in messages if later.due_ns >= begin_ns),
-        ]
-    )
-    return Playback(
-        {topic: known[topic].type_name for topic in sorted(wanted)}, played, start_ns, skipped
-    )
+    if start > 0.0:
+        later = (message for message in messages if message.due_ns >= begin_ns)
+        messages = [*_latched(messages, known, begin_ns), *later]
+    types = {topic: known[topic].type_name for topic in sorted(wanted)}
+    return Playback(types, messages, start_ns, skipped)
+
+
+def _within(stored: Sequence[StoredMessage], namespace: str, where: str) -> list[StoredMessage]:
+    """The messages of an aircraft, and of SHARED topics. Raises ParameterError."""
+    topics = {message.topic for message in stored}
+    names = names_within(chosen_namespace(topics, namespace, where), topics)
+    inside = {*names, *SHARED}
+    return [message for message in stored if message.topic in inside]
+
+
+def _is_lockstep(stored: Iterable[StoredMessage]) -> bool:
+    """Whether most stamps of named vectors are flight time, as in lockstep."""
+    votes = [
+        _is_flight_time(message)
+        for message in stored
+        if message.type_name == JOINT_STATE and stamp_of(message.data)
+    ]
+    return 2 * sum(votes) > len(votes)
+
+
+def _scheduled(
+    stored: Iterable[StoredMessage],
+    known: Mapping[str, StoredMessage],
+    wanted: Collection[str],
+    *,
+    lockstep: bool,
+) -> Iterator[ScheduledMessage]:
+    """The wanted messages with their due times."""
+    stamped_topics = {
+        topic for topic, message in known.items() if begins_with_stamp(_definition(message))
+    }
+    now_ns = 0
+    for message in stored:
+        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is
+        # sent unchanged.
+        stamped = message.topic in stamped_topics and _is_flight_time(message) is lockstep
+        if not lockstep:
+            now_ns = _sent_ns(message)
+        elif stamped:
+            now_ns = max(now_ns, stamp_of(message.data))
+        if message.topic in wanted:
+            yield ScheduledMessage(now_ns, message.topic, message.data, stamped)
 
 
 def _latched(
