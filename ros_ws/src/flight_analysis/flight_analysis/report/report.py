@@ -4,7 +4,7 @@
 programs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,14 @@ from flight_core.parameters import require
 from flight_log.open_log import A_RUN
 
 A_FILE = "the path of a file"
+
+
+class File(NamedTuple):
+    """A file beside the page: the key in refusals, the path, and what writes flights to a path."""
+
+    key: str
+    path: Path
+    write: Callable[[Path, Sequence[RecordedFlight]], object]
 
 
 class Report(NamedTuple):
@@ -88,28 +96,27 @@ def report(
     """
     require(bool(runs), "runs", "none", A_RUN)
     folders = [as_path(run, "run", A_RUN) for run in runs]
-    wanted = (
-        ("html", html, write_page),
-        ("png", png, write_png),
-        ("csv", csv, write_csv),
-        ("parquet", parquet, write_parquet),
-        ("figure", figure, partial(write_figure, width=width, channels=channels)),
-        ("mat", mat, write_mat),
-        ("tables", tables, write_tables),
-        ("latex", latex, write_latex),
-    )
     if figure is None:
-        require(
-            not channels and width == WIDTH,
-            "channels" if channels else "width",
-            "it without a figure",
-            "figure beside it",
-        )
+        key = "channels" if channels else "width"
+        unused = not channels and width == WIDTH
+        require(unused, key, "it without a figure", "figure beside it")
     files = [
-        (key, as_path(path, key, A_FILE), write) for key, path, write in wanted if path is not None
+        File(key, as_path(path, key, A_FILE), write)
+        for key, path, write in (
+            ("html", html, write_page),
+            ("png", png, write_png),
+            ("csv", csv, write_csv),
+            ("parquet", parquet, write_parquet),
+            ("figure", figure, partial(write_figure, width=width, channels=channels)),
+            ("mat", mat, write_mat),
+            ("tables", tables, write_tables),
+            ("latex", latex, write_latex),
+        )
+        if path is not None
     ]
     alone = len(folders) == 1 and html is None
     require(output is None or alone, "output", "a comparison", "one run; html for several")
+    read = partial(read_flight, namespace=namespace, scenario=scenario, remaps=remaps)
     if alone:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
         result = write_report(
@@ -118,22 +125,21 @@ def report(
         page = result.report
         flights = [result.flight]
     else:
-        flights = [
-            read_flight(folder, namespace=namespace, scenario=scenario, remaps=remaps)
-            for folder in folders
-        ]
-        for folder, flight in zip(folders, flights, strict=True):
-            expected = "a flight of the stack: a comparison is of tracking errors"
-            require(
-                len(flights) == 1 or flight.scenario is not None,
-                str(folder),
-                "an imported log",
-                expected,
-            )
+        flights = [read(folder) for folder in folders]
+        _require_comparable(folders, flights)
         if html is None:
-            files.insert(0, ("html", folders[0].absolute().parent / "comparison.html", write_page))
-        page = files[0][1]
-    for key, path, write in files:
-        with writing(key, path, A_FILE):
-            write(path, flights)
+            comparison = folders[0].absolute().parent / "comparison.html"
+            files.insert(0, File("html", comparison, write_page))
+        page = files[0].path
+    for file in files:
+        with writing(file.key, file.path, A_FILE):
+            file.write(file.path, flights)
     return Report(page, flights)
+
+
+def _require_comparable(folders: Sequence[Path], flights: Sequence[RecordedFlight]) -> None:
+    """Raise ParameterError for an imported log among several runs."""
+    expected = "a flight of the stack: a comparison is of tracking errors"
+    for folder, flight in zip(folders, flights, strict=True):
+        comparable = len(flights) == 1 or flight.scenario is not None
+        require(comparable, str(folder), "an imported log", expected)
