@@ -197,30 +197,18 @@ def fly_plant(
         'completed'
     """
     loop = Loop(controller)
-    config = reference_model
-    if not isinstance(config, ReferenceModelConfig):
-        config = ReferenceModelConfig.validate_mapping(config, "reference_model")
-    require_channels(
-        "reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller"
-    )
+    config = _reference_model(reference_model, loop)
     reference = Reference(config)
     period_ns = nanoseconds(loop.period)
+    samples, rest = divmod(period_ns, reference.period_ns)
     multiple = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
-    require(
-        period_ns % reference.period_ns == 0,
-        "reference_model.rate",
-        f"{config.rate:g} Hz",
-        multiple,
-    )
-    each = period_ns // reference.period_ns
-    ticks = (
-        int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
-    )
+    require(rest == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
+    length_ns = nanoseconds(as_number(duration, "duration", loop.period, unit="s"))
     channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
     rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
     u = np.zeros(len(loop.inputs))
     outcome = COMPLETED
-    for k in range(ticks):
+    for k in range(int(length_ns // period_ns) + 1):
         t_ns = k * period_ns
         dt = loop.period if k else 0.0
         try:
@@ -230,20 +218,32 @@ def fly_plant(
         except FlightEnded as error:
             outcome = str(error)
             break
-        y_m = select(loop.outputs, config.outputs, reference.sample(k * each))
+        y_m = select(loop.outputs, config.outputs, reference.sample(k * samples))
         u = loop.step(seconds(t_ns), y, y_m)
         sample = {"y": y, "y_m": y_m} | (
             {} if loop.output is None else {"u": u, "internals": loop.output.internals}
         )
         for topic, value in sample.items():
             rows[topic].append((t_ns, value))
-    signals = {}
-    for topic, names in channels.items():
-        stamp_ns = np.array([stamp for stamp, _ in rows[topic]], dtype=np.int64)
-        signals[topic] = Signal(
-            stamp_ns, names, np.array([row for _, row in rows[topic]]).reshape(-1, len(names))
-        )
+    signals = {topic: _signal(names, rows[topic]) for topic, names in channels.items()}
     return Tape(signals, outcome=outcome)
+
+
+def _reference_model(
+    config: ReferenceModelConfig | Mapping[str, Any], loop: Loop
+) -> ReferenceModelConfig:
+    """Parameters of a reference model with the outputs of a loop. Raises ParameterError."""
+    if not isinstance(config, ReferenceModelConfig):
+        config = ReferenceModelConfig.validate_mapping(config, "reference_model")
+    expected = "the outputs of the controller"
+    require_channels("reference_model.outputs", config.outputs, loop.outputs, expected)
+    return config
+
+
+def _signal(names: tuple[str, ...], rows: Sequence[tuple[int, FloatArray]]) -> Signal:
+    """The samples of a topic, a row each: stamp, ns, and values."""
+    stamp_ns = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    return Signal(stamp_ns, names, np.array([row for _, row in rows]).reshape(-1, len(names)))
 
 
 def as_control(
@@ -290,18 +290,8 @@ def as_control(
     measured = [f"y_{name}" for name in config.outputs]
     names = [f"u_{name}" for name in config.effectors]
     if linear:
-        near = linear_law(tuned, m, dt)
-        T = np.eye(m) if guard.allocation is None else guard.allocation.T
-        return control.ss(
-            near.A,
-            near.B,
-            T @ near.C,
-            T @ near.D,
-            dt,
-            inputs=measured,
-            outputs=names,
-            name=config.law,
-        )
+        matrices = _linear_matrices(config)
+        return control.ss(*matrices, dt, inputs=measured, outputs=names, name=config.law)
     law, params = tuned
     zero = np.zeros(m)
     p = 0 if guard.allocation is None else len(names)
@@ -339,3 +329,12 @@ def as_control(
         outputs=names,
         name=config.law,
     )
+
+
+def _linear_matrices(config: ControllerConfig) -> tuple[FloatArray, ...]:
+    """A, B, C, D of the law near e = 0, from y to the effectors T u."""
+    m = len(config.outputs)
+    near = linear_law(config.tuned_law(), m, 1.0 / config.rate)
+    allocation = config.guard().allocation
+    T = np.eye(m) if allocation is None else allocation.T
+    return near.A, near.B, T @ near.C, T @ near.D
