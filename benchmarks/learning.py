@@ -42,7 +42,8 @@ from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, sampled_matrices, wi
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
 from flight_analysis.closed_loop.loop_margins import law_order
-from flight_analysis.closed_loop.replay import replay, vary
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

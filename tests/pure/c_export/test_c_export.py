@@ -47,17 +47,18 @@ from c_export.proof import (
     report,
     write_code,
 )
-from flight_analysis.closed_loop.replay import vary
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
-from flight_cli.export import export
+from flight_cli.export import Export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
-from flight_log.tape_reader import RecordedRun, StoredFile, read_run
+from flight_log.log_content import StoredFile
+from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
@@ -487,6 +488,11 @@ def test_log_is_replayed_by_c(tmp_path: Path) -> None:
     program = Program(tmp_path / "code", ["gcc"], sets, tmp_path / "program")
     assert program.compare(recording).differing == 0
     assert as_logged == recording.ticks > 30
+
+
+def export(scenario: str, folder: Path, **words: Any) -> None:
+    """`rise-di export`."""
+    Export(scenario=scenario, folder=folder, **words).execute()
 
 
 def test_command_writes_code_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from c_export.px4 import AXES, MODULE, SAMPLES, write_px4
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_cli.export import export
+from flight_cli.export import Export
 from flight_design.identification.module_log import STATUS, module_flight
 from flight_log.vehicle_log import Table, VehicleLog
 from rise_di_controller.internals import Saturation
@@ -320,7 +320,7 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
         r"^aircraft\.actuators\.upper: found no end stop of elevator",
     )
     with pytest.raises(typer.BadParameter, match="--c FOLDER or --px4 FOLDER"):
-        export("osprey_servo")
+        Export(scenario="osprey_servo").execute()
     assert set(AXES) == set("pqr")
 
 

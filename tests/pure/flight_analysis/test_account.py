@@ -42,8 +42,8 @@ from flight_bringup.fly import fly_and_report
 from flight_cli.fleet import _Result as FleetResult
 from flight_cli.fleet import _show as show_fleet
 from flight_cli.output import show_flight
-from flight_cli.replay import replay
-from flight_cli.report import report
+from flight_cli.replay import Replay
+from flight_cli.report import Report
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -75,7 +75,7 @@ def figures(whole: Path) -> dict[str, Any]:
 def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `rise-di replay --json` prints."""
     with pytest.raises(typer.Exit) as end:
-        replay(log, as_json=True)
+        Replay(run=log, as_json=True).execute()
     assert end.value.exit_code in {0, 1, STATUS_INCOMPLETE}
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result
@@ -153,7 +153,7 @@ def test_report_prints_part_beside_figures(
 ) -> None:
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
     with pytest.raises(typer.Exit) as end:
-        report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
+        Report(runs=[log], csv=tmp_path / "run.csv", png=tmp_path / "run.png").execute()
     assert end.value.exit_code == STATUS_INCOMPLETE
     output = " ".join(capsys.readouterr().out.split())
     assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
@@ -169,7 +169,7 @@ def test_replay_claims_no_tick_without_its_u(
 ) -> None:
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/u", DAMAGES["ends at a third"])
     with pytest.raises(typer.Exit):
-        replay(log)
+        Replay(run=log).execute()
     output = capsys.readouterr().out
     assert output.startswith("67 of 201 ticks checked, every bit equal\n")
     assert "note: 134 ticks have no sample on the topic u: what was sent is not compared" in output

@@ -13,6 +13,8 @@ from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis import metrics
 from flight_analysis.metrics import Transient
+from flight_analysis.report.spectra import spectra
+from flight_analysis.report.timing import tick_metrics
 from flight_core.tape import Signal, Tape
 from rise_di_controller.internals import Saturation
 
@@ -233,7 +235,7 @@ def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
     u = Signal(
         EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None]
     )
-    frequency, density = metrics.spectra(u, 10 * MS)
+    frequency, density = spectra(u, 10 * MS)
     assert frequency[np.argmax(density["elevator"])] == approx(5.0, abs=0.1)
     assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == approx(2.0, rel=0.01)
 
@@ -243,7 +245,7 @@ def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
 )  # a window of the whole, an even and an odd one
 def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
     values = np.random.default_rng(1).standard_normal((samples, 2)).cumsum(axis=0)
-    frequency, density = metrics.spectra(
+    frequency, density = spectra(
         Signal(EPOCH + np.arange(samples) * 10 * MS, ("a", "b"), values), 10 * MS
     )
     expected, power = welch(values, fs=100.0, nperseg=max(samples // 10, min(samples, 256)), axis=0)
@@ -254,9 +256,7 @@ def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
 
 def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
-    frequency, density = metrics.spectra(
-        Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS
-    )
+    frequency, density = spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
     assert frequency[-1] == 50.0
     assert np.all(density["u"] < 1e-12)  # constant, for gaps repeat the sample before
 
@@ -264,7 +264,7 @@ def test_a_spectrum_bridges_missing_samples() -> None:
 def test_periods_without_a_tick_are_counted() -> None:
     # Ticks at 0, 10, 20, 40 ms: none at 30, mean 13.3 ms; the stamps are those of y, 1 ms older.
     internals = signal([-1, 9, 19, 39], late=[0.0, 1e-4, 0.0, 3e-4], age=1e-3)
-    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    result = tick_metrics(tape(internals=internals), 10 * MS)
     assert result is not None
     assert (result.ticks, result.without_new_y, result.period_max, result.late_max) == (
         4,

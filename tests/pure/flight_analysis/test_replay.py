@@ -24,7 +24,8 @@ from tests.recordings import EPOCH, MS, scenario_file, truncate
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay, vary
+from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

@@ -18,9 +18,10 @@ from tests.recordings import EPOCH, MS, signal
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report import comparison, figures, html, plotting
+from flight_analysis.report.display_units import DisplayUnit
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext, SampleStore
-from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED

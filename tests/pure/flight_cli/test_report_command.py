@@ -14,7 +14,7 @@ from flight_analysis.report import run_folder
 from flight_analysis.report.run_folder import new_run, read_flight, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
-from flight_cli.report import report
+from flight_cli.report import Report
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
@@ -37,7 +37,7 @@ def test_one_run_as_figure_tables_and_json(
     runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     png, csv, parquet = (tmp_path / f"run.{suffix}" for suffix in ("png", "csv", "parquet"))
-    report(runs[:1], png=png, csv=csv, parquet=parquet, as_json=True)
+    Report(runs=runs[:1], png=png, csv=csv, parquet=parquet, as_json=True).execute()
     assert json.loads(capsys.readouterr().out) == json.loads((runs[0] / "summary.json").read_text())
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert csv.read_bytes()[:8] == b"stamp_ns"
@@ -68,14 +68,14 @@ def test_two_runs_are_compared(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = (runs[0] / "report.html").read_bytes()
-    report(runs, html=Path("two.html"))
+    Report(runs=runs, html=Path("two.html")).execute()
     output = capsys.readouterr().out
     assert "2 flights compared" in (tmp_path / "two.html").read_text()
     assert f"1: {runs[0].name}, completed" in output
     assert "settling" not in output  # the terminal shows errors only
     assert output.splitlines()[-1] == "report:  two.html"
     assert (runs[0] / "report.html").read_bytes() == before
-    report(runs, as_json=True)
+    Report(runs=runs, as_json=True).execute()
     assert [report["scenario"] for report in json.loads(capsys.readouterr().out)] == [
         "osprey_gust",
         "osprey_servo",
@@ -87,7 +87,7 @@ def test_two_runs_are_compared(
 def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
     nowhere: dict[str, Any] = {option: Path("/proc/none/file")}
     with refusing(f"^{option}: /proc/none/file cannot be written "):
-        report(runs[:1], **nowhere)
+        Report(runs=runs[:1], **nowhere).execute()
 
 
 def test_flight_without_samples_has_summary_with_same_keys(runs: list[Path]) -> None:

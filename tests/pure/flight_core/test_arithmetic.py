@@ -18,8 +18,9 @@ from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.arithmetic import MAX_ANGLE, PI_HIGH, PI_LOW, inverse, product, sine
+from flight_log.log_content import StoredFile
 from flight_log.provenance import provenance
-from flight_log.tape_reader import RecordedRun, StoredFile
+from flight_log.tape_reader import RecordedRun
 
 NUMBERS = st.floats(-1e3, 1e3)
 PI = Fraction("3.14159265358979323846264338327950288419716939937510582097494")

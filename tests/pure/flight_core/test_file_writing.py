@@ -17,7 +17,7 @@ import pytest
 from tests.conftest import refusing
 
 from flight_analysis.report.run_folder import REPORT, SUMMARY, write_report
-from flight_cli.report import report
+from flight_cli.report import Report
 from flight_core.files import replacing, write_file
 from flight_core.parameters import ParameterError
 
@@ -166,12 +166,12 @@ def test_report_of_read_only_archive_goes_to_output(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files_in(run)
-    report([run], output=tmp_path / "pages" / "today")
+    Report(runs=[run], output=tmp_path / "pages" / "today").execute()
     assert files_in(run) == before
     assert {SUMMARY, REPORT, "osprey_gust.yaml"} == set(files_in(tmp_path / "pages" / "today"))
     assert "pages/today/report.html" in capsys.readouterr().out
     with refusing("output: found a comparison, expected one run"):
-        report([run, run], output=tmp_path / "pages")
+        Report(runs=[run, run], output=tmp_path / "pages").execute()
 
 
 def test_scenario_parsed_before_any_file_written(

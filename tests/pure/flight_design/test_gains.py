@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 import yaml
 from numpy.testing import assert_allclose
 from pytest import approx
@@ -25,9 +24,7 @@ from typer.testing import CliRunner, Result
 from aircraft_sim.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_cli.airframes import airframes
-from flight_cli.gains import gains as gains_command
-from flight_cli.words import Command
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions, ideal_control
@@ -413,10 +410,7 @@ def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command("gains", cls=Command)(gains_command)
-    app.command()(airframes)
-    return CliRunner(env={"COLUMNS": "80"}).invoke(app, arguments)
+    return CliRunner(env={"COLUMNS": "80"}).invoke(application(arguments[:1]), arguments)
 
 
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:

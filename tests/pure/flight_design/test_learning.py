@@ -20,7 +20,8 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
-from flight_analysis.closed_loop.replay import replay, vary
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate

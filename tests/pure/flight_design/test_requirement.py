@@ -13,7 +13,6 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-import typer
 import yaml
 from pytest import approx
 from tests.conftest import refusing
@@ -24,8 +23,7 @@ from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, line
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
-from flight_cli.gains import gains as gains_command
-from flight_cli.words import Command
+from flight_cli.cli import application
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains import requirement as requirement_module
@@ -289,15 +287,14 @@ def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command("gains", cls=Command)(gains_command)
-    return CliRunner(env={"COLUMNS": "150"}).invoke(app, arguments)
+    return CliRunner(env={"COLUMNS": "150"}).invoke(application(arguments[:1]), arguments)
 
 
 def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
     page = tmp_path / "loop.html"
     result = rise_di(
+        "gains",
         "osprey",
         "--set",
         "samples=2",

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from c_export.constants import exportable, sizes
-from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters, vary
+from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode

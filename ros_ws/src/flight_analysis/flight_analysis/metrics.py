@@ -11,12 +11,11 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from flight_core.modes import Mode
 from flight_core.parameters import require
-from flight_core.rates import NANOSECONDS, seconds
+from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape, as_tape
 from flight_core.vectors import FloatArray, as_array
 from rise_di_controller.internals import Saturation
@@ -107,37 +106,6 @@ class InputMetrics(NamedTuple):
     rms: float
     max: float
     rate: float
-
-
-class TickMetrics(NamedTuple):
-    """Timing of the controller's ticks; times in s."""
-
-    ticks: int
-    without_new_y: (
-        int  # periods without a step of the controller: no new y arrived, or the tick was missed
-    )
-    period_mean: float
-    period_p99: float
-    period_max: float
-    jitter: float  # rms deviation of the time between two ticks from a whole number of periods
-    late_p99: float
-    late_max: float
-    age_p99: float
-
-
-class AgeMetrics(NamedTuple):
-    """Age of u at the aircraft, the delay of the whole loop from the instant of y to u, in s."""
-
-    mean: float
-    max: float
-
-
-class LatencyMetrics(NamedTuple):
-    """Time from sending y to sending the resulting u, in s."""
-
-    median: float
-    p99: float
-    max: float
 
 
 def tracking_error(tape: Tape) -> Signal:
@@ -604,90 +572,3 @@ def sign_switches(tape: Tape) -> dict[str, float]:
         for name, column in zip(signal.names, moves.T, strict=True)
     }
     return {name: float(np.count_nonzero(np.diff(sign))) / time for name, sign in signs.items()}
-
-
-def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values
-    in unit / sqrt(Hz).
-
-    The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample
-    repeats the last sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length.
-    The square of the density, integrated over the frequencies, is the variance. Source: Welch 1967.
-    """
-    places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
-    longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
-    places = np.cumsum(np.minimum(np.diff(places, prepend=0), longest))
-    grid = np.arange(places[-1] + 1)
-    held = signal.values[np.searchsorted(places, grid, side="right") - 1]
-    window = max(len(grid) // 10, min(len(grid), 256))
-    frequency, power = _welch(held, 1e9 / period_ns, window)
-    return frequency[1:], dict(zip(signal.names, np.sqrt(power[1:]).T, strict=True))
-
-
-def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
-    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m), as of
-    `scipy.signal.welch`.
-
-    scipy.signal takes half a second to load, a tenth of a whole flight in one process.
-    """
-    hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
-    parts = sliding_window_view(values, window, axis=0)[
-        :: window - window // 2
-    ]  # (parts, m, window)
-    spectra = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
-    power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T / (rate * np.sum(hann**2))
-    power[1 : (window + 1) // 2] *= (
-        2.0  # each frequency but 0 and the highest of an even window stands for two
-    )
-    return np.fft.rfftfreq(window, 1.0 / rate).astype(np.float64), power
-
-
-def tick_periods(tape: Tape) -> NDArray[np.int64]:
-    """Time between successive ticks of the controller, ns, shape (N - 1,).
-
-    The instant of a tick is stamp + "age", the deadline plus "late".
-    """
-    internals = tape["internals"]
-    return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
-
-
-def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
-    """Metrics of the controller's ticks from `internals`; None for fewer than two ticks.
-
-    `internals` holds only ticks with a new y. A period without a tick therefore counts for a
-    missing y and for a missing tick.
-    """
-    internals = tape["internals"]
-    if len(internals.stamp_ns) < 2:
-        return None
-    periods = tick_periods(tape)
-    elapsed = round(float(periods.sum()) / period_ns)
-    deviation = periods - period_ns * np.round(periods / period_ns)
-    return TickMetrics(
-        ticks=len(internals.stamp_ns),
-        without_new_y=max(elapsed - len(periods), 0),
-        period_mean=seconds(int(periods.mean())),
-        period_p99=seconds(int(np.percentile(periods, 99))),
-        period_max=seconds(int(periods.max())),
-        jitter=float(np.sqrt(np.mean(deviation**2))) / 1e9,
-        late_p99=float(np.percentile(internals["late"], 99)),
-        late_max=float(internals["late"].max()),
-        age_p99=float(np.percentile(internals["age"], 99)),
-    )
-
-
-def latency_metrics(tape: Tape) -> LatencyMetrics | None:
-    """Metrics of the signal `latency`; None where the tape has none."""
-    if "latency" not in tape or len(tape["latency"].stamp_ns) == 0:
-        return None
-    latency = tape["latency"].values[:, 0]
-    return LatencyMetrics(
-        float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max())
-    )
-
-
-def age_metrics(tape: Tape) -> AgeMetrics | None:
-    """Metrics of the signal `age_of_u`; None where the tape has none."""
-    if "age_of_u" not in tape or len(tape["age_of_u"].stamp_ns) == 0:
-        return None
-    return AgeMetrics(float(tape["age_of_u"]["mean"].mean()), float(tape["age_of_u"]["max"].max()))

@@ -18,8 +18,8 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import fly
+from flight_analysis.report.display_units import display_units
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
-from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
 from flight_bringup.processes import (
     FIRST_U,

@@ -18,19 +18,19 @@ from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report import plotting
 from flight_analysis.report.comparison import COLOURS
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    NO_VALUE,
+    QUANTITY_UNITS,
+    DisplayUnit,
+    display_units,
+)
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
 from flight_analysis.report.margin_figures import LEAST_MARGINS, least_margins, margins_as_json
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_analysis.report.summary import (
-    NO_UNIT,
-    NO_VALUE,
-    QUANTITY_UNITS,
-    Column,
-    DisplayUnit,
-    display_units,
-    finite_or_null,
-)
+from flight_analysis.report.summary import finite_or_null
+from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_campaign import equipment
 from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition

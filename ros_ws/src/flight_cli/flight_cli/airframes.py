@@ -4,14 +4,16 @@
 a new airframe.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
 
 from flight_cli.output import new_table, parse_numbers, print_json
-from flight_cli.words import AsJson, argument, option, setting, warn
+from flight_cli.words import argument, json_option, option, setting, values_of, warn
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains.airframe_properties import (
@@ -27,69 +29,8 @@ ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
 FALLS_SHORT = 3  # exit status: an input at its stop in the first flight, or no end as planned
 
 
-def airframes(
-    names: Annotated[
-        list[str] | None,
-        argument(
-            "Names, or airframe files (.yaml); by default the library. With --write one: "
-            "an airframe file, a MATLAB file"
-            " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
-            metavar="[AIRFRAME]...",
-        ),
-    ] = None,
-    write: Annotated[
-        Path | None,
-        option("Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"),
-    ] = None,
-    name: Annotated[
-        str, setting("name", "Name of the airframe; by default that of the file.")
-    ] = "",
-    speed: Annotated[
-        str | None, setting("speed", 'Trim speed, in m/s or with a unit: "176 ft/s".')
-    ] = None,
-    states: Annotated[
-        str,
-        option('States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".'),
-    ] = "",
-    inputs: Annotated[
-        str,
-        option(
-            'Inputs in the order of B, with units and effects: "elevator: rad nose down, '
-            'thrust: 1".'
-        ),
-    ] = "",
-    outputs: Annotated[
-        str,
-        option(
-            'As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
-            '0.987 u + 0.163 w".'
-        ),
-    ] = "",
-    thrust: Annotated[
-        bool, setting("thrust", "Add an input thrust in units of the weight along the flight path.")
-    ] = False,
-    lag: Annotated[
-        str | None, option("Lags of the actuators in s, in the order of the inputs: 0.05,0.3")
-    ] = None,
-    mass: Annotated[
-        str | None, setting("mass", 'Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
-    ] = None,
-    Ixx: Annotated[
-        str | None, setting("Ixx", 'Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
-    ] = None,
-    Iyy: Annotated[str | None, setting("Iyy", "As --Ixx.")] = None,
-    Izz: Annotated[str | None, setting("Izz", "As --Ixx.")] = None,
-    Ixz: Annotated[str | None, setting("Ixz", "As --Ixx; by default 0.")] = None,
-    density: Annotated[
-        str | None, setting("density", '"1.225 kg/m^3" or "0.002377 slug/ft^3".')
-    ] = None,
-    length: Annotated[
-        str | None, setting("length", "Unit of length of AVL's file, by default m.")
-    ] = None,
-    text: Annotated[str, setting("source", "Where the figures come from: a book and a page.")] = "",
-    replace: Annotated[bool, setting("replace", "Replace files of these names.")] = False,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Airframes:
     """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
 
     With --write FOLDER: make NAME.yaml, an airframe that is checked against physics, and
@@ -98,43 +39,80 @@ def airframes(
 
     Exit status: 0, 2 for a file with a mistake, or 3 for files whose first flight falls short.
     """
-    if write is not None:
-        require(
-            len(names or ()) == 1, "airframes", f"{len(names or ())} sources", "one beside --write"
-        )
-        body = {
-            "mass": mass,
-            "Ixx": Ixx,
-            "Iyy": Iyy,
-            "Izz": Izz,
-            "Ixz": Ixz,
-            "density": density,
-            "length": length,
-        }
-        lags = None if lag is None else parse_numbers(lag)
-        require(lags is None or bool(lags), "lag", repr(lag), "seconds separated by commas")
+
+    names: list[str] | None = argument(
+        "Names, or airframe files (.yaml); by default the library. With --write one: "
+        "an airframe file, a MATLAB file"
+        " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
+        metavar="[AIRFRAME]...",
+    )
+    write: Path | None = option(
+        "Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"
+    )
+    name: str = setting("Name of the airframe; by default that of the file.", default="")
+    speed: str | None = setting('Trim speed, in m/s or with a unit: "176 ft/s".')
+    states: str = option(
+        'States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".',
+        default="",
+    )
+    inputs: str = option(
+        'Inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1".',
+        default="",
+    )
+    outputs: str = option(
+        'As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
+        '0.987 u + 0.163 w".',
+        default="",
+    )
+    thrust: bool = setting(
+        "Add an input thrust in units of the weight along the flight path.", default=False
+    )
+    lag: str | None = option("Lags of the actuators in s, in the order of the inputs: 0.05,0.3")
+    mass: str | None = setting('Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
+    Ixx: str | None = setting('Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
+    Iyy: str | None = setting("As Ixx.")
+    Izz: str | None = setting("As Ixx.")
+    Ixz: str | None = setting("As Ixx; by default 0.")
+    density: str | None = setting('"1.225 kg/m^3" or "0.002377 slug/ft^3".')
+    length: str | None = setting("Unit of length of AVL's file, by default m.")
+    source: str = setting("Where the figures come from: a book and a page.", default="")
+    replace: bool = setting("Replace files of these names.", default=False)
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Make an airframe, or show airframes by name."""
+        if self.write is not None:
+            self._make(self.write)
+            return
+        facts = [airframe_facts(name) for name in self.names] if self.names else library()
+        if self.as_json:
+            print_json([_as_json(airframe) for airframe in facts])
+        else:
+            _show(Console(), facts)
+
+    def _make(self, folder: Path) -> None:
+        """Write airframe and scenario, and show the first flight."""
+        sources = self.names or []
+        found = f"{len(sources)} sources"
+        require(len(sources) == 1, "airframes", found, "one beside --write")
+        lags = None if self.lag is None else parse_numbers(self.lag)
+        require(lags is None or bool(lags), "lag", repr(self.lag), "seconds separated by commas")
+        body = values_of(self, "mass", "Ixx", "Iyy", "Izz", "Ixz", "density", "length")
         with Console().status("selecting gains and flying"):
             draft = new_airframe(
-                (names or [""])[0],
-                folder=write,
-                name=name,
-                speed=speed,
-                states=states,
-                inputs=inputs,
-                outputs=outputs,
-                thrust=thrust,
-                text=text,
-                lag=lags,
-                replace=replace,
+                sources[0],
+                **values_of(self, "name", "speed", "states", "inputs", "outputs", "thrust"),
                 **{key: value for key, value in body.items() if value is not None},
+                folder=folder,
+                text=self.source,
+                lag=lags,
+                replace=self.replace,
             )
         _show_draft(draft)
-        return
-    facts = [airframe_facts(name) for name in names] if names else library()
-    if as_json:
-        print_json([_as_json(airframe) for airframe in facts])
-        return
-    console = Console()
+
+
+def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
+    """Print the assumptions of the theorem, a table each."""
     for title, headings, cells in (
         ("Signs and pairing", ("D", "for D = I", "coupling"), _signs),
         ("Assumptions 1 and 3", ("n, m", "controllable", "zeros", "integrated"), _assumptions),

@@ -4,9 +4,10 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -14,10 +15,11 @@ from rich.console import Console
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.benchmark_entry import find_entry
-from flight_campaign.benchmark_scores import SCORES, Benchmark, Flights, define
+from flight_campaign.benchmark_scores import SCORES, Flights, define
+from flight_campaign.benchmark_scores import Benchmark as BenchmarkRun
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
-from flight_cli.words import AsJson, argument, option
+from flight_cli.words import REQUIRED, argument, json_option, option
 from flight_core.files import display_path
 from flight_core.parameters import require
 
@@ -29,58 +31,63 @@ LEGEND = (
 )
 
 
-def benchmark(
-    entry: Annotated[
-        list[str],
-        argument(
-            "Scenarios whose controllers fly, one for each airframe; or a law of compare, "
-            "as pi; or MODULE:FUNCTION."
-        ),
-    ],
-    aircraft: Annotated[
-        int, option("Uncertain aircraft of a set; fewer to try an entry.", min=1)
-    ] = 200,
-    name: Annotated[str | None, option("Name of the entry.")] = None,
-    sees: Annotated[str | None, option("What the law measures beside y_m, as in: y.")] = None,
-    knows: Annotated[
-        str | None, option("What the law knows of the aircraft beside D, as in: Omega_ii.")
-    ] = None,
-    release: Annotated[
-        str, option("Hash of the commit of a release: fresh seeds; by default the fixed seeds.")
-    ] = "",
-    output: Annotated[
-        Path | None,
-        option("Folder of the run, which an interrupted run continues; by default in runs."),
-    ] = None,
-    workers: Annotated[int | None, option("Threads; by default one a core.", min=1)] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
     """Fly the public benchmark with a law, and write a file of scores. The same command continues
     an interrupted run.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted.
     """
-    engines.require_jax()
-    fits = not release or re.fullmatch(rf"[0-9a-f]{{{RELEASE_LENGTH}}}", release) is not None
-    require(fits, "--release", release, f"the hash of a commit, {RELEASE_LENGTH} hex digits")
-    with Console(stderr=True, quiet=as_json).status("preparing"):
-        sets = Sets({word: find_scenario(word) for word in SCENARIOS}, release)
-        entered = find_entry(entry, sets, find_scenario, name, sees, knows)
-        flights = Flights(entered, sets)
-        definition = define(flights, aircraft, version("rise-di"))
-    run = Benchmark(
-        output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)), definition
+
+    entry: list[str] = argument(
+        "Scenarios whose controllers fly, one for each airframe; or a law of compare, "
+        "as pi; or MODULE:FUNCTION.",
+        default=REQUIRED,
     )
-    _fly(run, flights, engines.threads(workers), quiet=as_json)
-    scores = run.scores()
-    if as_json:
-        print_json(scores)
-        return
-    _show(Console(), scores)
-    print(f"scores: {display_path(run.folder / SCORES)}")
+    aircraft: int = option(
+        "Uncertain aircraft of a set; fewer to try an entry.", default=200, min=1
+    )
+    name: str | None = option("Name of the entry.")
+    sees: str | None = option("What the law measures beside y_m, as in: y.")
+    knows: str | None = option("What the law knows of the aircraft beside D, as in: Omega_ii.")
+    release: str = option(
+        "Hash of the commit of a release: fresh seeds; by default the fixed seeds.", default=""
+    )
+    output: Path | None = option(
+        "Folder of the run, which an interrupted run continues; by default in runs."
+    )
+    workers: int | None = option("Threads; by default one a core.", min=1)
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Fly what is missing, and show the scores."""
+        engines.require_jax()
+        fits = (
+            not self.release
+            or re.fullmatch(rf"[0-9a-f]{{{RELEASE_LENGTH}}}", self.release) is not None
+        )
+        require(
+            fits, "--release", self.release, f"the hash of a commit, {RELEASE_LENGTH} hex digits"
+        )
+        with Console(stderr=True, quiet=self.as_json).status("preparing"):
+            sets = Sets({word: find_scenario(word) for word in SCENARIOS}, self.release)
+            entered = find_entry(self.entry, sets, find_scenario, self.name, self.sees, self.knows)
+            flights = Flights(entered, sets)
+            definition = define(flights, self.aircraft, version("rise-di"))
+        run = BenchmarkRun(
+            self.output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)),
+            definition,
+        )
+        _fly(run, flights, engines.threads(self.workers), quiet=self.as_json)
+        scores = run.scores()
+        if self.as_json:
+            print_json(scores)
+            return
+        _show(Console(), scores)
+        print(f"scores: {display_path(run.folder / SCORES)}")
 
 
-def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: bool) -> None:
+def _fly(run: BenchmarkRun, flights: Flights, engine: engines.Engine, *, quiet: bool) -> None:
     total = run.definition.flights
     missing = run.missing()
     completed = total - sum(map(run.definition.size, missing))

@@ -6,6 +6,7 @@ scenario that flies it.
 
 import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -61,83 +62,112 @@ from flight_log.tape_reader import read_run
 GUIDED = 600.0  # s, of a flight under guidance
 
 
-def identify_behind_bridge(
-    map_name: str,
-    speed: float | None,
-    folder: Path,
-    amplitude: float,
-    log: Path | None,
-    as_json: bool,
-    needed: Requirement,
-    accept: bool,
-    link_delay: float | None,
-) -> None:
-    """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it
-    into `folder`.
+@dataclass(frozen=True, kw_only=True)
+class BridgeExperiment:
+    """An experiment behind a channel map, or a recorded one, and the folder for what flies the
+    aircraft.
 
     Gains from an imported log are for `link_delay`, s, beyond the delay in the log; None for that
     of the map.
     """
-    channel_map = load_map(map_name)
-    require(
-        0.0 < amplitude <= 1.0,
-        "amplitude",
-        amplitude,
-        "above 0 and at most 1, a part of the limits of the map",
-    )
-    known = speed is not None or not has_airspeed(channel_map)
-    require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
-    require(
-        folder.is_dir() or not folder.exists(),
-        "--write",
-        folder,
-        "a folder, or the name of a new one",
-    )
-    console = Console(quiet=as_json)
-    if log is None:
-        require_envelope(channel_map)
-    run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
-    tape, spans, ended = _engaged(run, channel_map)
-    try:
-        trims, response, channels = _identified(console, channel_map, tape, spans, speed)
-    except ParameterError as error:
-        raise ParameterError(sentences(str(error), ended)) from None
-    if COMMANDS in tape:
-        later = channel_map.link_delay if link_delay is None else link_delay
-        channels = over_link(channels, later or 0.0)
+
+    map_name: str
+    speed: float | None  # m/s in trim; None for the map's own airspeed, or in hover
+    folder: Path
+    amplitude: float  # a part of each input's limit
+    log: Path | None  # None to fly the experiment
+    needed: Requirement
+    accept: bool  # gains whose margins fall short
+    link_delay: float | None
+
+    def identify(self, *, as_json: bool) -> None:
+        """Excite the aircraft, or read the log, and write what flies it."""
+        channel_map = load_map(self.map_name)
+        self._require_fit(channel_map)
+        console = Console(quiet=as_json)
+        run = self._excite(console, channel_map) if self.log is None else self.log
+        tape, spans, ended = _engaged(run, channel_map)
+        try:
+            trims, response, channels = _identified(console, channel_map, tape, spans, self.speed)
+        except ParameterError as error:
+            raise ParameterError(sentences(str(error), ended)) from None
+        channels = self._with_link(console, channel_map, channels, imported=COMMANDS in tape)
+        channel_map, narrower = within_range(channel_map, trims)
+        for sentence in narrower:
+            say(console, sentence)
+        flyable = self._flyable(channel_map, channels)
+        written_map = map_text(channel_map, trims, run.resolve().name)  # the run, not `latest`
+        files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
+        guided = guided_scenario(flyable.scenario, channel_map, self.speed)
+        if guided:
+            files["guided"] = guided
+        _write(self.folder, files)
+        load_scenario(self.folder / "scenario.yaml")
+        if guided:
+            load_scenario(self.folder / "guided.yaml")
+        if as_json:
+            print_json(_as_json(response, channels, flyable, trims, self.folder))
+            return
+        _show_gains(console, channels, response, flyable)
+        scenario = shlex.quote(str(self.folder / "scenario.yaml"))
+        copied = shlex.quote(str(self.folder / "map.yaml"))
+        say(console, f"to fly it: rise-di fly {scenario} --bridge {copied} --send")
+        if guided:
+            path = shlex.quote(str(self.folder / "guided.yaml"))
+            say(console, f"under guidance: {path} in its place")
+
+    def _require_fit(self, channel_map: ChannelMap) -> None:
+        """Raise ParameterError for a mistake about the map, before anything flies."""
+        expected = "above 0 and at most 1, a part of the limits of the map"
+        require(0.0 < self.amplitude <= 1.0, "amplitude", self.amplitude, expected)
+        known = self.speed is not None or not has_airspeed(channel_map)
+        require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
+        fits = self.folder.is_dir() or not self.folder.exists()
+        require(fits, "--write", self.folder, "a folder, or the name of a new one")
+        if self.log is None:
+            require_envelope(channel_map)
+
+    def _excite(self, console: Console, channel_map: ChannelMap) -> Path:
+        """Fly the experiment; the folder of its run."""
+        airframe = self.folder / "experiment_airframe.yaml"
+        scenario = self.folder / "experiment.yaml"
+        planned = experiment(channel_map, self.speed, self.amplitude, str(airframe.resolve()))
+        _write(self.folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
+        chosen = load_scenario(scenario)
+        _announce(console, planned, chosen.flight.duration, hovers=self.speed is None)
+        run = new_run(chosen, Path("runs"))
+        with flight_progress(chosen.flight.duration, quiet=console.quiet) as (progress, announce):
+            outcome = fly_over_topics(
+                chosen,
+                run,
+                progress,
+                autopilot=find_autopilot(self.map_name, dry_run=False),
+                announce=announce,
+                engaged_for=planned.controller.duration,
+            )
+        link_latest(run)
+        console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
+        return run
+
+    def _with_link(
+        self, console: Console, channel_map: ChannelMap, channels: Channels, *, imported: bool
+    ) -> Channels:
+        """The channels of an imported log with the delay of the link."""
+        expected = "a log of rise-di import: an experiment over the link contains its delay"
+        require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
+        if not imported:
+            return channels
+        later = channel_map.link_delay if self.link_delay is None else self.link_delay
         _show_link(console, channel_map, later)
-    else:
-        require(
-            link_delay is None,
-            "link_delay",
-            link_delay,
-            "a log of rise-di import: an experiment over the link contains its delay",
-        )
-    channel_map, narrower = within_range(channel_map, trims)
-    for sentence in narrower:
-        say(console, sentence)
-    airframe = folder / "airframe.yaml"
-    flyable = flying_scenario(channel_map, channels, speed, str(airframe.resolve()), needed)
-    require(
-        accept or not flyable.lacking,
-        "identify",
-        flyable.lacking,
-        "the margins, or --set accept beside --bridge",
-    )
-    written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
-    files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
-    guided = guided_scenario(flyable.scenario, channel_map, speed)
-    _write(folder, files | ({"guided": guided} if guided else {}))
-    for name in ("scenario", *(["guided"] if guided else [])):
-        load_scenario(folder / f"{name}.yaml")
-    if as_json:
-        print_json(_as_json(response, channels, flyable, trims, folder))
-        return
-    _show_gains(console, channels, response, flyable)
-    scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
-    say(console, f"to fly it: rise-di fly {scenario} --bridge {copied} --send")
-    if guided:
-        say(console, f"under guidance: {shlex.quote(str(folder / 'guided.yaml'))} in its place")
+        return over_link(channels, later or 0.0)
+
+    def _flyable(self, channel_map: ChannelMap, channels: Channels) -> Flyable:
+        """Airframe and scenario with gains. Raises ParameterError for short margins."""
+        airframe = str((self.folder / "airframe.yaml").resolve())
+        flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
+        expected = "the margins, or --set accept beside --bridge"
+        require(self.accept or not flyable.lacking, "identify", flyable.lacking, expected)
+        return flyable
 
 
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str:
@@ -170,55 +200,19 @@ def _identified(
     channel that is not certain.
     """
     pairing, _ = channel_pairs(channel_map)
-    is_imported = COMMANDS in tape
     trims = (
         median_trims(tape[COMMANDS])
-        if is_imported
+        if COMMANDS in tape
         else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
     )
     response = identify_response(
         tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans
     )
-    _show_response(
-        console,
-        channel_map.name,
-        response,
-        trims,
-        sum(stop - start for start, stop in spans) / NANOSECONDS,
-    )
+    engaged = sum(stop - start for start, stop in spans) / NANOSECONDS
+    _show_response(console, channel_map.name, response, trims, engaged)
     models = channel_models(channel_map, tape, spans, speed)
     _show_models(console, response, models)
     return trims, response, join(channel_map, response, models)
-
-
-def _excite(
-    console: Console,
-    channel_map: ChannelMap,
-    map_name: str,
-    speed: float | None,
-    folder: Path,
-    amplitude: float,
-) -> Path:
-    """Fly the experiment; the folder of its run."""
-    airframe = folder / "experiment_airframe.yaml"
-    scenario = folder / "experiment.yaml"
-    planned = experiment(channel_map, speed, amplitude, str(airframe.resolve()))
-    _write(folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
-    chosen = load_scenario(scenario)
-    _announce(console, planned, chosen.flight.duration, hovers=speed is None)
-    run = new_run(chosen, Path("runs"))
-    with flight_progress(chosen.flight.duration, quiet=console.quiet) as (progress, announce):
-        outcome = fly_over_topics(
-            chosen,
-            run,
-            progress,
-            autopilot=find_autopilot(map_name, dry_run=False),
-            announce=announce,
-            engaged_for=planned.controller.duration,
-        )
-    link_latest(run)
-    console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
-    return run
 
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:

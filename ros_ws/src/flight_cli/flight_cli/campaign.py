@@ -8,9 +8,10 @@ import math
 import shlex
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -18,11 +19,12 @@ from rich.markup import escape
 
 from aircraft_sim.uncertainty import Distribution, WindEffect
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.display_units import QUANTITY_UNITS, display_units
 from flight_analysis.report.run_folder import REPORT, new_run
-from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_analysis.report.tables import Table
 from flight_campaign import engines
-from flight_campaign.campaign import Campaign, Definition, Sweep, define
+from flight_campaign.campaign import Campaign as MonteCarlo
+from flight_campaign.campaign import Definition, Sweep, define
 from flight_campaign.campaign_report import (
     FIGURE_HEADINGS,
     WIND_EFFECTS,
@@ -41,25 +43,14 @@ from flight_cli.output import (
     progress_bar,
     say,
 )
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import argument, json_option, option, require_unused, setting
 from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import learner
 
 OF_DEFINITION = (
-    *(
-        "aircraft",
-        "uncertainty",
-        "entry",
-        "distribution",
-        "score",
-        "wind",
-        "seed",
-        "sweep",
-        "duration",
-        "chunk",
-        "runs",
-    ),
+    *("aircraft", "uncertainty", "entry", "distribution", "score", "wind"),
+    *("seed", "sweep", "duration", "chunk", "runs"),
 )  # options of a new campaign
 
 
@@ -70,89 +61,8 @@ class EngineName(StrEnum):
     DASK = "dask"
 
 
-def campaign(
-    context: typer.Context,
-    scenario: Annotated[
-        str,
-        argument(
-            "Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
-            "interrupted campaign to continue."
-        ),
-    ] = "osprey_servo",
-    aircraft: Annotated[int, option("How many uncertain aircraft.", min=1)] = 1000,
-    uncertainty: Annotated[
-        float, option("Largest relative deviation of each entry of A and B, 0 to 1.")
-    ] = 0.3,
-    wind: Annotated[
-        WindEffect | None,
-        setting(
-            "wind",
-            "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
-            "the scenario's.",
-        ),
-    ] = None,
-    entry: Annotated[
-        list[str] | None,
-        setting(
-            "entry",
-            "An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
-            "lag=0.5, noise=0.5, delay=0.02 (s).",
-        ),
-    ] = None,
-    distribution: Annotated[
-        Distribution | None,
-        setting(
-            "distribution",
-            "Of the deviations: uniform, normal with three standard deviations at the "
-            "limit, or its two limits.",
-        ),
-    ] = None,
-    score: Annotated[
-        list[str] | None,
-        setting(
-            "score",
-            "Unit of the rms error of an output in the score, SI, as q=0.02; once for each output.",
-        ),
-    ] = None,
-    seed: Annotated[int, option("Seed of the aircraft.", min=0)] = 1,
-    sweep: Annotated[
-        str | None,
-        option(
-            "A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
-            "or 'beta[V]=0.5,1,2'."
-        ),
-    ] = None,
-    duration: Annotated[float | None, option("Seconds to fly, in place of the scenario's.")] = None,
-    chunk: Annotated[
-        int | None,
-        setting(
-            "chunk",
-            "Aircraft computed at once, by default 1000, on a GPU what its memory holds, with a "
-            "learner 1.",
-            min=1,
-        ),
-    ] = None,
-    engine: Annotated[
-        EngineName | None,
-        option(
-            "Threads of this process, or processes and hosts of dask; by default dask with "
-            "a learner."
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None, setting("workers", "Threads or processes; by default one a core.", min=1)
-    ] = None,
-    scheduler: Annotated[
-        str | None, setting("scheduler", "Address of a dask scheduler, as in tcp://host:8786.")
-    ] = None,
-    runs: Annotated[Path, setting("runs", "Folder that the campaign's folder is made in.")] = Path(
-        "runs"
-    ),
-    rows: Annotated[
-        Path | None, option("Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a
     scenario, many at once.
 
@@ -161,75 +71,133 @@ def campaign(
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
-    engines.require_jax(shared=engine is EngineName.DASK)
-    require(
-        scheduler is None or engine is EngineName.DASK,
-        "scheduler",
-        scheduler,
-        "--engine dask with it",
-    )
-    if rows is not None:
-        require(rows.parent.is_dir(), "rows", rows, "a file in a folder that exists")
-    if Path(scenario).is_dir():
-        for name in OF_DEFINITION:
-            source = context.get_parameter_source(name)
-            is_default = source is None or source.name != "COMMANDLINE"
-            require(
-                is_default,
-                name,
-                "it beside a folder",
-                "none: the folder of a campaign holds its definition",
-            )
-        monte_carlo = Campaign.resume(Path(scenario))
-    else:
-        chosen = find_scenario(scenario, duration)
-        learner(chosen)  # refuses what the aircraft could not learn with
-        swept = None if sweep is None else _parse_sweep(sweep)
-        spread = chosen.aircraft.uncertainty.spread()
-        if entry is not None:
-            spread = spread._replace(entries=_named_numbers("entry", entry, "A[q,alpha]=0.6"))
-        if distribution is not None:
-            spread = spread._replace(distribution=distribution)
-        units = None if score is None else _named_numbers("score", score, "q=0.02")
-        definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
-        monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
-    learns = monte_carlo.definition.scenario().learns()
-    if engine is None:
-        engine = EngineName.DASK if learns else EngineName.THREADS
-    flies = (
-        engines.threads(workers)
-        if engine is EngineName.THREADS
-        else engines.dask(workers, scheduler, on_devices=not learns)
-    )
-    from flight_campaign.device import device_name  # noqa: PLC0415 - JAX takes a second
 
-    place = "" if learns or scheduler is not None else f" on {device_name()}"
-    speed = _fly_missing(monte_carlo, flies, place, quiet=as_json)
-    figures, results = write_results(monte_carlo)
-    if rows is not None:
-        with writing("rows", rows, "the path of a file"):
-            monte_carlo.write_rows(rows)
-    if as_json:
-        print_json(figures)
-        return
-    console = Console()
-    for case in range(monte_carlo.definition.cases):
-        _show(
-            console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case]
-        )
-        if figures["cases"][case]["influence"]["entries"]:
-            _print(
-                console,
-                influence_table(monte_carlo.definition.label(case), figures["cases"][case]),
-                "entry",
-            )
-    _print(console, results, "figure")
-    if speed is not None:
-        print(f"flown:   {speed:,.0f} aircraft-seconds per second{place}")
-    print(
-        f"folder:  {display_path(monte_carlo.folder)}\nreport:  "
-        f"{display_path(monte_carlo.folder / REPORT)}"
+    context: typer.Context
+    scenario: str = argument(
+        "Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
+        "interrupted campaign to continue.",
+        default="osprey_servo",
     )
+    aircraft: int = option("How many uncertain aircraft.", default=1000, min=1)
+    uncertainty: float = option(
+        "Largest relative deviation of each entry of A and B, 0 to 1.", default=0.3
+    )
+    wind: WindEffect | None = setting(
+        "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+        "the scenario's."
+    )
+    entry: list[str] | None = setting(
+        "An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
+        "lag=0.5, noise=0.5, delay=0.02 (s)."
+    )
+    distribution: Distribution | None = setting(
+        "Of the deviations: uniform, normal with three standard deviations at the "
+        "limit, or its two limits."
+    )
+    score: list[str] | None = setting(
+        "Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."
+    )
+    seed: int = option("Seed of the aircraft.", default=1, min=0)
+    sweep: str | None = option(
+        "A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
+        "or 'beta[V]=0.5,1,2'."
+    )
+    duration: float | None = option("Seconds to fly, in place of the scenario's.")
+    chunk: int | None = setting(
+        "Aircraft computed at once, by default 1000, on a GPU what its memory holds, with a "
+        "learner 1.",
+        min=1,
+    )
+    engine: EngineName | None = option(
+        "Threads of this process, or processes and hosts of dask; by default dask with a learner."
+    )
+    workers: int | None = setting("Threads or processes; by default one a core.", min=1)
+    scheduler: str | None = setting("Address of a dask scheduler, as in tcp://host:8786.")
+    runs: Path = setting("Folder that the campaign's folder is made in.", default=Path("runs"))
+    rows: Path | None = option(
+        "Write a row an aircraft as Parquet: figures, outcome, drawn entries."
+    )
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Begin or continue the campaign, fly what is missing, show the figures."""
+        engines.require_jax(shared=self.engine is EngineName.DASK)
+        if self.engine is not EngineName.DASK:
+            require_unused(self, ["scheduler"], "--engine dask with it")
+        if self.rows is not None:
+            expected = "a file in a folder that exists"
+            require(self.rows.parent.is_dir(), "rows", self.rows, expected)
+        monte_carlo = self._continued() if Path(self.scenario).is_dir() else self._begun()
+        learns = monte_carlo.definition.scenario().learns()
+        from flight_campaign.device import device_name  # noqa: PLC0415 - JAX takes a second
+
+        place = "" if learns or self.scheduler is not None else f" on {device_name()}"
+        speed = _fly_missing(monte_carlo, self._engine(learns=learns), place, quiet=self.as_json)
+        figures, results = write_results(monte_carlo)
+        if self.rows is not None:
+            with writing("rows", self.rows, "the path of a file"):
+                monte_carlo.write_rows(self.rows)
+        if self.as_json:
+            print_json(figures)
+            return
+        _show_cases(Console(), monte_carlo, figures["cases"], results)
+        if speed is not None:
+            print(f"flown:   {speed:,.0f} aircraft-seconds per second{place}")
+        print(
+            f"folder:  {display_path(monte_carlo.folder)}\nreport:  "
+            f"{display_path(monte_carlo.folder / REPORT)}"
+        )
+
+    def _continued(self) -> MonteCarlo:
+        """The campaign of a folder. Raises ParameterError beside an option of a new campaign."""
+        for name in OF_DEFINITION:
+            source = self.context.get_parameter_source(name)
+            is_default = source is None or source.name != "COMMANDLINE"
+            expected = "none: the folder of a campaign holds its definition"
+            require(is_default, name, "it beside a folder", expected)
+        return MonteCarlo.resume(Path(self.scenario))
+
+    def _begun(self) -> MonteCarlo:
+        """A new campaign of the scenario."""
+        chosen = find_scenario(self.scenario, self.duration)
+        learner(chosen)  # refuses what the aircraft could not learn with
+        spread = chosen.aircraft.uncertainty.spread()
+        if self.entry is not None:
+            entries = _named_numbers("entry", self.entry, "A[q,alpha]=0.6")
+            spread = spread._replace(entries=entries)
+        if self.distribution is not None:
+            spread = spread._replace(distribution=self.distribution)
+        definition = define(
+            chosen,
+            self.aircraft,
+            self.uncertainty,
+            self.seed,
+            self.chunk,
+            None if self.sweep is None else _parse_sweep(self.sweep),
+            self.wind,
+            spread,
+            None if self.score is None else _named_numbers("score", self.score, "q=0.02"),
+        )
+        return MonteCarlo.begin(new_run(chosen, self.runs, "campaign-"), definition)
+
+    def _engine(self, *, learns: bool) -> engines.Engine:
+        """The named engine, else dask for aircraft with a learner."""
+        named = self.engine or (EngineName.DASK if learns else EngineName.THREADS)
+        if named is EngineName.THREADS:
+            return engines.threads(self.workers)
+        return engines.dask(self.workers, self.scheduler, on_devices=not learns)
+
+
+def _show_cases(
+    console: Console, monte_carlo: MonteCarlo, cases: Sequence[dict[str, Any]], results: Table
+) -> None:
+    """Print the figures and the influences of every case, and the table of all."""
+    definition = monte_carlo.definition
+    for case, figures in enumerate(cases):
+        _show(console, definition, case, monte_carlo.tally(case), figures)
+        if figures["influence"]["entries"]:
+            _print(console, influence_table(definition.label(case), figures), "entry")
+    _print(console, results, "figure")
 
 
 def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
@@ -264,7 +232,7 @@ def _parse_sweep(text: str) -> Sweep:
 
 
 def _fly_missing(
-    monte_carlo: Campaign, engine: engines.Engine, place: str, *, quiet: bool
+    monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
     """Fly the chunks that are missing; aircraft-seconds per second, None if none is. `place` says
     where, as " on NVIDIA H200".

@@ -5,8 +5,8 @@ an autopilot.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -23,9 +23,9 @@ from autopilot_bridge.map_check import (
 from autopilot_bridge.map_rows import MAVLINK, InputRow, OutputRow
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_cli.log_options import LogNamespace, warn_of_lacks_in
+from flight_cli.log_options import log_namespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
-from flight_cli.words import AsJson, argument, option, warn
+from flight_cli.words import REQUIRED, argument, json_option, option, warn
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
     SignCheck,
@@ -37,28 +37,8 @@ CONTRADICTS = 1
 INSTALLED = "installed"  # in place of a folder: the message packages of this host
 
 
-def check(
-    map_name: Annotated[
-        str, argument("Name of a channel map, or path of one (.yaml).", metavar="MAP")
-    ],
-    airframe: Annotated[str | None, option("Airframe; by default that of the scenario.")] = None,
-    scenario: Annotated[str, option("Scenario with the controller.")] = "osprey_servo",
-    run: Annotated[
-        Path | None,
-        option(
-            "A recorded flight with y and u, each input excited; with a bridge, its engaged time."
-        ),
-    ] = None,
-    namespace: LogNamespace = None,
-    definitions: Annotated[
-        list[Path] | None,
-        option(
-            "Check the rows instead: the sources of a message package, of one release; "
-            f"several, each a column; or {INSTALLED}."
-        ),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Check:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
     With --definitions, tell for which releases of an autopilot the rows of the map hold: topic,
@@ -68,37 +48,53 @@ def check(
     the necessary excitation. Exit status: 0 agreement, 1 a contradiction or a row that does not
     hold, 2 bad input.
     """
-    channel_map = load_map(map_name)
-    if definitions:
-        _check_rows(channel_map, definitions, as_json)
-        return
-    for fault in version_faults(
-        (topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")
-    ):
-        warn(f"warning: {fault}")
-    chosen = find_scenario(scenario)
-    frame = load_airframe(airframe or chosen.aircraft.airframe)
-    if run is not None:
-        warn_of_lacks_in(run, namespace)
-    checked = check_scenario(channel_map, chosen, frame, run, namespace)
-    if as_json:
-        channels = [channel._asdict() for channel in checked.channels]
-        sentences = list(checked.contradictions)
-        result = {
-            "map": channel_map.name,
-            "channels": channels,
-            "seconds": checked.seconds,
-            "contradictions": sentences,
-        }
-        print_json(result)
-    else:
-        _show(Console(), channel_map, checked, frame.name)
-    for sentence in checked.uncertain:
-        warn(f"not certain: {sentence}")
-    for sentence in checked.contradictions:
-        warn(f"error: {sentence}")
-    if checked.contradictions:
-        raise typer.Exit(CONTRADICTS)
+
+    map_name: str = argument(
+        "Name of a channel map, or path of one (.yaml).", default=REQUIRED, metavar="MAP"
+    )
+    airframe: str | None = option("Airframe; by default that of the scenario.")
+    scenario: str = option("Scenario with the controller.", default="osprey_servo")
+    run: Path | None = option(
+        "A recorded flight with y and u, each input excited; with a bridge, its engaged time."
+    )
+    namespace: str | None = log_namespace()
+    definitions: list[Path] | None = option(
+        "Check the rows instead: the sources of a message package, of one release; "
+        f"several, each a column; or {INSTALLED}."
+    )
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Compare signs, or rows with releases, and show what contradicts."""
+        channel_map = load_map(self.map_name)
+        if self.definitions:
+            _check_rows(channel_map, self.definitions, self.as_json)
+            return
+        topics = [(topic, kind) for _, topic, kind in channel_map.used_topics()]
+        for fault in version_faults(row for row in topics if row[0].startswith("/fmu/")):
+            warn(f"warning: {fault}")
+        chosen = find_scenario(self.scenario)
+        frame = load_airframe(self.airframe or chosen.aircraft.airframe)
+        if self.run is not None:
+            warn_of_lacks_in(self.run, self.namespace)
+        checked = check_scenario(channel_map, chosen, frame, self.run, self.namespace)
+        if self.as_json:
+            print_json(
+                {
+                    "map": channel_map.name,
+                    "channels": [channel._asdict() for channel in checked.channels],
+                    "seconds": checked.seconds,
+                    "contradictions": list(checked.contradictions),
+                }
+            )
+        else:
+            _show(Console(), channel_map, checked, frame.name)
+        for sentence in checked.uncertain:
+            warn(f"not certain: {sentence}")
+        for sentence in checked.contradictions:
+            warn(f"error: {sentence}")
+        if checked.contradictions:
+            raise typer.Exit(CONTRADICTS)
 
 
 def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airframe: str) -> None:

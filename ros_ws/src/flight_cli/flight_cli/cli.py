@@ -14,7 +14,7 @@ import gc
 import os
 import sys
 from collections import ChainMap
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from keyword import iskeyword
 from pkgutil import resolve_name
@@ -23,7 +23,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.words import Command
+from flight_cli.words import Command, as_function
 
 FAILED = 1
 BAD_INPUT = 2
@@ -81,8 +81,8 @@ GROUPS = MappingProxyType(
         },
     }
 )
-"""What each command does, by group. The function `NAME` of the module `flight_cli.NAME` is the
-command, with _ after a keyword."""
+"""What each command does, by group. The class `Name` of the module `flight_cli.name` is the
+command; the module has _ after a keyword."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
@@ -113,8 +113,10 @@ def application(words: Collection[str]) -> typer.Typer:
     app.callback()(_options)
     for group, commands in GROUPS.items():
         for name, sentence in commands.items():
-            place = f"{name}_" if iskeyword(name) else name
-            command = resolve_name(f"flight_cli.{place}:{place}") if name in words else lambda: None
+            module = f"{name}_" if iskeyword(name) else name
+            command: Callable[..., None] = lambda: None  # noqa: E731 - of a command that does not run
+            if name in words:
+                command = as_function(resolve_name(f"flight_cli.{module}:{name.capitalize()}"))
             help_text = None if name in words else sentence
             app.command(name, help=help_text, rich_help_panel=group, cls=Command)(command)
     return app

@@ -6,9 +6,10 @@ procedure.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -20,7 +21,8 @@ from control_laws.catalogue import LAWS, Law
 from flight_analysis.closed_loop.loop_margins import loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.summary import display_units, finite_or_null
+from flight_analysis.report.display_units import display_units
+from flight_analysis.report.summary import finite_or_null
 from flight_campaign import engines, law_comparison, registered_laws, tuned_controller
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
@@ -35,7 +37,7 @@ from flight_cli.output import (
     progress_bar,
     write_text,
 )
-from flight_cli.words import WRITE, argument, option, setting
+from flight_cli.words import argument, option, setting, values_of, write_option
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -64,129 +66,203 @@ cost: the least of {seeds} seeds of the tuning, and the difference to the larges
 WIDTH = 200  # characters, the least width of the table
 
 
-def compare(
-    scenario: Annotated[
-        str, argument("Name of a scenario, or path of a scenario file (.yaml).")
-    ] = "osprey_servo",
-    aircraft: Annotated[int, option("Uncertain aircraft at each level.", min=1)] = 200,
-    uncertainty: Annotated[
-        str, option("Largest relative deviations of A and B, as in 0.3,0.5")
-    ] = "0.3,0.5",
-    seed: Annotated[int, option("Seed of the uncertain aircraft.", min=0)] = 1,
-    wind: Annotated[
-        WindEffect | None,
-        setting(
-            "wind",
-            "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
-            "the scenario's.",
-        ),
-    ] = None,
-    laws: Annotated[
-        str | None,
-        option(
-            "Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
-            "place of a name: its controller."
-        ),
-    ] = None,
-    tuning: Annotated[
-        str, option(f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}.")
-    ] = "gust_turbulence",
-    tune: Annotated[
-        bool,
-        option(
-            "First tune the laws that have no gains for this scenario: minutes a law.", "--tune"
-        ),
-    ] = False,
-    turbulence_seed: Annotated[
-        int, setting("turbulence_seed", "Seed of the turbulence, unlike that of the tuning.", min=0)
-    ] = law_comparison.TURBULENCE_SEED,
-    gains: Annotated[
-        Path | None, setting("gains", "File of tuned gains; by default the one of the stack.")
-    ] = None,
-    write: Annotated[
-        Path | None,
-        option(
-            "File for the gains of one law as a section of a scenario, which flies with "
-            "the score shown.",
-            *WRITE,
-        ),
-    ] = None,
-    to_json: Annotated[Path | None, option("File to write the figures to, SI.", "--json")] = None,
-) -> None:
+Gains = dict[str, dict[str, TuningResult]]
+
+
+class Contest(NamedTuple):
+    """The laws of a comparison, and the file of their tuned gains."""
+
+    scenario: Scenario
+    names: Sequence[str]
+    aims: Sequence[str]  # objectives of the tuning
+    controllers: Mapping[str, ControllerConfig | None]  # None for a law that is tuned
+    entries: Mapping[str, Law]
+    path: Path
+
+    def untuned(self) -> list[tuple[str, str]]:
+        """Laws and objectives for which the file has no gains."""
+        stored = tuned_gains.load(self.path)
+        pairs = product(self.names, self.aims)
+        return [(name, aim) for name, aim in pairs if aim not in stored.get(name, {})]
+
+    def tune(self, command: str, bar: Progress) -> None:
+        """Tune laws for an objective per law. The file is written after every law."""
+        benchmark = self.benchmark()
+        for name, aim in self.untuned():
+            law = self.entries[name]
+            task = bar.add_task("", total=gain_tuning.generation_count(law, benchmark))
+
+            def show_cost(
+                generation: int,
+                least: float,
+                task: Any = task,
+                shown: str = f"tuning {name}, {aim}",
+            ) -> None:
+                bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
+
+            objective = gain_tuning.OBJECTIVES[aim]
+            result = gain_tuning.tune(law, objective, benchmark, SEEDS, progress=show_cost)
+            known = tuned_gains.load(self.path)
+            known.setdefault(name, {})[aim] = result
+            tuned_gains.save(self.path, known, list(gain_tuning.OBJECTIVES), command)
+
+    def benchmark(self, *seed: int) -> Benchmark:
+        """The winds and aircraft, with turbulence of a seed in place of the tuning's."""
+        build = gain_tuning.build_benchmark(self.scenario, *seed)
+        return registered_laws.with_courses(build, self.controllers)
+
+    def tuned(self) -> Gains:
+        """The gains by law and objective: those of a search, else those of a controller. Raises
+        ParameterError without any.
+        """
+        stored = tuned_gains.load(self.path)
+        gains: Gains = {}
+        for name in self.names:
+            known = stored.get(name, {})
+            gains[name] = {aim: known[aim] for aim in self.aims if aim in known}
+            if (controller := self.controllers[name]) is not None:
+                row = dict.fromkeys(self.aims, registered_laws.as_tuned(controller))
+                gains[name] = row | gains[name]
+        expected = f"gains in {self.path}, or --tune, which finds them"
+        require(any(gains.values()), "--laws", "tuned gains for none of them", expected)
+        return gains
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
     """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits,
     uncertainty, tuning.
 
     Exit status: 0, or 2 bad input.
     """
-    engines.require_jax()
-    names = list(LAWS) if laws is None else laws.split(",")
-    aims = tuning.split(",")
-    levels, tuning_seed = parse_numbers(uncertainty), gain_tuning.TUNING_TURBULENCE_SEED
-    _check_options(aims, levels, uncertainty, turbulence_seed)
-    if write is not None:
-        _require_one_law(names, aims)
-    chosen, command = find_scenario(scenario), f"rise-di compare {scenario} --tune"
-    if wind is not None:
-        chosen = chosen.vary(
-            aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}}
-        )
-        command += f" --wind {wind}"
-    effect = chosen.aircraft.uncertainty.wind
-    others = {Path(name).stem: find_scenario(name) for name in names if name.endswith(".yaml")}
-    names = [Path(name).stem if name.endswith(".yaml") else name for name in names]
-    controllers = registered_laws.find_laws(names, chosen, others)
-    entries = registered_laws.entries(controllers)
-    path = gains or tuned_gains.tuned_file(chosen)
-    stored = tuned_gains.load(path)
-    wanted = [(name, aim) for name, aim in product(names, aims) if aim not in stored.get(name, {})]
-    results = []
-    with progress_bar(*COUNT_COLUMNS) as bar:
-        if tune:
-            _tune(wanted, entries, chosen, path, command, bar, controllers)
-        known = tuned_gains.load(path)
-        tuned = {name: _tuned(known.get(name, {}), aims, controllers[name]) for name in names}
-        require(
-            any(tuned.values()),
-            "--laws",
-            "tuned gains for none of them",
-            f"gains in {path}, or --tune, which finds them",
-        )
-        benchmark = registered_laws.with_courses(
-            gain_tuning.build_benchmark(chosen, turbulence_seed), controllers
-        )
-        task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
-        for result in law_comparison.compare(
-            benchmark, tuned, aircraft, levels, seed, laws=entries
-        ):
-            results.append(result)
-            bar.advance(task)
-    console = Console()
-    console.width = max(console.width, WIDTH)
-    for aim in aims:
-        if shown := [result for result in results if result.objective == aim]:
-            console.print(_table(gain_tuning.OBJECTIVES[aim].title, shown, entries, chosen))
-    notes = _notes(chosen, benchmark, {name: entries[name] for name in tuned if tuned[name]}, aims)
-    flown = (
-        f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
+
+    scenario: str = argument(
+        "Name of a scenario, or path of a scenario file (.yaml).", default="osprey_servo"
     )
-    turbulence = f"turbulence of seed {turbulence_seed}, that of the tuning {tuning_seed}"
-    console.print(f"{notes}\n{flown}; {turbulence}", style="dim", highlight=False)
-    lacking = [(name, aim) for name, aim in wanted if controllers[name] is None]
-    if lacking and not tune:
-        missing = ", ".join(f"{name} ({aim})" for name, aim in lacking)
-        console.print(f"without tuned gains (--tune finds them): {missing}")
-    if write is not None:
-        _write(write, names[0], aims[0], tuned[names[0]][aims[0]], benchmark)
-        console.print(f"controller: {display_path(write)}")
-    if to_json is not None:
-        rows = [_as_json(result, entries[result.law], chosen) for result in results]
-        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
-        write_text(
-            "--json",
-            to_json,
-            json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1)
-            + "\n",
+    aircraft: int = option("Uncertain aircraft at each level.", default=200, min=1)
+    uncertainty: str = option(
+        "Largest relative deviations of A and B, as in 0.3,0.5", default="0.3,0.5"
+    )
+    seed: int = option("Seed of the uncertain aircraft.", default=1, min=0)
+    wind: WindEffect | None = setting(
+        "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
+        "the scenario's."
+    )
+    laws: str | None = option(
+        "Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
+        "place of a name: its controller."
+    )
+    tuning: str = option(
+        f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}.",
+        default="gust_turbulence",
+    )
+    tune: bool = option(
+        "First tune the laws that have no gains for this scenario: minutes a law.", default=False
+    )
+    turbulence_seed: int = setting(
+        "Seed of the turbulence, unlike that of the tuning.",
+        default=law_comparison.TURBULENCE_SEED,
+        min=0,
+    )
+    gains: Path | None = setting("File of tuned gains; by default the one of the stack.")
+    write: Path | None = write_option(
+        "File for the gains of one law as a section of a scenario, which flies with "
+        "the score shown."
+    )
+    to_json: Path | None = option("File to write the figures to, SI.", "--json")
+
+    def execute(self) -> None:
+        """Tune what has no gains, fly every law, show and write."""
+        engines.require_jax()
+        names = list(LAWS) if self.laws is None else self.laws.split(",")
+        aims = self.tuning.split(",")
+        levels = parse_numbers(self.uncertainty)
+        _check_options(aims, levels, self.uncertainty, self.turbulence_seed)
+        if self.write is not None:
+            _require_one_law(names, aims)
+        contest = self._contest(names, aims)
+        tuned: Gains
+        with progress_bar(*COUNT_COLUMNS) as bar:
+            if self.tune:
+                contest.tune(self._command(), bar)
+            tuned = contest.tuned()
+            benchmark = contest.benchmark(self.turbulence_seed)
+            task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
+            results = []
+            for result in law_comparison.compare(
+                benchmark, tuned, self.aircraft, levels, self.seed, laws=contest.entries
+            ):
+                results.append(result)
+                bar.advance(task)
+        console = Console()
+        console.width = max(console.width, WIDTH)
+        self._show(console, contest, results, benchmark, tuned)
+        if self.write is not None:
+            law, aim = contest.names[0], aims[0]
+            _write(self.write, law, aim, tuned[law][aim], benchmark)
+            console.print(f"controller: {display_path(self.write)}")
+        if self.to_json is not None:
+            write_text("--json", self.to_json, self._as_json(contest, results))
+
+    def _contest(self, names: Sequence[str], aims: Sequence[str]) -> Contest:
+        """The laws; laws of scenario files by the name of the file."""
+        chosen = find_scenario(self.scenario)
+        if self.wind is not None:
+            uncertainty = chosen.aircraft.uncertainty.model_dump() | {"wind": self.wind}
+            chosen = chosen.vary(aircraft={"uncertainty": uncertainty})
+        files = {Path(name).stem: name for name in names if name.endswith(".yaml")}
+        others = {stem: find_scenario(file) for stem, file in files.items()}
+        laws = [Path(name).stem if name.endswith(".yaml") else name for name in names]
+        controllers = registered_laws.find_laws(laws, chosen, others)
+        entries = registered_laws.entries(controllers)
+        path = self.gains or tuned_gains.tuned_file(chosen)
+        return Contest(chosen, laws, aims, controllers, entries, path)
+
+    def _command(self) -> str:
+        """The command of another tuning, for the file of gains."""
+        wind = "" if self.wind is None else f" --wind {self.wind}"
+        return f"rise-di compare {self.scenario} --tune{wind}"
+
+    def _show(
+        self,
+        console: Console,
+        contest: Contest,
+        results: Sequence[LawResult],
+        benchmark: Benchmark,
+        tuned: Gains,
+    ) -> None:
+        """Print a table an objective, and what the words mean."""
+        scenario = contest.scenario
+        for aim in contest.aims:
+            if shown := [result for result in results if result.objective == aim]:
+                title = gain_tuning.OBJECTIVES[aim].title
+                console.print(_table(title, shown, contest.entries, scenario))
+        laws = {name: contest.entries[name] for name in tuned if tuned[name]}
+        effect = WIND_EFFECTS[scenario.aircraft.uncertainty.wind]
+        console.print(
+            f"{_notes(scenario, benchmark, laws, contest.aims)}\n"
+            f"{self.aircraft} aircraft a level, seed {self.seed}; effect of wind on x_dot {effect}"
+            f"; turbulence of seed {self.turbulence_seed}, that of the tuning "
+            f"{gain_tuning.TUNING_TURBULENCE_SEED}",
+            style="dim",
+            highlight=False,
         )
+        lacking = [row for row in contest.untuned() if contest.controllers[row[0]] is None]
+        if lacking:
+            missing = ", ".join(f"{name} ({aim})" for name, aim in lacking)
+            console.print(f"without tuned gains (--tune finds them): {missing}")
+
+    def _as_json(self, contest: Contest, results: Sequence[LawResult]) -> str:
+        """The figures of all laws as JSON, SI."""
+        scenario = contest.scenario
+        figures = {
+            "scenario": scenario.name,
+            **values_of(self, "aircraft", "seed"),
+            "wind": scenario.aircraft.uncertainty.wind,
+            "turbulence_seed": self.turbulence_seed,
+            "laws": [_as_json(row, contest.entries[row.law], scenario) for row in results],
+        }
+        return json.dumps(figures, indent=1) + "\n"
 
 
 def _check_options(
@@ -232,43 +308,6 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     write_text(
         "--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments)
     )
-
-
-def _tuned(
-    known: Mapping[str, TuningResult], aims: Sequence[str], controller: ControllerConfig | None
-) -> dict[str, TuningResult]:
-    """The gains of a law by objective: those of a search, else those of its controller."""
-    searched = {aim: known[aim] for aim in aims if aim in known}
-    if controller is None:
-        return searched
-    return dict.fromkeys(aims, registered_laws.as_tuned(controller)) | searched
-
-
-def _tune(
-    wanted: Iterable[tuple[str, str]],
-    entries: Mapping[str, Law],
-    chosen: Scenario,
-    path: Path,
-    command: str,
-    bar: Progress,
-    controllers: Mapping[str, ControllerConfig | None],
-) -> None:
-    """Tune laws for an objective per law. The file is written after every law."""
-    benchmark = registered_laws.with_courses(gain_tuning.build_benchmark(chosen), controllers)
-    for name, aim in wanted:
-        task = bar.add_task("", total=gain_tuning.generation_count(entries[name], benchmark))
-
-        def show_cost(
-            generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}"
-        ) -> None:
-            bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
-
-        result = gain_tuning.tune(
-            entries[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost
-        )
-        known = tuned_gains.load(path)
-        known.setdefault(name, {})[aim] = result
-        tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), command)
 
 
 def _table(

@@ -4,29 +4,18 @@
 disengagement.
 """
 
-from typing import Annotated
+from dataclasses import dataclass
 
 import typer
 
-from flight_cli.words import Namespace, option, warn
+from flight_cli.words import namespace_option, option, warn
 from flight_core.environment import require_ros_environment
 
 REFUSED = 1
 
 
-def engage(
-    off: Annotated[
-        bool, option("Disengage: give the channels back to the autopilot.", "--off")
-    ] = False,
-    blind: Annotated[
-        bool,
-        option(
-            "Engage without regard to the pilot's transmitter, and without end by max_engaged.",
-            "--blind",
-        ),
-    ] = False,
-    namespace: Namespace = "",
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Engage:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
     The command waits until u is at trim, and for a change of mode where the map asks for one. The
@@ -35,12 +24,22 @@ def engage(
     the map ends the engagement, unless you engage again before. Exit status: 0 done, 1 refused with
     the bridge's reason, 2 service not available.
     """
-    require_ros_environment()
-    from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    with EngagementClient(namespace) as client:
-        refusal = client.disengage() if off else client.engage(warn, blind=blind)
-    if refusal:
-        warn(f"error: not {'disengaged' if off else 'engaged'}: {refusal}")
-        raise typer.Exit(REFUSED)
-    print("disengaged" if off else "engaged, the controller flies")
+    off: bool = option("Disengage: give the channels back to the autopilot.", default=False)
+    blind: bool = option(
+        "Engage without regard to the pilot's transmitter, and without end by max_engaged.",
+        default=False,
+    )
+    namespace: str = namespace_option()
+
+    def execute(self) -> None:
+        """Ask the bridge, and say what it did."""
+        require_ros_environment()
+        from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+        with EngagementClient(self.namespace) as client:
+            refusal = client.disengage() if self.off else client.engage(warn, blind=self.blind)
+        if refusal:
+            warn(f"error: not {'disengaged' if self.off else 'engaged'}: {refusal}")
+            raise typer.Exit(REFUSED)
+        print("disengaged" if self.off else "engaged, the controller flies")

@@ -4,69 +4,33 @@
 same bits.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import typer
 from rich.console import Console
 
 from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import print_json
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import (
+    REQUIRED,
+    argument,
+    json_option,
+    option,
+    setting,
+    values_of,
+)
 from flight_log.tape_reader import read_run
+from rise_di.c_code import Exported
 from rise_di.c_code import export as write_export
 
 DIFFERS = 1
+PROOF = ("duration", "drawn", "seed", "runner")
 
 
-def export(
-    scenario: Annotated[str, argument("Name of a scenario, or path of a scenario file (.yaml).")],
-    folder: Annotated[
-        Path | None,
-        option("Folder to write the C code and the report of the proof to.", "--c", "--output"),
-    ] = None,
-    px4: Annotated[
-        Path | None, option("Folder to write an external module of PX4 to, in place of --c.")
-    ] = None,
-    run: Annotated[
-        Path | None, option("Prove with the ticks of a recorded run, in place of flights.")
-    ] = None,
-    float32: Annotated[
-        bool, option("Compute in float. The proof then bounds the difference of u.", "--float32")
-    ] = False,
-    duration: Annotated[
-        float | None,
-        option("Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0),
-    ] = None,
-    drawn: Annotated[
-        int, setting("drawn", "Number of drawn steps of the proof.", min=1, max=10_000_000)
-    ] = 50_000,
-    seed: Annotated[int, setting("seed", "Seed of the drawn inputs.", min=0)] = 1,
-    compiler: Annotated[
-        list[str] | None,
-        option(
-            "Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
-            "and clang, if there."
-        ),
-    ] = None,
-    runner: Annotated[
-        str, setting("runner", "Command that starts what the compiler makes, as qemu-aarch64.")
-    ] = "",
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            "--set samples",
-            min=4,
-            help="Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.",
-        ),
-    ] = None,
-    fmu: Annotated[
-        bool,
-        option("Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", "--fmu"),
-    ] = False,
-    without_proof: Annotated[bool, option("Write the code without a proof.", "--no-proof")] = False,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Export:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
     same bits.
 
@@ -74,48 +38,83 @@ def export(
     engagement, limits), with drawn calls and with drawn steps. It compares every u and every state.
     Exit status: 0 proved, 1 a bit differs, 2 bad input.
     """
-    chosen = folder or px4
-    if chosen is None or (folder and px4):
-        raise typer.BadParameter("expected --c FOLDER or --px4 FOLDER")
-    recorded = None if run is None else read_run(run)
-    if recorded is not None:
-        warn_of_lacks(recorded)
-    with Console(stderr=True, quiet=as_json).status("flying and comparing"):
-        files, proof, text = write_export(
-            scenario,
-            chosen,
-            run=recorded,
-            float32=float32,
-            duration=duration,
-            drawn=drawn,
-            seed=seed,
-            compiler=compiler or (),
-            runner=runner,
-            samples=samples,
-            fmu=fmu,
-            px4=px4 is not None,
-            proof=not without_proof,
-        )
-    if proof is None:
-        if as_json:
-            print_json({"files": [str(path) for path in files], "proved": None})
+
+    scenario: str = argument(
+        "Name of a scenario, or path of a scenario file (.yaml).", default=REQUIRED
+    )
+    folder: Path | None = option(
+        "Folder to write the C code and the report of the proof to.", "--c", "--output"
+    )
+    px4: Path | None = option("Folder to write an external module of PX4 to, in place of --c.")
+    run: Path | None = option("Prove with the ticks of a recorded run, in place of flights.")
+    float32: bool = option(
+        "Compute in float. The proof then bounds the difference of u.", default=False
+    )
+    duration: float | None = option(
+        "Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0
+    )
+    drawn: int = setting(
+        "Number of drawn steps of the proof.", default=50_000, min=1, max=10_000_000
+    )
+    seed: int = setting("Seed of the drawn inputs.", default=1, min=0)
+    compiler: list[str] | None = option(
+        "Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
+        "and clang, if there."
+    )
+    runner: str = setting(
+        "Command that starts what the compiler makes, as qemu-aarch64.", default=""
+    )
+    samples: int | None = setting(
+        "Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.", min=4
+    )
+    fmu: bool = option(
+        "Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", default=False
+    )
+    without_proof: bool = option("Write the code without a proof.", "--no-proof", default=False)
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Write the code, prove it, show the proof."""
+        chosen = self.folder or self.px4
+        if chosen is None or (self.folder and self.px4):
+            raise typer.BadParameter("expected --c FOLDER or --px4 FOLDER")
+        recorded = None if self.run is None else read_run(self.run)
+        if recorded is not None:
+            warn_of_lacks(recorded)
+        with Console(stderr=True, quiet=self.as_json).status("flying and comparing"):
+            exported = write_export(
+                self.scenario,
+                chosen,
+                **values_of(self, *PROOF, "float32", "samples", "fmu"),
+                run=recorded,
+                compiler=self.compiler or (),
+                px4=self.px4 is not None,
+                proof=not self.without_proof,
+            )
+        if self.as_json:
+            print_json(_as_json(exported))
+        elif exported.proof is None:
+            print(*exported.files, "not proved: --no-proof", sep="\n")
         else:
-            print("\n".join(map(str, files)) + "\nnot proved: --no-proof")
-        return
-    if as_json:
-        comparisons = [
-            {**comparison._asdict(), "first": comparison.first and comparison.first._asdict()}
-            for comparison in proof.comparisons
-        ]
-        print_json(
-            {
-                "files": [str(path) for path in files],
-                "proved": proof.holds,
-                "compilers": proof.compilers,
-                "comparisons": comparisons,
-            }
-            | {"figures": proof.figures}
-        )
-    else:
-        print(text + "\n" + "\n".join(map(str, files)))
-    raise typer.Exit(0 if proof.holds else DIFFERS)
+            print(exported.report, *exported.files, sep="\n")
+        if exported.proof is not None:
+            raise typer.Exit(0 if exported.proof.holds else DIFFERS)
+
+
+def _as_json(exported: Exported) -> dict[str, Any]:
+    """Files, and the figures of the proof."""
+    proof = exported.proof
+    files = {"files": [str(path) for path in exported.files]}
+    if proof is None:
+        return {**files, "proved": None}
+    comparisons = [
+        {**comparison._asdict(), "first": comparison.first and comparison.first._asdict()}
+        for comparison in proof.comparisons
+    ]
+    return {
+        **files,
+        "proved": proof.holds,
+        "compilers": proof.compilers,
+        "comparisons": comparisons,
+        "figures": proof.figures,
+    }

@@ -2,20 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several aircraft at once by `rise-di fly`, then a line an aircraft."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import typer
 from rich.console import Console
 
-from flight_analysis.report.run_folder import remove_empty, write_empty_summary, write_report
+from flight_analysis.report.run_folder import write_empty_summary, write_report
 from flight_analysis.report.summary import taken_over
-from flight_bringup.fleet import Flown, fly_fleet, new_runs, read_fleet
+from flight_bringup.fleet import Fleet, Flown, fly_fleet, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
@@ -34,28 +31,17 @@ from flight_core.parameters import ParameterError
 SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 
 
-def fly_fleet_file(
-    context: typer.Context,
-    file: str,
-    duration: float | None,
-    runs: Path,
-    *,
-    watch: bool,
-    use_sim_time: bool,
-    as_json: bool,
-) -> None:
-    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Exits with the
-    severest status.
-    """
+def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Fleet:
+    """The fleet of a file, in an environment that can fly it. Raises ParameterError."""
     require_package("rclpy", "")
     require_ros_environment()
-    chosen = read_fleet(file, duration, use_sim_time=use_sim_time)
-    chosen_runs = new_runs(chosen, runs)
-    context.call_on_close(partial(remove_empty, *chosen_runs))
-    if watch:
-        from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
+    return read_fleet(file, duration, use_sim_time=use_sim_time)
 
-        print(*context.with_resource(watched(*chosen_runs, fleet=True)), sep="\n", file=sys.stderr)
+
+def fly_fleet_file(chosen: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
+    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Returns the
+    severest exit status.
+    """
     totals = {member.name: member.scenario.flight.duration for member in chosen.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
         tasks = {
@@ -66,7 +52,7 @@ def fly_fleet_file(
         def progress(name: str, t: float, shown: str) -> None:
             bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=shown)
 
-        flown = fly_fleet(chosen, chosen_runs, progress)
+        flown = fly_fleet(chosen, runs, progress)
         for each in flown:
             bar.update(tasks[each.member.name], shown=f"{each.outcome}, report to write")
         reported: dict[str, _Result] = {}
@@ -80,7 +66,7 @@ def fly_fleet_file(
         _show(chosen.name, flown, results)
     statuses = [exit_status(result.summary["outcome"]) for result in reported.values()]
     statuses += [STATUS_INTERRUPTED] if len(reported) < len(flown) else []
-    raise typer.Exit(max(statuses, key=SEVEREST.index))
+    return max(statuses, key=SEVEREST.index)
 
 
 class _Result(NamedTuple):

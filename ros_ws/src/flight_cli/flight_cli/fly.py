@@ -3,9 +3,10 @@
 """`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
 
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -19,7 +20,7 @@ from flight_analysis.report.run_folder import (
     write_empty_summary,
     write_report,
 )
-from flight_bringup.fleet import is_fleet
+from flight_bringup.fleet import is_fleet, new_runs
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import (
     Autopilot,
@@ -28,18 +29,11 @@ from flight_bringup.graph import (
     require_limits,
     second_stage,
 )
-from flight_cli.fleet import fly_fleet_file
+from flight_cli.fleet import fly_fleet_file, open_fleet
 from flight_cli.output import flight_progress, print_json, show_flight
-from flight_cli.route_options import (
-    Altitude,
-    Line,
-    OriginOfRoute,
-    Simplify,
-    parse_origin,
-    read_waypoints,
-)
-from flight_cli.settings import Settings, with_settings
-from flight_cli.words import AsJson, argument, option, setting, warn
+from flight_cli.route_options import RouteWords, parse_origin
+from flight_cli.settings import settings_option, with_settings
+from flight_cli.words import argument, json_option, option, require_unused, setting, warn
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -48,79 +42,14 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import ENDINGS, read_fence_file
 from flight_guidance.route_formats import FENCES
 
+OF_AIRCRAFT = (
+    *("settings", "in_process", "lockstep", "composed", "bridge"),
+    *("send", "route", "fence", "namespace"),
+)  # fields of a flight of one aircraft alone
 
-def fly(
-    context: typer.Context,
-    scenario: Annotated[
-        str,
-        argument(
-            "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
-        ),
-    ] = "osprey_servo",
-    duration: Annotated[
-        float | None, option("Duration in s; by default that of the scenario.")
-    ] = None,
-    settings: Settings = None,
-    in_process: Annotated[
-        bool, option("Fly in one process without ROS, as fast as it goes.", "--in-process")
-    ] = False,
-    lockstep: Annotated[
-        bool,
-        option(
-            "Fly in lockstep over topics, as fast as possible, repeatable to the byte.",
-            "--lockstep",
-        ),
-    ] = False,
-    composed: Annotated[
-        bool,
-        setting("composed", "Fly with all nodes in one process: a third of the processor time."),
-    ] = False,
-    use_sim_time: Annotated[
-        bool,
-        typer.Option(
-            "--set use_sim_time",
-            help="Fly by the /clock of a simulator, at any speed of it, in place of real time.",
-        ),
-    ] = False,
-    bridge: Annotated[
-        str | None,
-        option(
-            "Fly an autopilot in place of the aircraft, by a channel map; a dry run "
-            "without --send.",
-            metavar="MAP",
-        ),
-    ] = None,
-    route: Annotated[
-        Path | None,
-        option(f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"),
-    ] = None,
-    origin: OriginOfRoute = None,
-    fence: Annotated[
-        Path | None,
-        setting(
-            "route.fence",
-            f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
-            metavar="FILE",
-        ),
-    ] = None,
-    altitude: Altitude = None,
-    simplify: Simplify = 0.0,
-    line: Line = None,
-    send: Annotated[
-        bool, option("Send commands to the autopilot once the bridge is engaged.", "--send")
-    ] = False,
-    watch: Annotated[
-        bool, option("Serve the live page of the flight while it lasts.", "--watch")
-    ] = False,
-    namespace: Annotated[
-        str,
-        option("Namespace of all nodes, as uav1: one for each aircraft that flies in this domain."),
-    ] = "",
-    runs: Annotated[Path, setting("runs", "Folder that the run's folder is made in.")] = Path(
-        "runs"
-    ),
-    as_json: AsJson = False,
-) -> None:
+
+@dataclass(frozen=True, kw_only=True)
+class Fly(RouteWords):
     """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real
     time.
 
@@ -128,117 +57,157 @@ def fly(
     an incomplete log or a leg missed or not flown, 130 interrupted; of a fleet the severest of its
     aircraft.
     """
-    if is_fleet(scenario):
-        rest: dict[str, object] = {
-            "settings": settings,
-            "in_process": in_process,
-            "lockstep": lockstep,
-            "composed": composed,
-            "bridge": bridge,
-        }
-        rest |= {"send": send, "route": route, "fence": fence, "namespace": namespace}
-        for key, chosen_value in rest.items():
-            require(
-                not chosen_value,
-                key,
-                "it beside a fleet",
-                "a scenario, or the key in the file of the fleet",
-            )
-        fly_fleet_file(
-            context,
-            scenario,
-            duration,
-            runs,
-            watch=watch,
-            use_sim_time=use_sim_time,
-            as_json=as_json,
-        )
-    chosen = with_settings(find_scenario(scenario, duration, with_route=route is None), settings)
-    require(
-        not (in_process and (lockstep or composed)),
-        "in_process",
-        "a flight over topics, in lockstep",
-        "one of the two",
+
+    context: typer.Context
+    scenario: str = argument(
+        "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.",
+        default="osprey_servo",
     )
-    require(
-        not (in_process and namespace),
-        "--namespace",
-        "a flight in one process",
-        "a flight over topics, which has nodes",
+    duration: float | None = option("Duration in s; by default that of the scenario.")
+    settings: list[str] | None = settings_option()
+    in_process: bool = option("Fly in one process without ROS, as fast as it goes.", default=False)
+    lockstep: bool = option(
+        "Fly in lockstep over topics, as fast as possible, repeatable to the byte.", default=False
     )
-    namespace = absolute_namespace(namespace)
-    stepping = lockstep or chosen.flight.lockstep
-    require(
-        not (use_sim_time and (in_process or stepping)),
-        "use_sim_time",
-        "a flight in lockstep or in one process",
-        "a flight in real time over topics",
+    composed: bool = setting(
+        "Fly with all nodes in one process: a third of the processor time.", default=False
     )
-    autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
-    require(
-        not (send and bridge is None),
-        "--send",
-        "no --bridge",
-        "the channel map of an autopilot: --bridge MAP",
+    use_sim_time: bool = setting(
+        "Fly by the /clock of a simulator, at any speed of it, in place of real time.",
+        default=False,
     )
-    real_time = "a flight in real time over topics: an autopilot does not wait"
-    require(
-        autopilot is None or not composed,
-        "composed",
-        "a flight with a bridge",
-        "one process a node",
+    bridge: str | None = option(
+        "Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send.",
+        metavar="MAP",
     )
-    require(
-        autopilot is None or not (in_process or stepping),
-        "--bridge",
-        "a flight in lockstep or in one process",
-        real_time,
+    route: Path | None = option(
+        f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"
     )
-    files = route or fence
-    for_route = (("route.simplify", simplify or None, route), ("route.line", line, route))
-    for key, value, file in (
-        ("route.origin", origin, files),
-        ("route.altitude", altitude, files),
-        *for_route,
-    ):
+    fence: Path | None = setting(
+        f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
+        "route.fence",
+        metavar="FILE",
+    )
+    send: bool = option("Send commands to the autopilot once the bridge is engaged.", default=False)
+    watch: bool = option("Serve the live page of the flight while it lasts.", default=False)
+    namespace: str = option(
+        "Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.",
+        default="",
+    )
+    runs: Path = setting("Folder that the run's folder is made in.", default=Path("runs"))
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Fly, write the report, show the figures."""
+        if is_fleet(self.scenario):
+            expected = "a scenario, or the key in the file of the fleet"
+            require_unused(self, OF_AIRCRAFT, expected, "it beside a fleet")
+            self._fly_fleet()
+        chosen = self._scenario()
+        namespace = absolute_namespace(self.namespace)
+        stepping = self.lockstep or chosen.flight.lockstep
+        autopilot = self._autopilot(stepping=stepping)
+        _require_flyable(chosen, autopilot, in_process=self.in_process)
+        for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
+            warn(f"warning: {sentence}")
+        learn = _learner(chosen)
+        run = new_run(chosen, self.runs)
+        self.context.call_on_close(partial(remove_empty, run))
+        if self.route or self.fence or self.settings:
+            chosen = written(chosen, run / f"{chosen.name}.yaml")
+        self._watch(run)
+        with flight_progress(chosen.flight.duration, quiet=self.as_json) as (progress, announce):
+            if self.in_process:
+                outcome = fly_in_process(chosen, run, progress, learn, announce)
+            else:
+                outcome = fly_over_topics(
+                    chosen,
+                    run,
+                    progress,
+                    lockstep=stepping,
+                    one_process=self.composed,
+                    use_sim_time=self.use_sim_time,
+                    autopilot=autopilot,
+                    namespace=namespace,
+                    announce=announce,
+                )
+            if outcome == "completed":
+                progress(chosen.flight.duration, outcome)
+        raise typer.Exit(_report(chosen, run, outcome, as_json=self.as_json))
+
+    def _scenario(self) -> Scenario:
+        """The scenario with settings, route and fence. Raises ParameterError for contradictory
+        words.
+        """
+        found = find_scenario(self.scenario, self.duration, with_route=self.route is None)
+        chosen = with_settings(found, self.settings)
+        self._require_one_way(stepping=self.lockstep or chosen.flight.lockstep)
+        files = self.route or self.fence
+        needs = {"origin": files, "altitude": files, "simplify": self.route, "line": self.route}
+        for name, file in needs.items():
+            unset = file is not None or getattr(self, name) in (None, 0.0)
+            require(unset, f"route.{name}", "no --route", "the file of a route: --route FILE")
+        return chosen if files is None else self._with_files(chosen)
+
+    def _require_one_way(self, *, stepping: bool) -> None:
+        """Raise ParameterError for two ways to fly at once."""
+        over_topics = "a flight over topics, in lockstep"
+        ways = not (self.in_process and (self.lockstep or self.composed))
+        require(ways, "in_process", over_topics, "one of the two")
+        has_nodes = "a flight over topics, which has nodes"
+        named = self.in_process and self.namespace
+        require(not named, "--namespace", "a flight in one process", has_nodes)
+        timed = self.use_sim_time and (self.in_process or stepping)
+        found = "a flight in lockstep or in one process"
+        require(not timed, "use_sim_time", found, "a flight in real time over topics")
+
+    def _autopilot(self, *, stepping: bool) -> Autopilot | None:
+        """The autopilot in the aircraft's place. Raises ParameterError where none can fly."""
+        if self.bridge is None:
+            expected = "the channel map of an autopilot: --bridge MAP"
+            require_unused(self, ["send"], expected, "no --bridge")
+            return None
+        autopilot = find_autopilot(self.bridge, dry_run=not self.send)
+        require(not self.composed, "composed", "a flight with a bridge", "one process a node")
         require(
-            value is None or file is not None,
-            key,
-            "no --route",
-            "the file of a route: --route FILE",
+            not (self.in_process or stepping),
+            "--bridge",
+            "a flight in lockstep or in one process",
+            "a flight in real time over topics: an autopilot does not wait",
         )
-    if files is not None:
-        chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)
-    _require_flyable(chosen, autopilot, in_process=in_process)
-    for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
-        warn(f"warning: {sentence}")
-    learn = _learner(chosen)
-    run = new_run(chosen, runs)
-    context.call_on_close(partial(remove_empty, run))
-    if files is not None or settings:
-        chosen = written(chosen, run / f"{chosen.name}.yaml")
-    if watch:
+        return autopilot
+
+    def _with_files(self, scenario: Scenario) -> Scenario:
+        """The scenario with the route and the fence of files. Raises ParameterError."""
+        above_sea = scenario.aircraft.is_jsbsim
+        sections: dict[str, Any] = {}
+        if self.fence is not None:
+            origin = parse_origin(self.origin)
+            sections = read_fence_file(self.fence, origin, self.altitude, above_sea=above_sea)
+        guided = not sections or scenario.guidance is not None
+        require(guided, "route.fence", "a scenario without guidance", "one with guidance")
+        if home := sections.get("home"):
+            ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
+            warn(f"note: home by the fence file: {home}{ground}")
+        if self.route is None:
+            return scenario.vary(guidance=sections)
+        return with_route(scenario, self.read_waypoints(self.route, above_sea=above_sea), sections)
+
+    def _fly_fleet(self) -> NoReturn:
+        """Fly a fleet, with the page of all aircraft, and exit with the severest status."""
+        fleet = open_fleet(self.scenario, self.duration, use_sim_time=self.use_sim_time)
+        runs = new_runs(fleet, self.runs)
+        self.context.call_on_close(partial(remove_empty, *runs))
+        self._watch(*runs, fleet=True)
+        raise typer.Exit(fly_fleet_file(fleet, runs, as_json=self.as_json))
+
+    def _watch(self, *runs: Path, fleet: bool = False) -> None:
+        """Serve the page of runs while the command lasts, with --watch."""
+        if not self.watch:
+            return
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
 
-        print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
-    with flight_progress(chosen.flight.duration, quiet=as_json) as (progress, announce):
-        if in_process:
-            outcome = fly_in_process(chosen, run, progress, learn, announce)
-        else:
-            outcome = fly_over_topics(
-                chosen,
-                run,
-                progress,
-                lockstep=stepping,
-                one_process=composed,
-                use_sim_time=use_sim_time,
-                autopilot=autopilot,
-                namespace=namespace,
-                announce=announce,
-            )
-        if outcome == "completed":
-            progress(chosen.flight.duration, outcome)
-    raise typer.Exit(_report(chosen, run, outcome, as_json=as_json))
+        print(*self.context.with_resource(watched(*runs, fleet=fleet)), sep="\n", file=sys.stderr)
 
 
 def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> int:
@@ -262,40 +231,6 @@ def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> in
             f"{display_path(result.report)}"
         )
     return exit_status(outcome)
-
-
-def _with_files(
-    scenario: Scenario,
-    route: Path | None,
-    fence: Path | None,
-    origin: str | None,
-    altitude: float | None,
-    simplify: float,
-    line: str | None,
-) -> Scenario:
-    """The scenario with the route and the fence of files. Raises ParameterError."""
-    above_sea = scenario.aircraft.is_jsbsim
-    sections = (
-        {}
-        if fence is None
-        else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
-    )
-    require(
-        not sections or scenario.guidance is not None,
-        "route.fence",
-        "a scenario without guidance",
-        "one with guidance",
-    )
-    if home := sections.get("home"):
-        ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
-        print(f"note: home by the fence file: {home}{ground}", file=sys.stderr)
-    if route is not None:
-        return with_route(
-            scenario,
-            read_waypoints(route, origin, altitude, simplify, line, above_sea=above_sea),
-            sections,
-        )
-    return scenario.vary(guidance=sections)
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

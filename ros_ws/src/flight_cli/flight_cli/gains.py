@@ -5,10 +5,11 @@ scenario.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
@@ -17,6 +18,7 @@ from rich.table import Table
 
 from flight_analysis.closed_loop.guarantee import Guarantee, guarantee
 from flight_analysis.closed_loop.loop_margins import linear_loop
+from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (
     MARGIN_COLUMNS,
@@ -26,7 +28,6 @@ from flight_analysis.report.margin_figures import (
     margins_as_json,
     modes_text,
 )
-from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.gains_guarantee import (
     loop_of_effectors,
@@ -34,8 +35,17 @@ from flight_cli.gains_guarantee import (
     show_guarantee,
     write_unstable,
 )
-from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
-from flight_cli.words import WRITE, AsJson
+from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, say, write_text
+from flight_cli.words import (
+    REQUIRED,
+    argument,
+    json_option,
+    option,
+    require_unused,
+    setting,
+    values_of,
+    write_option,
+)
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
@@ -63,170 +73,37 @@ MEANINGS = {
 }
 """Terms of the table and their meaning."""
 Assessment = GainAssessment[Any]
+LOOP = ("rate", "y_rate", "lag", "delay", "inputs")
+STUDY = ("uncertainty", "gamma_2", "samples", "seed")
+SELECTION = (
+    *("rate", "y_rate", "delay", "feedforward", "observer", "model"),
+    *("margin", "phase_margin", "accept", "mixing"),
+)
+"""Fields of a loop, of a check, and of a selection."""
 
 
-def gains(
-    airframe: Annotated[
-        str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")
-    ],
-    uncertainty: Annotated[
-        float, typer.Option(help="Largest relative deviation of each entry of A and B.")
-    ] = 0.3,
-    scenario: Annotated[
-        str, typer.Option(help="Scenario with the commands, the gusts and the loop.")
-    ] = "osprey_servo",
-    rate: Annotated[
-        float | None,
-        typer.Option("--set rate", help="Rate of the law in Hz; by default that of the scenario."),
-    ] = None,
-    y_rate: Annotated[
-        float | None,
-        typer.Option(
-            "--set y_rate",
-            help="Rate of y in Hz: a period above that of the law counts as delay, and y is "
-            "stale after three.",
-        ),
-    ] = None,
-    lag: Annotated[
-        str | None,
-        typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1"),
-    ] = None,
-    delay: Annotated[
-        float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")
-    ] = None,
-    px4: Annotated[
-        Path | None,
-        typer.Option(
-            "--set px4",
-            help="Parameter file of QGroundControl or ULog of PX4, for the module of export --px4: "
-            "rate and delay of the body rates.",
-        ),
-    ] = None,
-    inputs: Annotated[
-        str | None,
-        typer.Option(
-            "--set inputs", help="Input of each output, in the airframe's order: rudder,aileron"
-        ),
-    ] = None,
-    gamma_2: Annotated[
-        float,
-        typer.Option(
-            "--set gamma_2",
-            help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.",
-        ),
-    ] = 0.0,
-    samples: Annotated[
-        int,
-        typer.Option(
-            "--set samples",
-            min=0,
-            max=10_000,
-            help="Number of uncertain airframes for the bounds of the theorem.",
-        ),
-    ] = 100,
-    seed: Annotated[
-        int, typer.Option("--set seed", min=0, help="Seed of the uncertain airframes.")
-    ] = 1,
-    write: Annotated[
-        Path | None,
-        typer.Option(*WRITE, help="File for the engineering gains, as a section of a scenario."),
-    ] = None,
-    feedforward: Annotated[
-        bool,
-        typer.Option(
-            "--set feedforward",
-            help="Write the airframe too, as the model of the feedforward (an extension).",
-        ),
-    ] = False,
-    observer: Annotated[
-        bool,
-        typer.Option(
-            "--observer",
-            help="Write feedforward and observer, and the gains beside them (an extension).",
-        ),
-    ] = False,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            "--set model",
-            help="Airframe that the observer takes as its model, as rise-di identify RUN writes "
-            "it.",
-        ),
-    ] = None,
-    margin: Annotated[
-        float,
-        typer.Option(
-            "--set margin", help="Least delay margin of the nominal loop with the observer, s."
-        ),
-    ] = 0.03,
-    speeds: Annotated[
-        str | None,
-        typer.Option(
-            "--set speeds",
-            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
-            "schedule that flies them.",
-        ),
-    ] = None,
-    phase_margin: Annotated[
-        float,
-        typer.Option(
-            "--set phase_margin",
-            help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.",
-        ),
-    ] = PHASE_MARGIN,
-    theorem: Annotated[
-        bool,
-        typer.Option(
-            "--set theorem",
-            help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.",
-        ),
-    ] = False,
-    mixing: Annotated[
-        str,
-        typer.Option(
-            "--set mixing",
-            help="diagonal: an input an output; full: inputs of the law, distributed by the "
-            "inverse of C B.",
-        ),
-    ] = "diagonal",
-    accept: Annotated[
-        bool,
-        typer.Option(
-            "--set accept",
-            help="Accept a phase margin below 40 deg, and write gains whose margins fall short.",
-        ),
-    ] = False,
-    check: Annotated[
-        bool,
-        typer.Option(
-            "--check", help="Check the gain set of the scenario instead of selecting one."
-        ),
-    ] = False,
-    page: Annotated[
-        Path | None,
-        typer.Option(
-            "--set page",
-            help="HTML file for the margins with Bode and Nyquist plots: of the engineering "
-            "gains, or with --check.",
-        ),
-    ] = None,
-    guaranteed: Annotated[
-        bool,
-        typer.Option(
-            "--guarantee",
-            help="With --check: what holds for every aircraft within --uncertainty, by a bound.",
-        ),
-    ] = False,
-    worst: Annotated[
-        Path | None,
-        typer.Option(
-            "--set worst",
-            help="With --guarantee: folder for the first unstable aircraft, airframe.yaml and "
-            "scenario.yaml.",
-        ),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+class _Result(NamedTuple):
+    """Gain sets by name with their conditions: of a check, or of a `selection`."""
+
+    answers: dict[str, Assessment]
+    selection: Selection | None = None
+    promise: Guarantee | None = None
+
+    @property
+    def first(self) -> Assessment:
+        return next(iter(self.answers.values()))
+
+    @property
+    def last(self) -> Assessment:
+        return [*self.answers.values()][-1]
+
+    @property
+    def study(self) -> Study:
+        return self.first.study
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
     """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every
     condition on both.
 
@@ -236,95 +113,163 @@ def gains(
     Exit status: 0; 1 if a condition of the loop fails with --check, or an aircraft within
     --uncertainty may be unstable with --guarantee; 2 bad input.
     """
-    console = Console(quiet=as_json)
-    require(
-        not theorem or (write is not None and not observer),
-        "theorem",
-        "it alone",
-        "--write beside it, without --observer",
+
+    airframe: str = argument(
+        "Name of an airframe, or path of an airframe file (.yaml).", default=REQUIRED
     )
-    rate, delay, px4_origin = _loop_of_px4(px4, rate, delay)
-    loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
-    require_guarantee(check=check, guaranteed=guaranteed, worst=worst)
-    promise: Guarantee | None = None
-    answers: dict[str, Assessment]
-    with console.status("selecting gains on uncertain airframes") as status:
-        if check:
-            _require_check_alone(
-                {"--write": write, "--feedforward": feedforward, "--observer": observer}, loop
-            )
-            answer = check_gains(
-                airframe,
-                scenario,
-                uncertainty=uncertainty,
-                gamma_2=gamma_2,
-                samples=samples,
-                seed=seed,
-            )
-            answers = {"scenario": answer}
-            origin = ""
-            if guaranteed:
-                status.update("bounding every aircraft of the box")
-                promise = guarantee(loop_of_effectors(answer, airframe, uncertainty))
-                write_unstable(worst, promise, airframe, scenario)
+    uncertainty: float = option("Largest relative deviation of each entry of A and B.", default=0.3)
+    scenario: str = option(
+        "Scenario with the commands, the gusts and the loop.", default="osprey_servo"
+    )
+    rate: float | None = setting("Rate of the law in Hz; by default that of the scenario.")
+    y_rate: float | None = setting(
+        "Rate of y in Hz: a period above that of the law counts as delay, and y is "
+        "stale after three."
+    )
+    lag: str | None = option("Lags of the actuators in s, in the airframe's order: 0.02,0.1")
+    delay: float | None = option("Pure delay in s; by default that of the scenario.")
+    px4: Path | None = setting(
+        "Parameter file of QGroundControl or ULog of PX4, for the module of export --px4: "
+        "rate and delay of the body rates."
+    )
+    inputs: str | None = setting("Input of each output, in the airframe's order: rudder,aileron")
+    gamma_2: float = setting(
+        "gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.", default=0.0
+    )
+    samples: int = setting(
+        "Number of uncertain airframes for the bounds of the theorem.",
+        default=100,
+        min=0,
+        max=10_000,
+    )
+    seed: int = setting("Seed of the uncertain airframes.", default=1, min=0)
+    write: Path | None = write_option("File for the engineering gains, as a section of a scenario.")
+    feedforward: bool = setting(
+        "Write the airframe too, as the model of the feedforward (an extension).", default=False
+    )
+    observer: bool = option(
+        "Write feedforward and observer, and the gains beside them (an extension).", default=False
+    )
+    model: str | None = setting(
+        "Airframe that the observer takes as its model, as rise-di identify RUN writes it."
+    )
+    margin: float = setting(
+        "Least delay margin of the nominal loop with the observer, s.", default=0.03
+    )
+    speeds: str | None = setting(
+        "With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
+        "schedule that flies them."
+    )
+    phase_margin: float = setting(
+        "Least phase margin of the loop behind servos, deg; 35 or less with the observer.",
+        default=PHASE_MARGIN,
+    )
+    theorem: bool = setting(
+        "With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.", default=False
+    )
+    mixing: str = setting(
+        "diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B.",
+        default="diagonal",
+    )
+    accept: bool = setting(
+        "Accept a phase margin below 40 deg, and write gains whose margins fall short.",
+        default=False,
+    )
+    check: bool = option(
+        "Check the gain set of the scenario instead of selecting one.", default=False
+    )
+    page: Path | None = setting(
+        "HTML file for the margins with Bode and Nyquist plots: of the engineering "
+        "gains, or with --check."
+    )
+    guaranteed: bool = option(
+        "With --check: what holds for every aircraft within --uncertainty, by a bound.",
+        "--guarantee",
+        default=False,
+    )
+    worst: Path | None = setting(
+        "With --guarantee: folder for the first unstable aircraft, airframe.yaml and scenario.yaml."
+    )
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Select or check, write, show."""
+        require(
+            not self.theorem or (self.write is not None and not self.observer),
+            "theorem",
+            "it alone",
+            "--write beside it, without --observer",
+        )
+        require_guarantee(check=self.check, guaranteed=self.guaranteed, worst=self.worst)
+        rate, delay, origin = _loop_of_px4(self.px4, self.rate, self.delay)
+        result = replace(self, rate=rate, delay=delay)._result()
+        if self.page is not None:
+            _write_page(self.page, result.last)
+        if self.as_json:
+            print_json(_as_json(result, self.seed))
         else:
-            selection = select_gains(
-                airframe,
-                scenario,
-                uncertainty=uncertainty,
-                rate=rate,
-                y_rate=y_rate,
-                lag=None if lag is None else _parse_lags(lag),
-                delay=delay,
-                inputs=inputs or (),
-                gamma_2=gamma_2,
-                samples=samples,
-                seed=seed,
-                feedforward=feedforward,
-                observer=observer,
-                model=model,
-                margin=margin,
-                speeds=() if speeds is None else parse_numbers(speeds) or speeds,
-                phase_margin=phase_margin,
-                accept=accept,
-                mixing=mixing,
-                progress=status.update,
-            )
-            engineering = selection.engineering
-            origin = selection.origin
-            answers = (
-                {"observer": engineering}
-                if observer
-                else {"theorem": selection.theorem, "engineering": engineering}
-            )
-            if write is not None:
-                _write_gains(write, selection, theorem=theorem, accept=accept)
-    study = next(iter(answers.values())).study
-    if page is not None:
-        _write_page(page, [*answers.values()][-1])
-    if as_json:
-        bounded = {} if promise is None else {"guarantee": guarantee_as_json(promise)}
-        print_json(_as_json(study, answers, seed) | bounded)
-    else:
-        _show(console, study, answers)
-        show_guarantee(console, promise, next(iter(answers.values())).margins)
-        if not check and not observer and selection.engineering.has_requirement:
-            _show_trade(console, selection)
-        for sentence in filter(None, (origin, px4_origin)):
-            console.print(sentence, highlight=False, soft_wrap=True)
-        for key, path in (("gains", write), ("page", page), ("unstable aircraft", worst)):
-            if path is not None:
-                console.print(f"{key}: {display_path(path)}", highlight=False, soft_wrap=True)
-    unproved = promise is not None and not promise.holds
-    if unproved or (check and failing(answers["scenario"].loop)):
-        raise typer.Exit(CONDITION_FAILS)
+            self._show(Console(), result, origin)
+        unproved = result.promise is not None and not result.promise.holds
+        if unproved or (self.check and failing(result.last.loop)):
+            raise typer.Exit(CONDITION_FAILS)
 
+    def _result(self) -> _Result:
+        """The gain sets with all conditions; selected ones are written."""
+        with Console(quiet=self.as_json).status("selecting gains on uncertain airframes") as status:
+            if self.check:
+                return self._checked(status.update)
+            return self._selected(status.update)
 
-def _write_gains(path: Path, selection: Selection, *, theorem: bool, accept: bool) -> None:
-    """Write the chosen gains; without `accept` those that have the margins alone."""
-    if not accept:
-        _require_margins(selection, theorem=theorem)
-    write_text("--write", path, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem))
+    def _checked(self, progress: Callable[[str], None]) -> _Result:
+        """The gains of the scenario."""
+        beside = "one of them: --check selects nothing to write"
+        require_unused(self, ("write", "feedforward", "observer"), beside, "it beside --check")
+        own_loop = all(value is None for value in values_of(self, *LOOP).values())
+        expected = "the scenario's own rate, lag, delay and inputs"
+        require(own_loop, "--check", "it beside another loop", expected)
+        answer = check_gains(self.airframe, self.scenario, **values_of(self, *STUDY))
+        if not self.guaranteed:
+            return _Result({"scenario": answer})
+        progress("bounding every aircraft of the box")
+        promise = guarantee(loop_of_effectors(answer, self.airframe, self.uncertainty))
+        write_unstable(self.worst, promise, self.airframe, self.scenario)
+        return _Result({"scenario": answer}, promise=promise)
+
+    def _selected(self, progress: Callable[[str], None]) -> _Result:
+        """Gains by Theorem 1 and by the procedure, or those beside an observer."""
+        selection = select_gains(
+            self.airframe,
+            self.scenario,
+            **values_of(self, *STUDY, *SELECTION),
+            lag=None if self.lag is None else _parse_lags(self.lag),
+            inputs=self.inputs or (),
+            speeds=() if self.speeds is None else parse_numbers(self.speeds) or self.speeds,
+            progress=progress,
+        )
+        if self.write is not None:
+            if not self.accept:
+                _require_margins(selection, theorem=self.theorem)
+            text = LICENCE + gain_yaml.as_yaml(selection, theorem=self.theorem)
+            write_text("--write", self.write, text)
+        if self.observer:
+            return _Result({"observer": selection.engineering}, selection)
+        answers = {"theorem": selection.theorem, "engineering": selection.engineering}
+        return _Result(answers, selection)
+
+    def _show(self, console: Console, result: _Result, origin: str) -> None:
+        """Print tables, the trade of a selection, origins and the paths of the files."""
+        selection = result.selection
+        _show_conditions(console, result.study, result.answers)
+        show_guarantee(console, result.promise, result.first.margins)
+        lines = [origin]
+        if selection is not None:
+            lines.insert(0, selection.origin)
+            if not self.observer and selection.engineering.has_requirement:
+                _show_trade(console, selection)
+        files = {"gains": self.write, "page": self.page, "unstable aircraft": self.worst}
+        lines += [f"{key}: {display_path(path)}" for key, path in files.items() if path is not None]
+        for line in filter(None, lines):
+            say(console, line)
 
 
 def _loop_of_px4(
@@ -335,24 +280,6 @@ def _loop_of_px4(
         return rate, delay, ""
     require(delay is None, "px4", "it beside --delay", "one of both")
     return rate_loop(px4, rate)
-
-
-def _require_check_alone(selections: Mapping[str, object], loop: Mapping[str, object]) -> None:
-    """Raise ParameterError for options beside --check that select gains or another loop."""
-    for option, value in selections.items():
-        require(
-            value in (None, False),
-            option,
-            "it beside --check",
-            "one of them: --check selects nothing to write",
-        )
-    own_loop = all(value is None for value in loop.values())
-    require(
-        own_loop,
-        "--check",
-        "it beside another loop",
-        "the scenario's own rate, lag, delay and inputs",
-    )
 
 
 def _write_page(path: Path, answer: Assessment) -> None:
@@ -407,7 +334,8 @@ def _parse_lags(text: str) -> list[float]:
     return values
 
 
-def _show(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
+def _show_conditions(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
+    """Print gains, margins and conditions."""
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
     samples = len(study.A) - 1
@@ -566,7 +494,9 @@ def _cells(condition: Condition) -> tuple[str, str]:
     )
 
 
-def _as_json(study: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
+def _as_json(result: _Result, seed: int) -> dict[str, Any]:
+    study = result.study
+    promise = result.promise
     inputs = list(study.airframe.inputs)
     return {
         "airframe": study.airframe.name,
@@ -575,7 +505,9 @@ def _as_json(study: Study, answers: dict[str, Assessment], seed: int) -> dict[st
         "seed": seed,
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
-    } | {name: _assessment_as_json(study, answer) for name, answer in answers.items()}
+        **{name: _assessment_as_json(study, answer) for name, answer in result.answers.items()},
+        **({} if promise is None else {"guarantee": guarantee_as_json(promise)}),
+    }
 
 
 def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:

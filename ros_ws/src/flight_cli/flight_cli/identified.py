@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
-from flight_analysis.report.summary import display_unit
+from flight_analysis.report.display_units import display_unit
 from flight_cli.gains import speed_of_margin
 from flight_cli.output import new_table, say
 from flight_core.units import si_per_unit

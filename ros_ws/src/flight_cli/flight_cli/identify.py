@@ -5,23 +5,23 @@ airframe from a flight's log.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.jsbsim_aircraft import PREFIX, NamedProperties, named_properties, require_aircraft
+from aircraft_sim.jsbsim_aircraft import PREFIX, named_properties, require_aircraft
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
+from flight_analysis.report.display_units import DisplayUnit, display_unit
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
 from flight_analysis.report.plotting import (
@@ -31,8 +31,7 @@ from flight_analysis.report.plotting import (
     SampleStore,
     time_series_figure,
 )
-from flight_analysis.report.summary import DisplayUnit, display_unit
-from flight_cli.bridge_experiment import identify_behind_bridge
+from flight_cli.bridge_experiment import BridgeExperiment
 from flight_cli.identified import identified_as_json, show_identified
 from flight_cli.log_options import scenario_file, warn_of_lacks
 from flight_cli.output import (
@@ -46,7 +45,15 @@ from flight_cli.output import (
     say,
     write_text,
 )
-from flight_cli.words import WRITE, AsJson, argument, option, setting, warn
+from flight_cli.words import (
+    argument,
+    json_option,
+    option,
+    require_unused,
+    setting,
+    warn,
+    write_option,
+)
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -61,127 +68,24 @@ from flight_design.identification.innovation_filters import Actuation, recording
 from flight_design.identification.manoeuvre import manoeuvre_result
 from flight_design.identification.model_identification import Identification, model_yaml
 from flight_design.identification.model_identification import identify as identify_model
+from flight_design.identification.step_identification import IdentifiedAircraft
 from flight_design.identification.step_identification import identify as identify_aircraft
-from flight_log.tape_reader import read_run
+from flight_log.log_content import StoredFile
+from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3
 REFLY_MARGIN = 0.03  # s. Without A the model of the loop has no damping
 STEP_MARGIN = 0.015  # and less margin than the aircraft.
+OF_LOG = ("scenario", "delay", "namespace", "refly")
+OF_STEPS = ("observer", "guidance", "learn", "command")
+OF_MARGINS = ("phase_margin", "accept")
+"""Fields for a log alone, for step tests alone, and of required margins."""
+BESIDE_BRIDGE = "none beside --bridge"
 
 
-def identify(
-    source: Annotated[
-        str | None,
-        argument(
-            "jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
-            "run, or an MCAP file. None with --bridge alone."
-        ),
-    ] = None,
-    speed: Annotated[float | None, option("True airspeed to trim and fly at, m/s.")] = None,
-    altitude: Annotated[
-        float | None, option("Altitude above sea level to trim and fly at, m.")
-    ] = None,
-    airframe: Annotated[
-        str | None, option("With a log: the nominal airframe, a name or a file (.yaml).")
-    ] = None,
-    write: Annotated[
-        Path | None,
-        option(
-            "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
-            "airframe file for the model, with a page. With --bridge: folder for what flies it.",
-            *WRITE,
-        ),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        setting(
-            "scenario",
-            "With a log: scenario with lags and delay of the controller; by default that "
-            "in the log.",
-        ),
-    ] = None,
-    delay: Annotated[
-        float | None,
-        setting(
-            "delay",
-            "With a log: delay of u, s; by default that of the scenario. One process has none.",
-        ),
-    ] = None,
-    namespace: Annotated[
-        str | None,
-        setting("namespace", "With a log: namespace of the aircraft, if it holds several."),
-    ] = None,
-    refly: Annotated[
-        bool,
-        setting(
-            "refly",
-            "With a log: fly its scenario with feedforward and observer of the model, in process.",
-        ),
-    ] = False,
-    observer: Annotated[
-        bool, option("Of JSBSim: add an extended-state observer from Omega and lags.", "--observer")
-    ] = False,
-    guidance: Annotated[
-        bool,
-        option("Of JSBSim: fly and write guidance by rule in place of the pulses.", "--guidance"),
-    ] = False,
-    learn: Annotated[
-        bool, option("Of JSBSim: write a scenario that learns A and B in flight.", "--learn")
-    ] = False,
-    margin: Annotated[
-        float | None,
-        setting(
-            "margin",
-            "Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.",
-        ),
-    ] = None,
-    bridge: Annotated[
-        str | None,
-        option(
-            "Excite the aircraft behind a channel map, or read the log of such a flight.",
-            metavar="MAP",
-        ),
-    ] = None,
-    amplitude: Annotated[
-        float | None,
-        setting(
-            "amplitude",
-            "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.",
-        ),
-    ] = None,
-    phase_margin: Annotated[
-        float | None,
-        setting(
-            "phase_margin", "Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."
-        ),
-    ] = None,
-    accept: Annotated[
-        bool,
-        setting(
-            "accept",
-            "Accept a phase margin below 40 deg, and gains whose margins fall short.",
-        ),
-    ] = False,
-    commands: Annotated[
-        list[str] | None,
-        setting(
-            "command",
-            "Of JSBSim: a model's own property for an input, and its value at full "
-            "command; repeat for more.",
-            metavar="INPUT:PROPERTY=VALUE",
-        ),
-    ] = None,
-    link_delay: Annotated[
-        float | None,
-        typer.Option(
-            "--set link_delay",
-            help="With --bridge and a log of rise-di import: delay of the link beyond the log, s; "
-            "by default that of the map.",
-        ),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Identify:
     """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a
     flight.
 
@@ -193,246 +97,267 @@ def identify(
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not
     fly.
     """
-    needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
-    log = None if source is None or source.startswith(PREFIX) else Path(source)
-    if bridge is None and log is not None and not log.exists() and speed is not None:
-        log = None  # the name of an aircraft without its prefix
-    aircraft = source if log is None else None
-    if bridge is not None:
-        unused: dict[str, object] = {
-            "aircraft": aircraft,
-            "altitude": altitude,
-            "airframe": airframe,
-            "margin": margin,
-            "scenario": scenario,
-        }
-        unused |= {
-            "delay": delay,
-            "refly": refly,
-            "observer": observer,
-            "guidance": guidance,
-            "learn": learn,
-        }
-        _require_none(
-            unused | {"namespace": namespace, "command": commands}, "none beside --bridge"
+
+    source: str | None = argument(
+        "jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
+        "run, or an MCAP file. None with --bridge alone."
+    )
+    speed: float | None = option("True airspeed to trim and fly at, m/s.")
+    altitude: float | None = option("Altitude above sea level to trim and fly at, m.")
+    airframe: str | None = option("With a log: the nominal airframe, a name or a file (.yaml).")
+    write: Path | None = write_option(
+        "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
+        "airframe file for the model, with a page. With --bridge: folder for what flies it."
+    )
+    scenario: str | None = setting(
+        "With a log: scenario with lags and delay of the controller; by default that in the log."
+    )
+    delay: float | None = setting(
+        "With a log: delay of u, s; by default that of the scenario. One process has none."
+    )
+    namespace: str | None = setting("With a log: namespace of the aircraft, if it holds several.")
+    refly: bool = setting(
+        "With a log: fly its scenario with feedforward and observer of the model, in process.",
+        default=False,
+    )
+    observer: bool = option(
+        "Of JSBSim: add an extended-state observer from Omega and lags.", default=False
+    )
+    guidance: bool = option(
+        "Of JSBSim: fly and write guidance by rule in place of the pulses.", default=False
+    )
+    learn: bool = option(
+        "Of JSBSim: write a scenario that learns A and B in flight.", default=False
+    )
+    margin: float | None = setting(
+        "Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests."
+    )
+    bridge: str | None = option(
+        "Excite the aircraft behind a channel map, or read the log of such a flight.", metavar="MAP"
+    )
+    amplitude: float | None = setting(
+        "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."
+    )
+    phase_margin: float | None = setting(
+        "Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."
+    )
+    accept: bool = setting(
+        "Accept a phase margin below 40 deg, and gains whose margins fall short.", default=False
+    )
+    command: list[str] | None = setting(
+        "Of JSBSim: a model's own property for an input, and its value at full "
+        "command; repeat for more.",
+        metavar="INPUT:PROPERTY=VALUE",
+    )
+    link_delay: float | None = setting(
+        "With --bridge and a log of rise-di import: delay of the link beyond the log, s; "
+        "by default that of the map."
+    )
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Identify by what the source is."""
+        log = self._log()
+        if self.bridge is not None:
+            self._identify_behind_bridge(self.bridge, log)
+            return
+        for name in ("link_delay", "amplitude"):
+            require_unused(self, [name], "--bridge beside it")
+        require(
+            self.margin is None or self.refly or self.observer or self.learn,
+            "margin",
+            self.margin,
+            "--set refly, --observer or --learn beside it",
         )
-        if write is None:
+        require(
+            not (self.observer and self.learn),
+            "observer",
+            "--learn beside it",
+            "one of the two: a learner designs its own observer",
+        )
+        if log is None:
+            self._identify_by_steps()
+        else:
+            self._identify_log(log)
+
+    def _log(self) -> Path | None:
+        """The log that the source is; None for an aircraft or no source."""
+        if self.source is None or self.source.startswith(PREFIX):
+            return None
+        log = Path(self.source)
+        is_name = self.bridge is None and self.speed is not None and not log.exists()
+        return None if is_name else log
+
+    def _needed(self) -> Requirement:
+        """The required margins."""
+        phase_margin = PHASE_MARGIN if self.phase_margin is None else self.phase_margin
+        return requirement(phase_margin, accept=self.accept)
+
+    def _identify_behind_bridge(self, channel_map: str, log: Path | None) -> None:
+        require(log is not None or self.source is None, "aircraft", self.source, BESIDE_BRIDGE)
+        require_unused(self, ("altitude", "airframe", "margin", *OF_LOG, *OF_STEPS), BESIDE_BRIDGE)
+        if self.write is None:
             raise ParameterError(
                 "identify: found too few arguments, expected --write beside --bridge"
             )
+        speed = self.speed
         require(speed is None or 0.0 < speed < math.inf, "speed", f"{speed}", "above 0 m/s")
-        part = AMPLITUDE if amplitude is None else amplitude
+        later = self.link_delay
+        require(later is None or 0.0 <= later < math.inf, "link_delay", later, "0 or more")
+        BridgeExperiment(
+            map_name=channel_map,
+            speed=speed,
+            folder=self.write,
+            amplitude=AMPLITUDE if self.amplitude is None else self.amplitude,
+            log=log,
+            needed=self._needed(),
+            accept=self.accept,
+            link_delay=later,
+        ).identify(as_json=self.as_json)
+
+    def _identify_by_steps(self) -> None:
+        aircraft = self.source
+        if aircraft is None or self.speed is None or self.altitude is None:
+            raise ParameterError(
+                "identify: found too few arguments, expected a log, or an aircraft with --speed "
+                "and --altitude"
+            )
+        require_unused(self, ("airframe", *OF_LOG), "a log in place of the aircraft")
+        name = _jsbsim_name(aircraft)
+        require(0.0 < self.speed < math.inf, "--speed", self.speed, "above 0 m/s")
+        require(0.0 <= self.altitude < math.inf, "--altitude", self.altitude, "0 m or more")
+        path = self._scenario_path(name)
+        console = Console(quiet=self.as_json)
+        identified = self._identified_aircraft(name, self.speed, self.altitude, console)
+        write_text("write", path, identified.text)
+        if self.as_json:
+            print_json(identified_as_json(identified, path))
+        else:
+            show_identified(console, identified)
+            console.print(f"scenario: {display_path(path)}", highlight=False)
+        if identified.failure:
+            warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
+            raise typer.Exit(CANNOT_FLY)
+        if lacking := "" if self.accept else what_lacks(identified.selection):
+            shown = f"{display_path(path)}, which says so in its first line; --set accept takes it"
+            raise ParameterError(f"identify: {lacking}; the gains are in {shown}")
+
+    def _scenario_path(self, name: str) -> Path:
+        """The file of the scenario; --write alone replaces a file."""
+        path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
+        expected = "a file to write over, or another"
+        is_new = self.write is not None or not path.exists()
+        require(is_new, "write", f"none, and {path} exists", expected)
+        require_yaml("write", path)
+        return path
+
+    def _identified_aircraft(
+        self, name: str, speed: float, altitude: float, console: Console
+    ) -> IdentifiedAircraft:
+        """The aircraft by step tests, with gains and a flight; exits without a trim."""
+        margin = STEP_MARGIN if self.margin is None else self.margin
+        texts: dict[str, str] = {}
+        for text in self.command or []:
+            channel, _, paths = text.partition(":")
+            texts[channel] = f"{texts.get(channel, '')} {paths}".strip()
+        try:
+            with console.status("trim") as status:
+                return identify_aircraft(
+                    name,
+                    speed,
+                    altitude,
+                    status.update,
+                    margin if self.observer or self.learn else None,
+                    guided=self.guidance,
+                    learns=self.learn,
+                    needed=self._needed(),
+                    named=named_properties(texts, "--set command"),
+                )
+        except FlightEnded as error:
+            warn(f"error: {error}")
+            raise typer.Exit(CANNOT_FLY) from None
+
+    def _identify_log(self, log: Path) -> None:
+        """Identify a model from a log, show it and write it. Raises ParameterError for a model that
+        is refused.
+        """
+        require_unused(self, ("speed", "altitude", *OF_STEPS, *OF_MARGINS), "none beside a log")
         require(
-            link_delay is None or 0.0 <= link_delay < math.inf,
-            "link_delay",
-            link_delay,
-            "0 or more",
-        )
-        identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept, link_delay)
-        return
-    require(link_delay is None, "link_delay", link_delay, "--bridge beside it")
-    require(amplitude is None, "amplitude", amplitude, "--bridge beside it")
-    require(
-        margin is None or refly or observer or learn,
-        "margin",
-        margin,
-        "--set refly, --observer or --learn beside it",
-    )
-    require(
-        not (observer and learn),
-        "observer",
-        "--learn beside it",
-        "one of the two: a learner designs its own observer",
-    )
-    if log is not None:
-        steps_only: dict[str, object] = {
-            "speed": speed,
-            "altitude": altitude,
-            "observer": observer,
-            "guidance": guidance,
-            "learn": learn,
-        }
-        _require_none(
-            steps_only | {"phase_margin": phase_margin, "accept": accept, "command": commands},
-            "none beside a log",
-        )
-        require(
-            airframe is not None,
+            self.airframe is not None,
             "airframe",
             "none",
             "the nominal airframe of the log, a name or a file (.yaml)",
         )
-        nominal = load_airframe(airframe or "")
-        refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None
-        _identify_log(
-            _Source(log, scenario, delay, namespace), nominal, write, refly_margin, as_json
-        )
-    elif aircraft is None or speed is None or altitude is None:
-        raise ParameterError(
-            "identify: found too few arguments, expected a log, or an aircraft with --speed and "
-            "--altitude"
-        )
-    else:
-        log_only = {
-            "airframe": airframe,
-            "scenario": scenario,
-            "delay": delay,
-            "namespace": namespace,
-            "refly": refly,
-        }
-        _require_none(log_only, "a log in place of the aircraft")
-        observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
-        texts: dict[str, str] = {}
-        for text in commands or []:
-            name, _, paths = text.partition(":")
-            texts[name] = f"{texts.get(name, '')} {paths}".strip()
-        flown = _Flown(observer_margin, guidance, learn, named_properties(texts, "--set command"))
-        _identify_by_steps(aircraft, speed, altitude, write, flown, as_json, needed, accept)
+        nominal = load_airframe(self.airframe or "")
+        if self.write is not None:
+            require_yaml("--write", self.write)
+        recorded = read_run(log, self.namespace, scenario_file(self.scenario))
+        recorded.require()
+        warn_of_lacks(recorded)
+        if recorded.scenario is None:
+            raise ParameterError(
+                f"{log}: found a log without its scenario, expected --set scenario=NAME with the "
+                "controller's lags"
+            )
+        console = Console(quiet=self.as_json)
+        identification = self._identified_model(recorded, recorded.scenario, nominal)
+        _show_model(console, identification)
+        if identification.refusal:
+            raise ParameterError(f"{log}: {identification.refusal}")
+        if self.write is not None:
+            _write_model(console, identification, log, self.write)
+        again = None
+        if self.refly:
+            with console.status("flying with the model"):
+                again = _refly(
+                    recorded_scenario(recorded.scenario),
+                    recorded.tape,
+                    identification.airframe,
+                    REFLY_MARGIN if self.margin is None else self.margin,
+                )
+            _show_flights_of_model(console, again, _units(identification))
+        if self.as_json:
+            flown = {} if again is None else {"refly": again._asdict()}
+            print_json(_model_as_json(identification, self.write) | flown)
+
+    def _identified_model(
+        self, recorded: RecordedRun, scenario: StoredFile, nominal: Airframe
+    ) -> Identification:
+        """The model by a search on the log, with a bar."""
+        controller = recorded_parameters(scenario)
+        delay = controller.delay if self.delay is None else self.delay
+        actuation = _actuation(controller, nominal, delay)
+        samples = recording(recorded.tape, nominal)
+        pairing = ChannelPairing(controller.outputs, controller.inputs)
+        with progress_bar(*COUNT_COLUMNS, quiet=self.as_json) as bar:
+            show = partial(bar.update, bar.add_task("search"))
+            identification = identify_model(samples, nominal, actuation, pairing, show)
+            show(completed=1, total=1)
+        return identification
 
 
-def _require_none(values: Mapping[str, object], expected: str) -> None:
-    """Raise ParameterError for the first option with a value."""
-    for name, value in values.items():
-        require(value in (None, False), name, f"{value}", expected)
-
-
-class _Flown(NamedTuple):
-    """What the scenario has beside the gains."""
-
-    observer_margin: float | None  # s; None without an observer
-    guided: bool
-    learns: bool
-    named: tuple[tuple[str, NamedProperties], ...]  # properties of the model by input
-
-
-def _identify_by_steps(
-    airframe: str,
-    speed: float,
-    altitude: float,
-    output: Path | None,
-    flown: _Flown,
-    as_json: bool,
-    needed: Requirement,
-    accept: bool,
-) -> None:
+def _jsbsim_name(aircraft: str) -> str:
+    """The name of an aircraft of JSBSim without its prefix. Raises ParameterError."""
     require(
-        airframe.startswith(PREFIX),
+        aircraft.startswith(PREFIX),
         "aircraft",
-        f"{airframe!r}",
+        f"{aircraft!r}",
         f"an aircraft of JSBSim, {PREFIX}NAME or {PREFIX}PATH",
     )
     try:
-        name = require_aircraft(airframe)
+        return require_aircraft(aircraft)
     except ParameterError as error:  # the option --airframe is that of a log
         raise ParameterError(f"aircraft{str(error).removeprefix('airframe')}") from None
-    require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
-    require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
-    path = output or Path(f"jsbsim_{Path(name).stem}.yaml")
-    require(
-        output is not None or not path.exists(),
-        "write",
-        f"none, and {path} exists",
-        "a file to write over, or another",
+
+
+def _write_model(console: Console, identification: Identification, log: Path, path: Path) -> None:
+    """Write the airframe file and the page of the innovations."""
+    write_text("--write", path, model_yaml(identification, str(log)))
+    page = path.with_suffix(".html")
+    write_text("--write", page, page_html(_innovation_page(identification, log.name)))
+    console.print(
+        f"model: {display_path(path)}, innovations: {display_path(page)}", highlight=False
     )
-    require_yaml("write", path)
-    console = Console(quiet=as_json)
-    try:
-        with console.status("trim") as status:
-            identified = identify_aircraft(
-                name,
-                speed,
-                altitude,
-                status.update,
-                flown.observer_margin,
-                guided=flown.guided,
-                learns=flown.learns,
-                needed=needed,
-                named=flown.named,
-            )
-    except FlightEnded as error:
-        warn(f"error: {error}")
-        raise typer.Exit(CANNOT_FLY) from None
-    write_text("write", path, identified.text)
-    if as_json:
-        print_json(identified_as_json(identified, path))
-    else:
-        show_identified(console, identified)
-        console.print(f"scenario: {display_path(path)}", highlight=False)
-    if identified.failure:
-        warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
-        raise typer.Exit(CANNOT_FLY)
-    if lacking := "" if accept else what_lacks(identified.selection):
-        shown = f"{display_path(path)}, which says so in its first line; --set accept takes it"
-        raise ParameterError(f"identify: {lacking}; the gains are in {shown}")
-
-
-class _Source(NamedTuple):
-    """The log, and what else tells of its flight."""
-
-    log: Path
-    scenario: str | None
-    delay: float | None
-    namespace: str | None
-
-
-def _identify_log(
-    source: _Source,
-    nominal: Airframe,
-    write: Path | None,
-    refly_margin: float | None,
-    as_json: bool,
-) -> None:
-    """Identify a model from a log, show it and write it. Raises ParameterError for a model that is
-    refused.
-    """
-    if write is not None:
-        require_yaml("--write", write)
-    recorded = read_run(source.log, source.namespace, scenario_file(source.scenario))
-    recorded.require()
-    warn_of_lacks(recorded)
-    if recorded.scenario is None:
-        raise ParameterError(
-            f"{source.log}: found a log without its scenario, expected --set scenario=NAME with "
-            "the controller's lags"
-        )
-    controller = recorded_parameters(recorded.scenario)
-    actuation = _actuation(
-        controller, nominal, controller.delay if source.delay is None else source.delay
-    )
-    samples = recording(recorded.tape, nominal)
-    console = Console(quiet=as_json)
-    with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
-        task = bar.add_task("search")
-        show = partial(bar.update, task)
-        identification = identify_model(
-            samples, nominal, actuation, ChannelPairing(controller.outputs, controller.inputs), show
-        )
-        show(completed=1, total=1)
-    _show_model(console, identification)
-    if identification.refusal:
-        raise ParameterError(f"{source.log}: {identification.refusal}")
-    if write is not None:
-        write_text("--write", write, model_yaml(identification, str(source.log)))
-        page = write.with_suffix(".html")
-        write_text("--write", page, page_html(_innovation_page(identification, source.log.name)))
-        console.print(
-            f"model: {display_path(write)}, innovations: {display_path(page)}", highlight=False
-        )
-    again = None
-    if refly_margin is not None:
-        with console.status("flying with the model"):
-            again = _refly(
-                recorded_scenario(recorded.scenario),
-                recorded.tape,
-                identification.airframe,
-                refly_margin,
-            )
-        _show_flights_of_model(console, again, _units(identification))
-    if as_json:
-        print_json(
-            _model_as_json(identification, write)
-            | ({} if again is None else {"refly": again._asdict()})
-        )
 
 
 class _Reflight(NamedTuple):

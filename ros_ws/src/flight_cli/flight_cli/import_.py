@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a bag of y, u and pose from the log of an autopilot."""
 
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
@@ -15,7 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import PROVENANCE, attachments_for
 from flight_cli.output import new_table, say
-from flight_cli.words import argument, option, warn
+from flight_cli.words import REQUIRED, argument, option, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.outcome import IMPORT
 from flight_core.parameters import require
@@ -30,45 +31,8 @@ from flight_log.tape_writer import TapeWriter, write_run
 from flight_log.vehicle_log import Choice, read_foreign_log
 
 
-def import_(
-    log: Annotated[
-        Path, argument("DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.")
-    ],
-    map_name: Annotated[
-        str | None,
-        option("Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP"),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        option(
-            "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "
-            "replay."
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None, option("Folder to create; by default runs/ with the name of the log.")
-    ] = None,
-    start: Annotated[float | None, option("Begin, s since the begin of the log.", "--from")] = None,
-    stop: Annotated[float | None, option("End, s since the begin of the log.", "--until")] = None,
-    servos: Annotated[
-        bool,
-        option(
-            "u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
-            "--servos",
-        ),
-    ] = False,
-    system: Annotated[
-        int | None, option("MAVLink system of a tlog of several; without, the one that flew.")
-    ] = None,
-    instances: Annotated[
-        list[str] | None,
-        option(
-            "Sensor or instance of several, as IMU=1; repeat for more.",
-            "--instance",
-            metavar="MESSAGE=NUMBER",
-        ),
-    ] = None,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Import:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
     By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`,
@@ -78,65 +42,84 @@ def import_(
 
     Exit status: 0, or 2 bad input.
     """
-    for name, value in (("from", start), ("until", stop)):
-        require(value is None or value >= 0.0, name, value, "0 s or more")
-    if (map_name is None) == (scenario is None):
-        raise typer.BadParameter("expected --map MAP or --scenario SCENARIO")
-    folder = output or Path("runs") / log.stem
-    require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
-    if map_name is None:
-        _import_module(log, find_scenario(scenario or ""), folder)
-        return
-    channel_map = load_map(map_name)
-    console = Console()
 
-    def show(rows: list[Agreement]) -> None:
-        headings = ("", "what the log says", "what the map says")
-        table = new_table("", headings, headings, headings)
-        for row in rows:
-            table.add_row(
-                row.what,
-                row.logged or "not recorded",
-                row.mapped,
-                style="bold red" if row.differs else None,
-            )
-        console.print(table)
+    log: Path = argument(
+        "DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.",
+        default=REQUIRED,
+    )
+    map_name: str | None = option(
+        "Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP"
+    )
+    scenario: str | None = option(
+        "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "
+        "replay."
+    )
+    output: Path | None = option("Folder to create; by default runs/ with the name of the log.")
+    start: float | None = option("Begin, s since the begin of the log.", "--from")
+    stop: float | None = option("End, s since the begin of the log.", "--until")
+    servos: bool = option(
+        "u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
+        default=False,
+    )
+    system: int | None = option("MAVLink system of a tlog of several; without, the one that flew.")
+    instances: list[str] | None = option(
+        "Sensor or instance of several, as IMU=1; repeat for more.",
+        "--instance",
+        metavar="MESSAGE=NUMBER",
+    )
 
-    read = read_foreign_log(
-        log, Choice(system, _numbers(instances or []), kind_of_map(channel_map))
-    )
-    tape, parameters, notes = imported(channel_map, read, Window(start, stop), show, servos=servos)
-    with writing("--output", folder, "a folder that can"):
-        folder.mkdir(parents=True)
-        write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
-        records = {
-            IMPORTED: {
-                "log": log.name,
-                "kind": read.kind,
-                "map": channel_map.name,
-                COMPARED: "; ".join(notes),
-            },
-            CHANNEL_UNITS: {
-                name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()
-            },
-        }
-        write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
-    bag = write_run(
-        tape,
-        folder,
-        LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE),
-    )
-    for sentence in notes:
-        warn(f"warning: {sentence}")
-    _show_topics(console, f"{log.name}, {read.kind}", tape)
-    begin = (
-        tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
-    ) / NANOSECONDS
-    length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
-    say(
-        console,
-        f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",
-    )
+    def execute(self) -> None:
+        """Read the log, write the bag, show its topics."""
+        for name, value in (("from", self.start), ("until", self.stop)):
+            require(value is None or value >= 0.0, name, value, "0 s or more")
+        if (self.map_name is None) == (self.scenario is None):
+            raise typer.BadParameter("expected --map MAP or --scenario SCENARIO")
+        folder = self.output or Path("runs") / self.log.stem
+        found = f"{folder}, which exists"
+        require(not folder.exists(), "--output", found, "the name of a new folder")
+        if self.map_name is None:
+            _import_module(self.log, find_scenario(self.scenario or ""), folder)
+        else:
+            self._import_by_map(self.map_name, folder)
+
+    def _import_by_map(self, map_name: str, folder: Path) -> None:
+        """Write y, u and pose by the rows of a channel map."""
+        channel_map = load_map(map_name)
+        console = Console()
+        choice = Choice(self.system, _numbers(self.instances or []), kind_of_map(channel_map))
+        read = read_foreign_log(self.log, choice)
+        show = partial(_show_agreement, console)
+        window = Window(self.start, self.stop)
+        tape, parameters, notes = imported(channel_map, read, window, show, servos=self.servos)
+        source = {"log": self.log.name, "kind": read.kind, "map": channel_map.name}
+        units = {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()}
+        records = {IMPORTED: {**source, COMPARED: "; ".join(notes)}, CHANNEL_UNITS: units}
+        with writing("--output", folder, "a folder that can"):
+            folder.mkdir(parents=True)
+            write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
+            write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
+        files = (folder / PARAMETERS, find_map(map_name))
+        bag = write_run(tape, folder, LogAttachments(None, files, folder / PROVENANCE))
+        for sentence in notes:
+            warn(f"warning: {sentence}")
+        _show_topics(console, f"{self.log.name}, {read.kind}", tape)
+        log_start_ns = read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
+        begin = (tape.start_ns - log_start_ns) / NANOSECONDS
+        length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
+        say(
+            console,
+            f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",
+        )
+
+
+def _show_agreement(console: Console, rows: list[Agreement]) -> None:
+    """What log and map say of the same settings."""
+    headings = ("", "what the log says", "what the map says")
+    table = new_table("", headings, headings, headings)
+    for row in rows:
+        style = "bold red" if row.differs else None
+        table.add_row(row.what, row.logged or "not recorded", row.mapped, style=style)
+    console.print(table)
 
 
 def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:

@@ -4,8 +4,8 @@
 fleet.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler, rviz, urdf
@@ -14,39 +14,42 @@ from flight_cli.words import argument, option
 from flight_core.files import write_file, writing
 
 
-def layouts(
-    scenario: Annotated[
-        str,
-        argument(
-            "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet."
-        ),
-    ] = "osprey_servo",
-    folder: Annotated[Path, option("Folder to write the files to.")] = Path(),
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Layouts:
     """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz
     with guidance.
     """
-    if is_fleet(scenario):
-        name = Path(scenario).stem
-        scenarios = {member.name: member.scenario for member in read_fleet(scenario).members}
-    else:
-        chosen = find_scenario(scenario)
-        name = chosen.name
-        scenarios = {"": chosen}
-    aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
-    files = {
-        f"{name}.foxglove.json": foxglove(aircraft),
-        f"{name}.plotjuggler.xml": plotjuggler(aircraft),
-    }
-    if guided := [
-        namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None
-    ]:
-        files |= {
-            f"{name}.rviz": rviz(guided, (folder / "aircraft.urdf").absolute()),
-            "aircraft.urdf": urdf(),
+
+    scenario: str = argument(
+        "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.",
+        default="osprey_servo",
+    )
+    folder: Path = option("Folder to write the files to.", default=Path())
+
+    def execute(self) -> None:
+        """Write the files, a line each."""
+        if is_fleet(self.scenario):
+            name = Path(self.scenario).stem
+            members = read_fleet(self.scenario).members
+            scenarios = {member.name: member.scenario for member in members}
+        else:
+            chosen = find_scenario(self.scenario)
+            name = chosen.name
+            scenarios = {"": chosen}
+        aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
+        files = {
+            f"{name}.foxglove.json": foxglove(aircraft),
+            f"{name}.plotjuggler.xml": plotjuggler(aircraft),
         }
-    for file, text in files.items():
-        with writing("folder", folder, "a folder that can"):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_file(folder / file, text)
-        print(folder / file)
+        if guided := [
+            namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None
+        ]:
+            files |= {
+                f"{name}.rviz": rviz(guided, (self.folder / "aircraft.urdf").absolute()),
+                "aircraft.urdf": urdf(),
+            }
+        for file, text in files.items():
+            with writing("folder", self.folder, "a folder that can"):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_file(self.folder / file, text)
+            print(self.folder / file)

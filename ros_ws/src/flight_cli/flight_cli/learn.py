@@ -4,8 +4,8 @@
 model.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,9 +13,9 @@ from rich.markup import escape
 
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
+from flight_analysis.report.display_units import display_units
 from flight_analysis.report.run_folder import log_account
-from flight_analysis.report.summary import display_units
-from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
+from flight_cli.log_options import log_namespace, log_scenario, scenario_file, warn_of_lacks
 from flight_cli.output import (
     LATEST,
     entries_as_json,
@@ -26,8 +26,8 @@ from flight_cli.output import (
     say,
     write_text,
 )
-from flight_cli.settings import Settings, with_settings
-from flight_cli.words import WRITE, AsJson, argument, option
+from flight_cli.settings import settings_option, with_settings
+from flight_cli.words import argument, json_option, write_option
 from flight_core.files import display_path
 from flight_core.text import printable
 from flight_design.learning.scenario_learner import learn_again, learned_yaml
@@ -36,16 +36,8 @@ from flight_log.tape_reader import read_run
 NOTHING_LEARNED = 1
 
 
-def learn(
-    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")] = LATEST,
-    settings: Settings = None,
-    write: Annotated[
-        Path | None, option("File for the learned model, an airframe file.", *WRITE)
-    ] = None,
-    scenario: LogScenario = None,
-    namespace: LogNamespace = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Learn:
     """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set
     controller.learn.*, others.
 
@@ -53,38 +45,48 @@ def learn(
     controller has an observer. With --write the model becomes an airframe file, from which
     `controller.learn.prior` starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
     """
-    if write is not None:
-        require_yaml("--write", write)
-    recorded = read_run(run, namespace, scenario_file(scenario))
-    recorded.require()
-    warn_of_lacks(recorded)
-    flown = recorded_scenario(recorded)
-    others = with_settings(flown, settings)
-    console = Console(quiet=as_json)
-    with console.status(f"learning from {printable(str(run))}"):
-        result = learn_again(recorded.tape, others)
-    for step in result.steps:
-        lead = "" if step.proposed else "no model: "
-        say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
-    account = log_account(recorded)
-    over = "" if account is None else account.over("internals")
-    part = f", {over}" if over else ""
-    if result.entries:
-        console.print(entry_table(f"A and B of the last identification{part}", result.entries))
-    if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
-        console.print(model_table(models, display_units(flown), part))
-    if result.model is not None and write is not None:
-        write_text("--write", write, learned_yaml(result, str(run)))
-        say(console, f"model: {escape(display_path(write))}")
-    if as_json:
-        steps = [step._asdict() for step in result.steps]
-        path = None if result.model is None or write is None else str(write)
-        print_json(
-            {
-                "steps": steps,
-                "entries": entries_as_json(result.entries),
-                "models": models,
-                "model": path,
-            }
-        )
-    raise typer.Exit(NOTHING_LEARNED if result.model is None else 0)
+
+    run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)
+    settings: list[str] | None = settings_option()
+    write: Path | None = write_option("File for the learned model, an airframe file.")
+    scenario: str | None = log_scenario()
+    namespace: str | None = log_namespace()
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Learn again, show the steps, write the model."""
+        if self.write is not None:
+            require_yaml("--write", self.write)
+        recorded = read_run(self.run, self.namespace, scenario_file(self.scenario))
+        recorded.require()
+        warn_of_lacks(recorded)
+        flown = recorded_scenario(recorded)
+        others = with_settings(flown, self.settings)
+        console = Console(quiet=self.as_json)
+        with console.status(f"learning from {printable(str(self.run))}"):
+            result = learn_again(recorded.tape, others)
+        for step in result.steps:
+            lead = "" if step.proposed else "no model: "
+            say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
+        account = log_account(recorded)
+        over = "" if account is None else account.over("internals")
+        part = f", {over}" if over else ""
+        if result.entries:
+            console.print(entry_table(f"A and B of the last identification{part}", result.entries))
+        if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
+            console.print(model_table(models, display_units(flown), part))
+        if result.model is not None and self.write is not None:
+            write_text("--write", self.write, learned_yaml(result, str(self.run)))
+            say(console, f"model: {escape(display_path(self.write))}")
+        if self.as_json:
+            steps = [step._asdict() for step in result.steps]
+            path = None if result.model is None or self.write is None else str(self.write)
+            print_json(
+                {
+                    "steps": steps,
+                    "entries": entries_as_json(result.entries),
+                    "models": models,
+                    "model": path,
+                }
+            )
+        raise typer.Exit(NOTHING_LEARNED if result.model is None else 0)

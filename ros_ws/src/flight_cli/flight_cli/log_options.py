@@ -6,7 +6,7 @@ of several, what it lacks.
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
@@ -15,16 +15,17 @@ from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
 
-LogNamespace = Annotated[
-    str | None, option("Namespace of the aircraft, if the log holds several.", "--namespace")
-]
-LogScenario = Annotated[
-    str | None,
-    option("Scenario of the flight, a name or a file; by default that in the log.", "--scenario"),
-]
-
 REMAP = "A topic of remapped nodes, as in y:=/sensors/y; may be repeated."
-LogRemaps = Annotated[list[str] | None, option(REMAP, "--remap", metavar="NAME:=TOPIC")]
+
+
+def log_namespace() -> Any:
+    """The option --namespace of a command for a log."""
+    return option("Namespace of the aircraft, if the log holds several.")
+
+
+def log_scenario() -> Any:
+    """The option --scenario of a command for a log."""
+    return option("Scenario of the flight, a name or a file; by default that in the log.")
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:

@@ -5,80 +5,80 @@ network between the hosts.
 """
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from flight_cli.words import option
+from flight_cli.words import REQUIRED, option
 from flight_core.environment import require_ros_environment
 from flight_core.installation import require_package
 
 FAILED = 1
 
 
-def network(
-    peers: Annotated[
-        str,
-        option(
-            "IPv4 addresses of all hosts, this one's among them; the same on each host.",
-            metavar="A,B",
-        ),
-    ],
-    write: Annotated[Path, option("File to write the profile to.", metavar="FILE")] = Path(
-        "network.xml"
-    ),
-    check: Annotated[
-        bool,
-        option(
-            "Then wait for the same command on the other hosts: who receives whom, delays, clocks.",
-            "--check",
-        ),
-    ] = False,
-    timeout: Annotated[
-        float, option("How long to wait for the other hosts, s.", min=1.0, max=3600.0)
-    ] = 20.0,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Network:
     """Write the profile of the middleware for nodes on several hosts: unicast between their
     addresses, without multicast.
 
     Exit status: 0 written, and with --check every host receives and is received; 1 a host does not;
     2 bad input.
     """
-    require_package("rclpy", "")
-    require_ros_environment()
-    from flight_bringup.client import NetworkClient, domain_ports, write_profile  # noqa: PLC0415 - loads rclpy
 
-    own_host, hosts, environment = write_profile(peers, write)
-    print(
-        f"{write}: this host is {own_host}. In each shell that starts a node, a flight or a "
-        "tool here:"
+    peers: str = option(
+        "IPv4 addresses of all hosts, this one's among them; the same on each host.",
+        default=REQUIRED,
+        metavar="A,B",
     )
-    print(f"  export {' '.join(f'{name}={value}' for name, value in environment.items())}")
-    if not check:
-        return
-    os.environ.update(environment)
-    others = [address for address in hosts if address != own_host]
-    print(f"waiting for {', '.join(others)}: rise-di network --peers {peers} --check", flush=True)
-    with NetworkClient(own_host, hosts) as client:
-        received, clocks = client.exchange(timeout)
-    first, last = domain_ports()
-    for address in others:
-        if address in clocks:
-            clock = clocks[address]
-            print(
-                f"{address}: received, receives this host; delay {1e3 * clock.delay:.1f} ms, "
-                f"its clock is {clock}"
-            )
-        elif address in received:
-            print(
-                f"{address}: received, does not receive this host: open UDP ports {first} to "
-                f"{last} there"
-            )
-        else:
-            print(
-                f"{address}: not received: start the command there; check the address, and UDP "
-                f"ports {first} to {last} here"
-            )
-    if len(clocks) < len(others):
-        raise typer.Exit(FAILED)
+    write: Path = option(
+        "File to write the profile to.", default=Path("network.xml"), metavar="FILE"
+    )
+    check: bool = option(
+        "Then wait for the same command on the other hosts: who receives whom, delays, clocks.",
+        default=False,
+    )
+    timeout: float = option(
+        "How long to wait for the other hosts, s.", default=20.0, min=1.0, max=3600.0
+    )
+
+    def execute(self) -> None:
+        """Write the profile, and check the network where the user asks."""
+        require_package("rclpy", "")
+        require_ros_environment()
+        from flight_bringup.client import write_profile  # noqa: PLC0415 - loads rclpy
+
+        own_host, hosts, environment = write_profile(self.peers, self.write)
+        print(
+            f"{self.write}: this host is {own_host}. In each shell that starts a node, a flight or "
+            "a tool here:"
+        )
+        print(f"  export {' '.join(f'{name}={value}' for name, value in environment.items())}")
+        if self.check:
+            os.environ.update(environment)
+            self._exchange(own_host, hosts)
+
+    def _exchange(self, own_host: str, hosts: Sequence[str]) -> None:
+        """Wait for the other hosts, and say of each whether both receive."""
+        from flight_bringup.client import NetworkClient, domain_ports  # noqa: PLC0415 - loads rclpy
+
+        others = [address for address in hosts if address != own_host]
+        command = f"rise-di network --peers {self.peers} --check"
+        print(f"waiting for {', '.join(others)}: {command}", flush=True)
+        with NetworkClient(own_host, hosts) as client:
+            received, clocks = client.exchange(self.timeout)
+        ports = "UDP ports {} to {}".format(*domain_ports())
+        for address in others:
+            if address in clocks:
+                clock = clocks[address]
+                found = f"received, receives this host; delay {1e3 * clock.delay:.1f} ms, "
+                found += f"its clock is {clock}"
+            elif address in received:
+                found = f"received, does not receive this host: open {ports} there"
+            else:
+                found = "not received: start the command there; check the address, and "
+                found += f"{ports} here"
+            print(f"{address}: {found}")
+        if len(clocks) < len(others):
+            raise typer.Exit(FAILED)

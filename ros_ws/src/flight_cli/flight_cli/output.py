@@ -23,26 +23,30 @@ from rich.progress import (
 from rich.table import Table
 
 from flight_analysis.closed_loop.learning_loop import Entry
-from flight_analysis.report.guided import leg_results
-from flight_analysis.report.summary import (
-    ERROR_COLUMNS,
-    INPUT_COLUMNS,
+from flight_analysis.report.display_units import (
     QUANTITY_UNITS,
-    SATURATION_COLUMN,
-    Column,
     DisplayUnit,
-    RecordedFlight,
-    columns_of,
-    command_results,
-    finite_or_null,
     format_seconds,
     format_value,
-    input_rows,
-    model_rows,
+)
+from flight_analysis.report.guided import leg_results
+from flight_analysis.report.summary import (
+    RecordedFlight,
+    command_results,
+    finite_or_null,
     parts_legend,
-    table_rows,
     taken_over,
     time_flown,
+)
+from flight_analysis.report.summary_rows import (
+    ERROR_COLUMNS,
+    INPUT_COLUMNS,
+    SATURATION_COLUMN,
+    Column,
+    columns_of,
+    input_rows,
+    model_rows,
+    table_rows,
 )
 from flight_core.files import write_file, writing
 from flight_core.parameters import require

@@ -5,17 +5,17 @@ test.
 """
 
 import math
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
 
-from flight_cli.log_options import LogNamespace, warn_of_lacks_in
+from flight_cli.log_options import log_namespace, warn_of_lacks_in
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
-from flight_cli.words import argument, option, warn
+from flight_cli.words import REQUIRED, argument, option, warn
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
 from flight_core.text import printable
-from flight_log.playback import SHARED, read_playback
+from flight_log.playback import SHARED, Playback, read_playback
 from flight_log.tape_reader import listed
 
 
@@ -26,23 +26,8 @@ class Stamps(StrEnum):
     RECORDED = "recorded"
 
 
-def play(
-    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")],
-    topics: Annotated[
-        str, option("Topics, as in y,y_m; by default all but those of every node.")
-    ] = "",
-    rate: Annotated[float, option("Factor to real time.", min=0.01, max=100.0)] = 1.0,
-    start: Annotated[float, option("Flight time to start at, s.", min=0.0)] = 0.0,
-    loop: Annotated[bool, option("Repeat until Ctrl-C.", "--loop")] = False,
-    stamps: Annotated[
-        Stamps,
-        option(
-            "now: moved to the present, as a controller in real time needs them; recorded: "
-            "unchanged."
-        ),
-    ] = Stamps.NOW,
-    namespace: LogNamespace = None,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Play:
     """Publish the topics of a recorded flight again with their timing, and /clock with the time of
     the log.
 
@@ -50,42 +35,64 @@ def play(
     is refused. A warning names the skipped topics: without CDR, or of a message type that is not
     installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
-    for name, value in (("--rate", rate), ("--start", start)):
-        require(math.isfinite(value), name, value, "a number")  # NaN passes the ranges above
-    names = [name.strip() for name in topics.split(",") if name.strip()]
-    playback = read_playback(run, names, start, namespace)
-    warn_of_lacks_in(run, namespace)
-    require_ros_environment()
-    from flight_bringup.player import Player, unsendable  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    end = playback.t(playback.messages[-1].due_ns)
-    skipped = {**playback.skipped, **({} if names else unsendable(playback.types))}
-    types = {topic: name for topic, name in playback.types.items() if topic not in skipped}
-    require(
-        bool(types),
-        str(run),
-        f"no topic to play among {listed(skipped)}",
-        "a topic whose message type is installed",
+    run: Path = argument("Folder of a run, or an MCAP file.", default=REQUIRED)
+    topics: str = option("Topics, as in y,y_m; by default all but those of every node.", default="")
+    rate: float = option("Factor to real time.", default=1.0, min=0.01, max=100.0)
+    start: float = option("Flight time to start at, s.", default=0.0, min=0.0)
+    loop: bool = option("Repeat until Ctrl-C.", default=False)
+    stamps: Stamps = option(
+        "now: moved to the present, as a controller in real time needs them; recorded: unchanged.",
+        default=Stamps.NOW,
     )
-    if skipped:
-        warn(
-            f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type "
-            "that is not installed"
-        )
-    messages = [message for message in playback.messages if message.topic in types]
-    with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
-        task = bar.add_task(
-            "play", total=end - start, clock="", shown=f"{', '.join(types)}, stamps {stamps}"
-        )
+    namespace: str | None = log_namespace()
 
-        def progress(due_ns: int) -> None:
-            t = playback.t(due_ns)
-            bar.update(
-                task, completed=t - start, clock=f"t = {t:5.1f} of {end:.1f} s, {rate:g} times"
+    def execute(self) -> None:
+        """Play until the end of the log, or until Ctrl-C."""
+        for name, value in (("--rate", self.rate), ("--start", self.start)):
+            require(math.isfinite(value), name, value, "a number")  # NaN passes the ranges above
+        names = [name.strip() for name in self.topics.split(",") if name.strip()]
+        playback = read_playback(self.run, names, self.start, self.namespace)
+        warn_of_lacks_in(self.run, self.namespace)
+        require_ros_environment()
+        from flight_bringup.player import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+        types = self._sendable(playback, every=not names)
+        messages = [message for message in playback.messages if message.topic in types]
+        end = playback.t(playback.messages[-1].due_ns)
+        with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
+            shown = f"{', '.join(types)}, stamps {self.stamps}"
+            task = bar.add_task("play", total=end - self.start, clock="", shown=shown)
+
+            def progress(due_ns: int) -> None:
+                t = playback.t(due_ns)
+                clock = f"t = {t:5.1f} of {end:.1f} s, {self.rate:g} times"
+                bar.update(task, completed=t - self.start, clock=clock)
+
+            while True:
+                now = self.stamps is Stamps.NOW
+                sender.play(messages, self.rate, stamps_now=now, progress=progress)
+                progress(playback.messages[-1].due_ns)
+                if not self.loop:
+                    break
+
+    def _sendable(self, playback: Playback, *, every: bool) -> dict[str, str]:
+        """Message types by topic for sending; a warning names the skipped topics. Raises
+        ParameterError without a topic.
+        """
+        from flight_bringup.player import unsendable  # noqa: PLC0415 - as above
+
+        skipped = {**playback.skipped, **(unsendable(playback.types) if every else {})}
+        types = {topic: name for topic, name in playback.types.items() if topic not in skipped}
+        require(
+            bool(types),
+            str(self.run),
+            f"no topic to play among {listed(skipped)}",
+            "a topic whose message type is installed",
+        )
+        if skipped:
+            warn(
+                f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type "
+                "that is not installed"
             )
-
-        while True:
-            sender.play(messages, rate, stamps_now=stamps is Stamps.NOW, progress=progress)
-            progress(playback.messages[-1].due_ns)
-            if not loop:
-                break
+        return types

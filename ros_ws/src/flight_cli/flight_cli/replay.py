@@ -4,13 +4,15 @@
 in open loop.
 """
 
-import csv
 import io
 import math
 from collections import Counter
+from collections.abc import Sequence
+from csv import writer as csv_writer
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
@@ -22,16 +24,16 @@ from flight_analysis.closed_loop.replay import (
     ReplayResult,
     recorded_parameters,
     recorded_scenario,
-    vary,
 )
 from flight_analysis.closed_loop.replay import replay as recompute
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
-from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
+from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
-from flight_cli.settings import Settings, parse_settings
-from flight_cli.words import AsJson, argument, option
+from flight_cli.settings import parse_settings, settings_option
+from flight_cli.words import argument, json_option, option
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -40,18 +42,8 @@ from flight_log.tape_reader import read_run
 DIFFERS = 1
 
 
-def replay(
-    run: Annotated[Path, argument("Folder of a run, or an MCAP file.")] = LATEST,
-    settings: Settings = None,
-    scenario: LogScenario = None,
-    namespace: LogNamespace = None,
-    remap: LogRemaps = None,
-    csv_file: Annotated[
-        Path | None,
-        option("CSV file for u as recorded and as computed; - for standard output.", "--csv"),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Replay:
     """Compute every tick of a recorded flight again, and every step of guidance, and compare it
     with the log bit by bit.
 
@@ -60,50 +52,77 @@ def replay(
     parameters, 2 bad input, 4 every bit equal, and less than 99 % of the ticks are in the log with
     y and u.
     """
-    changes = parse_settings(settings, "controller")
-    changed = {name.removeprefix("controller."): value for name, value in changes.items()}
-    scenario_source = scenario_file(scenario)
-    with Console(stderr=True, quiet=as_json).status(f"computing {printable(str(run))} again"):
-        recorded = read_run(run, namespace, scenario_source, remaps_of(remap))
-        recorded.require()
-        parameters = recorded_parameters(recorded.scenario_file())
-        others = vary(parameters, changed) if changed else None
-        result = recompute(recorded, parameters, others)
-        guided = None
-        if others is None and "guidance" in recorded.tape:
-            guided = replay_guidance(recorded.tape, recorded_scenario(recorded).guidance)
-    require(
-        bool(result.checked.any()),
-        str(run),
-        "no tick that could be checked",
-        "a log with two successive ticks",
-    )
-    if csv_file is not None:
-        _write_csv(csv_file, result, parameters.inputs)
-    account = log_account(recorded)
-    lacks = () if account is None else account.notes()
-    ticks = max(
-        len(result.number), 0 if account is None else account.topics["internals"].expected or 0
-    )
-    notes = (
-        *recorded.tape.notes,
-        *lacks,
-        *result.notes,
-        *_parameter_notes(result, open_loop=others is not None),
-    )
-    notes += () if guided is None else guided.notes
-    with stdout_for(csv_file):
-        if as_json:
-            guidance_json = None if guided is None else _guidance_as_json(guided)
-            replay_json = _as_json(result, notes, parameters.inputs, settings or [])
-            print_json({**replay_json, "expected": ticks, "guidance": guidance_json})
-        else:
-            _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
-            if guided is not None:
-                _show_guidance(guided)
-    equal = result.equal() and (guided is None or guided.equal())
-    part = STATUS_INCOMPLETE if result.compared.sum() < WHOLE * ticks else 0
-    raise typer.Exit(part if equal else DIFFERS)
+
+    run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)
+    settings: list[str] | None = settings_option()
+    scenario: str | None = log_scenario()
+    namespace: str | None = log_namespace()
+    remap: list[str] | None = option(REMAP, metavar="NAME:=TOPIC")
+    csv: Path | None = option("CSV file for u as recorded and as computed; - for standard output.")
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Compute every tick again, show what differs, exit with the status."""
+        changes = parse_settings(self.settings, "controller")
+        changed = {name.removeprefix("controller."): value for name, value in changes.items()}
+        source = scenario_file(self.scenario)
+        name = printable(str(self.run))
+        with Console(stderr=True, quiet=self.as_json).status(f"computing {name} again"):
+            recorded = read_run(self.run, self.namespace, source, remaps_of(self.remap))
+            recorded.require()
+            parameters = recorded_parameters(recorded.scenario_file())
+            others = vary(parameters, changed) if changed else None
+            result = recompute(recorded, parameters, others)
+            guided = None
+            if others is None and "guidance" in recorded.tape:
+                guided = replay_guidance(recorded.tape, recorded_scenario(recorded).guidance)
+        checked = bool(result.checked.any())
+        expected = "a log with two successive ticks"
+        require(checked, str(self.run), "no tick that could be checked", expected)
+        if self.csv is not None:
+            _write_csv(self.csv, result, parameters.inputs)
+        account = log_account(recorded)
+        counted = None if account is None else account.topics["internals"].expected
+        shown = Shown(
+            result,
+            parameters.inputs,
+            ticks=max(len(result.number), counted or 0),
+            open_loop=others is not None,
+            guided=guided,
+        )
+        lacks = () if account is None else account.notes()
+        notes = (*recorded.tape.notes, *lacks, *shown.notes())
+        with stdout_for(self.csv):
+            if self.as_json:
+                print_json(_as_json(shown, notes, self.settings or []))
+            else:
+                _show(shown, notes)
+        equal = result.equal() and (guided is None or guided.equal())
+        part = STATUS_INCOMPLETE if result.compared.sum() < WHOLE * shown.ticks else 0
+        raise typer.Exit(part if equal else DIFFERS)
+
+
+class Shown(NamedTuple):
+    """Ticks computed again, and steps of guidance of a guided flight."""
+
+    result: ReplayResult
+    inputs: tuple[str, ...]
+    ticks: int  # flown; the log may lack some
+    open_loop: bool  # with other parameters
+    guided: GuidanceReplay | None
+
+    def notes(self) -> list[str]:
+        """Notes of the computation, and a note on ticks with other parameters than the log."""
+        result = self.result
+        notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
+        rows = np.flatnonzero(result.other_parameters)
+        if not self.open_loop and len(rows):
+            begin = f"from tick {result.number[rows[0]]} at t = {result.t[rows[0]]:.6g} s on"
+            why = "changed in flight (`ros2 param set`), or set on the command line of the node"
+            notes.append(
+                f"{len(rows)} ticks, {begin}, flew with other parameters than the log holds: {why}"
+            )
+        return notes
 
 
 def _show_guidance(guided: GuidanceReplay) -> None:
@@ -139,58 +158,36 @@ def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
     }
 
 
-def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:
-    """A note for ticks that flew with other parameters than those of the log."""
-    rows = np.flatnonzero(result.other_parameters)
-    if open_loop or len(rows) == 0:
-        return []
-    first = rows[0]
-    since = f"{len(rows)} ticks, from tick {result.number[first]} at t = {result.t[first]:.6g} s on"
-    why = "changed in flight (`ros2 param set`), or set on the command line of the node"
-    return [f"{since}, flew with other parameters than the log holds: {why}"]
-
-
-def _show(
-    result: ReplayResult,
-    notes: tuple[str, ...],
-    inputs: tuple[str, ...],
-    ticks: int,
-    *,
-    open_loop: bool,
-) -> None:
+def _show(shown: Shown, notes: Sequence[str]) -> None:
     console = Console(soft_wrap=True, highlight=False)
+    result = shown.result
     first = result.first()
     checked = int(result.compared.sum())
-    summary = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
+    summary = f"{checked} ticks"
+    if checked != shown.ticks:
+        summary = f"{checked} of {shown.ticks} ticks checked"
     if first is None:
-        console.print(
-            (
-                f"{summary}, every bit equal"
-                if checked
-                else f"{summary}: the log holds no tick with y and u"
-            )
-            + (", yet with other parameters" if result.other_parameters.any() else "")
-        )
+        equal = ", every bit equal" if checked else ": the log holds no tick with y and u"
+        others = ", yet with other parameters" if result.other_parameters.any() else ""
+        console.print(f"{summary}{equal}{others}")
     else:
-        different = result.different()
-        rows = np.flatnonzero(different.any(axis=1))
+        rows = np.flatnonzero(result.different().any(axis=1))
         console.print(
             f"tick {first.number} differs first, at t = {first.t:.6g} s: {_difference(first)}"
         )
-        by_group = ", ".join(
-            f"{name} in {count}" for name, count in _count_by_group(result).items()
-        )
-        console.print(
-            f"{summary}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}"
-        )
-    if open_loop:
+        groups = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
+        last = result.t[rows[-1]]
+        console.print(f"{summary}, {len(rows)} differ, the last at t = {last:.6g} s; {groups}")
+    if shown.open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
         table = new_table("u computed minus u recorded", headings)
-        for name, figures in _u_figures(result, inputs).items():
+        for name, figures in _u_figures(result, shown.inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
         console.print(table)
     for note in notes:
         console.print(f"note: {note}")
+    if shown.guided is not None:
+        _show_guidance(shown.guided)
 
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
@@ -225,9 +222,9 @@ def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[
     return figures
 
 
-def _as_json(
-    result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], settings: list[str]
-) -> dict[str, Any]:
+def _as_json(shown: Shown, notes: Sequence[str], settings: list[str]) -> dict[str, Any]:
+    result = shown.result
+    guided = shown.guided
     first = result.first()
     return {
         "open_loop": bool(settings),
@@ -239,8 +236,10 @@ def _as_json(
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
         "first": None if first is None else {**first._asdict(), "ulps": first.ulps},
-        "u_difference": _u_figures(result, inputs),
+        "u_difference": _u_figures(result, shown.inputs),
         "notes": list(notes),
+        "expected": shown.ticks,
+        "guidance": None if guided is None else _guidance_as_json(guided),
     }
 
 
@@ -250,7 +249,7 @@ def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> Non
     """
     columns = [result.names.index(f"u.{name}") for name in inputs]
     text = io.StringIO(newline="")
-    writer = csv.writer(text)
+    writer = csv_writer(text)
     writer.writerow(
         [
             "number",

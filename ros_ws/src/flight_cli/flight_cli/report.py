@@ -3,8 +3,8 @@
 """`rise-di report`: tables, report page, figures and data of recorded runs."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,70 +13,20 @@ from flight_analysis.report import comparison
 from flight_analysis.report.export import signal_table
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
-from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight, taken_over
-from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
+from flight_analysis.report.summary import RecordedFlight, taken_over
+from flight_analysis.report.summary_rows import ERROR_COLUMNS
+from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, STDOUT, new_table, print_json, say, show_flight, stdout_for
 from flight_cli.repair import repair_log
-from flight_cli.words import AsJson, argument, option, setting
+from flight_cli.words import argument, json_option, option, setting, values_of
 from flight_core.files import display_path
 from flight_core.outcome import STATUS_INCOMPLETE
 
+FILES = ("html", "output", "png", "parquet", "figure", "mat", "tables", "latex")
 
-def report(
-    runs: Annotated[
-        list[Path] | None,
-        argument("Folder of a run, by default runs/latest; several are compared with the first."),
-    ] = None,
-    html: Annotated[
-        Path | None,
-        setting("html", "Page of a comparison; by default comparison.html beside run 1."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        setting(
-            "output", "Folder for the report of one run, by default that of its log: for archives."
-        ),
-    ] = None,
-    png: Annotated[Path | None, option("Write y over y_m, e and u as one PNG figure.")] = None,
-    csv: Annotated[
-        Path | None,
-        option(
-            "Write all signals as CSV, one row an instant, one column a channel; - for standard "
-            "output."
-        ),
-    ] = None,
-    parquet: Annotated[Path | None, option("Write the same table as Parquet.")] = None,
-    repair: Annotated[
-        bool,
-        option(
-            "Rebuild each log whose recorder was killed, or that is damaged, and write no report.",
-            "--repair",
-        ),
-    ] = False,
-    scenario: LogScenario = None,
-    namespace: LogNamespace = None,
-    remap: LogRemaps = None,
-    figure: Annotated[
-        Path | None, option("Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
-    ] = None,
-    width: Annotated[str, setting("width", "Width of the figure: 88mm, 3.5in.")] = WIDTH,
-    channels: Annotated[
-        str,
-        setting(
-            "channels",
-            "Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
-            "default each output.",
-        ),
-    ] = "",
-    mat: Annotated[
-        Path | None, setting("mat", "Write all signals as a MAT-file, a structure a topic.")
-    ] = None,
-    tables: Annotated[Path | None, setting("tables", "Folder for a CSV a topic.")] = None,
-    latex: Annotated[
-        Path | None, setting("latex", "Write the tables of errors and inputs as LaTeX.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
     """Write the report page of a recorded run again, or one that compares several, and print its
     tables.
 
@@ -84,43 +34,75 @@ def report(
     metadata.yaml. The damaged file stays as *.damaged, an intact log as it is, and metadata.yaml of
     another program is never replaced. Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
-    if repair:
-        for run in runs or [LATEST]:
-            repair_log(run)
-        return
-    scenario_source = scenario_file(scenario)
-    page, flights = write_report(
-        *(runs or [LATEST]),
-        html=html,
-        output=output,
-        png=png,
-        csv=None if csv == STDOUT else csv,
-        parquet=parquet,
-        figure=figure,
-        width=width,
-        channels=channels,
-        mat=mat,
-        tables=tables,
-        latex=latex,
-        namespace=namespace,
-        scenario=scenario_source,
-        remaps=remaps_of(remap),
+
+    runs: list[Path] | None = argument(
+        "Folder of a run, by default runs/latest; several are compared with the first."
     )
-    if csv == STDOUT:
-        print(signal_table(flights).write_csv(), end="")
-    with stdout_for(csv):
-        if as_json:
-            summaries = [flight.summary for flight in flights]
-            print_json(summaries[0] if len(flights) == 1 else summaries)
-        else:
-            if len(flights) == 1:
-                show_flight(Console(), flights[0])
-                print(f"outcome: {flights[0].summary['outcome']}")
+    html: Path | None = setting("Page of a comparison; by default comparison.html beside run 1.")
+    output: Path | None = setting(
+        "Folder for the report of one run, by default that of its log: for archives."
+    )
+    png: Path | None = option("Write y over y_m, e and u as one PNG figure.")
+    csv: Path | None = option(
+        "Write all signals as CSV, one row an instant, one column a channel; - for standard output."
+    )
+    parquet: Path | None = option("Write the same table as Parquet.")
+    repair: bool = option(
+        "Rebuild each log whose recorder was killed, or that is damaged, and write no report.",
+        default=False,
+    )
+    scenario: str | None = log_scenario()
+    namespace: str | None = log_namespace()
+    remap: list[str] | None = option(REMAP, metavar="NAME:=TOPIC")
+    figure: Path | None = option(
+        "Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png."
+    )
+    width: str = setting("Width of the figure: 88mm, 3.5in.", default=WIDTH)
+    channels: str = setting(
+        "Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
+        "default each output.",
+        default="",
+    )
+    mat: Path | None = setting("Write all signals as a MAT-file, a structure a topic.")
+    tables: Path | None = setting("Folder for a CSV a topic.")
+    latex: Path | None = setting("Write the tables of errors and inputs as LaTeX.")
+    as_json: bool = json_option()
+
+    def execute(self) -> None:
+        """Write the report, or repair the logs, and print the tables."""
+        runs = self.runs or [LATEST]
+        if self.repair:
+            for run in runs:
+                repair_log(run)
+            return
+        page, flights = write_report(
+            *runs,
+            **values_of(self, *FILES, "width", "channels", "namespace"),
+            csv=None if self.csv == STDOUT else self.csv,
+            scenario=scenario_file(self.scenario),
+            remaps=remaps_of(self.remap),
+        )
+        if self.csv == STDOUT:
+            print(signal_table(flights).write_csv(), end="")
+        with stdout_for(self.csv):
+            if self.as_json:
+                summaries = [flight.summary for flight in flights]
+                print_json(summaries[0] if len(flights) == 1 else summaries)
             else:
-                show_comparison(Console(), flights)
-            print(f"report:  {display_path(page)}")
-    if any(flight.summary["account"] and flight.summary["account"]["lacks"] for flight in flights):
-        raise typer.Exit(STATUS_INCOMPLETE)
+                _show(flights)
+                print(f"report:  {display_path(page)}")
+        accounts = [flight.summary["account"] for flight in flights]
+        if any(account and account["lacks"] for account in accounts):
+            raise typer.Exit(STATUS_INCOMPLETE)
+
+
+def _show(flights: Sequence[RecordedFlight]) -> None:
+    """Print the tables of a flight, or a comparison."""
+    if len(flights) > 1:
+        show_comparison(Console(), flights)
+        return
+    show_flight(Console(), flights[0])
+    print(f"outcome: {flights[0].summary['outcome']}")
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:

@@ -3,67 +3,58 @@
 """The options of the commands that read a route file."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, overload
+from typing import overload
 
 from flight_cli.output import parse_numbers
 from flight_cli.words import setting, warn
 from flight_core.parameters import require
 from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
-Altitude = Annotated[
-    float | None,
-    setting(
-        "route.altitude",
-        "Altitude of a route without, or of the ground or home that it counts from, m.",
-    ),
-]
-OriginOfRoute = Annotated[
-    str | None,
-    setting(
-        "route.origin",
+
+@dataclass(frozen=True, kw_only=True)
+class RouteWords:
+    """The words of the commands that read a route file."""
+
+    origin: str | None = setting(
         "Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
+        "route.origin",
         metavar="LAT,LON",
-    ),
-]
-Simplify = Annotated[
-    float,
-    setting(
-        "route.simplify",
-        "Leave out positions of a route within this distance of the line without them, m.",
-        min=0.0,
-    ),
-]
-Line = Annotated[
-    str | None,
-    setting(
-        "route.line",
-        "Which line of a file with several: a number from 1 on, or a name.",
-        metavar="LINE",
-    ),
-]
-
-
-def read_waypoints(
-    file: Path,
-    origin: str | None,
-    altitude: float | None,
-    simplify: float,
-    line: str | None,
-    *,
-    above_sea: bool | None,
-) -> tuple[Waypoint, ...]:
-    """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as
-    `read_route_file`.
-    """
-    require(altitude is None or math.isfinite(altitude), "route.altitude", altitude, "a number")
-    require(math.isfinite(simplify), "route.simplify", simplify, "a number")
-    route = read_route_file(
-        file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line
     )
-    for note in route.notes:
-        warn(f"note: {note}")
-    return route.waypoints
+    altitude: float | None = setting(
+        "Altitude of a route without, or of the ground or home that it counts from, m.",
+        "route.altitude",
+    )
+    simplify: float = setting(
+        "Leave out positions of a route within this distance of the line without them, m.",
+        "route.simplify",
+        default=0.0,
+        min=0.0,
+    )
+    line: str | None = setting(
+        "Which line of a file with several: a number from 1 on, or a name.",
+        "route.line",
+        metavar="LINE",
+    )
+
+    def read_waypoints(self, file: Path, *, above_sea: bool | None) -> tuple[Waypoint, ...]:
+        """The waypoints of a route file; notes on the rest of the file go to standard error. Raises
+        as `read_route_file`.
+        """
+        for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
+            require(value is None or math.isfinite(value), f"route.{key}", value, "a number")
+        route = read_route_file(
+            file,
+            parse_origin(self.origin),
+            self.altitude,
+            self.simplify,
+            above_sea=above_sea,
+            line=self.line,
+        )
+        for note in route.notes:
+            warn(f"note: {note}")
+        return route.waypoints
 
 
 @overload

@@ -4,21 +4,18 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_cli.words import option
 from flight_core.files import parse_yaml
 from flight_core.parameters import Config, nest, require
 
-Settings = Annotated[
-    list[str] | None,
-    option(
-        "A parameter to change, as in controller.k_g=2.0; may be repeated.",
-        "--set",
-        metavar="KEY=VALUE",
-    ),
-]
+
+def settings_option() -> Any:
+    """The option --set of parameters by key."""
+    text = "A parameter to change, as in controller.k_g=2.0; may be repeated."
+    return option(text, "--set", metavar="KEY=VALUE")
 
 
 def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> dict[str, Any]:

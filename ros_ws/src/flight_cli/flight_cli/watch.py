@@ -6,12 +6,12 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from flight_bringup.processes import end_with_parent
 from flight_cli.flightgear import show_in_flightgear
-from flight_cli.log_options import REMAP, LogScenario, remaps_of, scenario_file
+from flight_cli.log_options import REMAP, log_scenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
 from flight_cli.words import argument, option, setting, warn
 from flight_core.environment import require_ros_environment
@@ -32,169 +32,129 @@ from flight_view.watch import (
 )
 
 
-def watch(
-    run: Annotated[
-        list[Path] | None,
-        argument(
-            "Folder of a run, or an MCAP file; by default the run in progress, else the "
-            "last one. The second is a ghost.",
-            metavar="[RUN]...",
-        ),
-    ] = None,
-    fleet: Annotated[
-        bool,
-        option(
-            "Show the aircraft of each RUN on one map, and a choice of them; by default "
-            "the runs in progress.",
-            "--fleet",
-        ),
-    ] = False,
-    port: Annotated[
-        int | None,
-        option(
-            "Port on this host; 0 takes any free one.",
-            min=0,
-            max=65535,
-            show_default=f"{DEFAULT_PORT}",
-        ),
-    ] = None,
-    wait: Annotated[
-        bool, option("Wait for the log of RUN where there is none yet.", "--wait")
-    ] = False,
-    text: Annotated[
-        bool, option("Show the flight in the terminal, without a browser.", "--text")
-    ] = False,
-    foxglove: Annotated[
-        bool,
-        option(
-            "Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.",
-            "--foxglove",
-        ),
-    ] = False,
-    flightgear: Annotated[
-        str | None,
-        option(
-            "Send the pose of a flight in progress to FlightGear instead, as to "
-            "127.0.0.1:5500, with --set origin.",
-            metavar="HOST:PORT",
-        ),
-    ] = None,
-    control: Annotated[
-        bool,
-        option(
-            "Let the page command the flight, with a key that this command prints.", "--control"
-        ),
-    ] = False,
-    control_real: Annotated[
-        bool, setting("real", "As --control, and gains also while a bridge sends to an autopilot.")
-    ] = False,
-    scenario: LogScenario = None,
-    namespace: Annotated[
-        str | None,
-        option(
-            "Namespace of the aircraft: by default the first in the log, with --control the root."
-        ),
-    ] = None,
-    remap: Annotated[list[str] | None, setting("remap", REMAP, metavar="NAME:=TOPIC")] = None,
-    background: Annotated[
-        Path | None,
-        setting(
-            "background",
-            "GeoJSON of lines, polygons and points for the map, with --set origin.",
-            metavar="FILE",
-        ),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        setting(
-            "origin",
-            "Where north and east are 0, for the background and FlightGear.",
-            metavar="LAT,LON",
-        ),
-    ] = None,
-    altitude: Annotated[
-        float,
-        setting(
-            "altitude",
-            "Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
-        ),
-    ] = 0.0,
-    rate: Annotated[
-        float, setting("rate", "Packets a second to FlightGear.", min=1.0, max=100.0)
-    ] = 30.0,
-    runs: Annotated[Path, setting("runs", "Folder of the runs.")] = Path("runs"),
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Watch:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or
     again later.
 
     The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130
     interrupted in the terminal.
     """
-    if flightgear is not None:
+
+    run: list[Path] | None = argument(
+        "Folder of a run, or an MCAP file; by default the run in progress, else the "
+        "last one. The second is a ghost.",
+        metavar="[RUN]...",
+    )
+    fleet: bool = option(
+        "Show the aircraft of each RUN on one map, and a choice of them; by default "
+        "the runs in progress.",
+        default=False,
+    )
+    port: int | None = option(
+        "Port on this host; 0 takes any free one.", min=0, max=65535, show_default=f"{DEFAULT_PORT}"
+    )
+    wait: bool = option("Wait for the log of RUN where there is none yet.", default=False)
+    text: bool = option("Show the flight in the terminal, without a browser.", default=False)
+    foxglove: bool = option(
+        "Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.", default=False
+    )
+    flightgear: str | None = option(
+        "Send the pose of a flight in progress to FlightGear instead, as to "
+        "127.0.0.1:5500, with --set origin.",
+        metavar="HOST:PORT",
+    )
+    control: bool = option(
+        "Let the page command the flight, with a key that this command prints.", default=False
+    )
+    real: bool = setting(
+        "As --control, and gains also while a bridge sends to an autopilot.", default=False
+    )
+    scenario: str | None = log_scenario()
+    namespace: str | None = option(
+        "Namespace of the aircraft: by default the first in the log, with --control the root."
+    )
+    remap: list[str] | None = setting(REMAP, metavar="NAME:=TOPIC")
+    background: Path | None = setting(
+        "GeoJSON of lines, polygons and points for the map, with --set origin.", metavar="FILE"
+    )
+    origin: str | None = setting(
+        "Where north and east are 0, for the background and FlightGear.", metavar="LAT,LON"
+    )
+    altitude: float = setting(
+        "Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
+        default=0.0,
+    )
+    rate: float = setting("Packets a second to FlightGear.", default=30.0, min=1.0, max=100.0)
+    runs: Path = setting("Folder of the runs.", default=Path("runs"))
+
+    def execute(self) -> None:
+        """Serve the page, or show the flight elsewhere, until its end."""
+        if self.flightgear is not None:
+            self._show_in_flightgear(self.flightgear)
+            return
+        self._require_one_view()
+        remaps = remaps_of(self.remap)
+        file = scenario_file(self.scenario)
+        chosen = self.run or self._runs_in_progress()
+        for folder in chosen if not self.wait else ():
+            require_log(folder, self.namespace, remaps)
+        lines = []
+        if self.background is not None:
+            lines = read_background(self.background, parse_origin(self.origin))
+        if self.foxglove:
+            require(len(chosen) == 1, "--foxglove", "a ghost beside it", "RUN alone")
+            _serve_foxglove(chosen[0], self.port)
+            return
+        scenario = None if file is None else stored_scenario(file)
+        flights = [
+            Flight(folder, namespace=name, scenario=scenario, background=lines, remaps=remaps)
+            for folder in chosen
+            for name in (namespaces(folder) if self.fleet else (self.namespace,))
+        ]
+        if self.text:
+            require(len(chosen) == 1, "--text", "two runs", "one run")
+            show(flights[0])
+            return
+        ports = (DEFAULT_PORT, 0) if self.port is None else (self.port,)
+        if self.control or self.real:
+            _serve_with_control(flights, ports, self.namespace or "", real=self.real)
+        else:
+            serve(flights, ports, _announce, fleet=self.fleet)
+
+    def _show_in_flightgear(self, to: str) -> None:
+        if self.origin is None:
+            raise ParameterError(
+                "flightgear: found no origin, expected --set origin=LAT,LON beside it, where north "
+                "and east are 0"
+            )
+        show_in_flightgear(to, self.origin, self.altitude, self.namespace or "", self.rate)
+
+    def _require_one_view(self) -> None:
+        """Raise ParameterError for contradictory words."""
+        runs = len(self.run or ())
+        controlled = self.control or self.real
         require(
-            origin is not None,
-            "flightgear",
-            "no origin",
-            "--set origin=LAT,LON beside it, where north and east are 0",
+            not self.wait or runs > 0,
+            "--wait",
+            "no RUN",
+            "the folder of a run that will be recorded",
         )
-        show_in_flightgear(flightgear, origin or "", altitude, namespace or "", rate)
-        return
-    require(not wait or bool(run), "--wait", "no RUN", "the folder of a run that will be recorded")
-    require(
-        fleet or len(run or ()) < 3,
-        "RUN",
-        f"{len(run or ())} runs",
-        "a run and a ghost, or --fleet",
-    )
-    controlled = control or control_real
-    require(
-        not (fleet and (text or foxglove or controlled)),
-        "--fleet",
-        "--text, --foxglove or --control beside it",
-        "the page",
-    )
-    require(
-        not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two"
-    )
-    remaps = remaps_of(remap)
-    shown_scenario = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
-    chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
-    for folder in chosen:
-        if not wait:
-            require_log(folder, namespace, remaps)
-    require(
-        background is None or not (text or foxglove),
-        "background",
-        "--text or --foxglove beside it",
-        "the page",
-    )
-    lines = [] if background is None else read_background(background, parse_origin(origin))
-    ports = (DEFAULT_PORT, 0) if port is None else (port,)
-    if text:
-        require(len(chosen) == 1, "--text", "two runs", "one run")
-        require(not controlled, "--text", "--control beside it", "one of the two")
-    if foxglove:
-        require(
-            len(chosen) == 1 and not controlled,
-            "--foxglove",
-            "a ghost or --control beside it",
-            "RUN alone",
-        )
-        _serve_foxglove(chosen[0], port)
-        return
-    aircraft: list[tuple[Path, str | None]] = []
-    for folder in chosen:
-        aircraft += [(folder, name) for name in (namespaces(folder) if fleet else (namespace,))]
-    flights = [
-        Flight(folder, namespace=name, scenario=shown_scenario, background=lines, remaps=remaps)
-        for folder, name in aircraft
-    ]
-    if text:
-        show(flights[0])
-    elif controlled:
-        _serve_with_control(flights, ports, namespace or "", real=control_real)
-    else:
-        serve(flights, ports, _announce, fleet=fleet)
+        require(self.fleet or runs < 3, "RUN", f"{runs} runs", "a run and a ghost, or --fleet")
+        found = "--text, --foxglove or --control beside it"
+        paged = not (self.text or self.foxglove or controlled)
+        require(paged or not self.fleet, "--fleet", found, "the page")
+        named = self.fleet and self.namespace is not None
+        require(not named, "--fleet", "--namespace beside it", "one of the two")
+        drawn = self.background is None or not (self.text or self.foxglove)
+        require(drawn, "background", "--text or --foxglove beside it", "the page")
+        for name in ("text", "foxglove"):
+            twice = getattr(self, name) and controlled
+            require(not twice, f"--{name}", "--control beside it", "one of the two")
+
+    def _runs_in_progress(self) -> list[Path]:
+        """The runs to watch without a RUN."""
+        return _in_progress(self.runs) if self.fleet else [_newest(self.runs, self.namespace)]
 
 
 def _in_progress(runs: Path) -> list[Path]:

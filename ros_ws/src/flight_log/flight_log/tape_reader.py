@@ -4,88 +4,48 @@
 ones.
 """
 
-import re
-import shlex
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
-from operator import itemgetter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
-from numpy.typing import NDArray
-
 from flight_core.arguments import FilePath, as_path
-from flight_core.files import is_file, is_folder, parse_yaml, read_file
+from flight_core.files import is_folder, parse_yaml, read_file
 from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS, seconds
+from flight_core.rates import seconds
 from flight_core.scenario_file import A_SCENARIO
-from flight_core.tape import Recording, Signal, Tape, refusal_note
+from flight_core.tape import Signal, Tape, refusal_note
 from flight_core.text import printable
-from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
+from flight_log.age_of_u import age_of_u
 from flight_log.bag import (
     IMPORTED,
-    LOST_MESSAGES,
     OUTCOME,
-    SCENARIO_MEDIA_TYPE,
-    SILENCES,
-    SIMULATED_TIME,
     full_names,
-    stack_topic,
 )
-from flight_log.clock import SINCE_EPOCH_NS, StampClock, leap_note, recording_note, without_leaps
-from flight_log.columns import Columns
-from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
+from flight_log.clock import leap_note, recording_note, without_leaps
+from flight_log.engagements import ENGAGEMENT, Engagement, engagements
 from flight_log.flight_processes import (
     INSTANCE,
-    LOG,
-    READY,
-    ROSOUT,
-    UNNAMED,
     Span,
     flight_processes,
     ready_times,
 )
 from flight_log.latency import TOPICS as TIMED_TOPICS
-from flight_log.latency import Times, latency
-from flight_log.learning_messages import DIAGNOSTIC_ARRAY
+from flight_log.latency import latency
+from flight_log.log_content import ROUTE, LogContent, StoredFile, read_content
 from flight_log.named_vectors import (
     JOINT_STATE,
-    PATH,
-    STAMP,
-    Decoder,
-    Table,
-    decode_routes,
-    decoder,
     flight_start_ns,
-    full_name,
-    stamps_of,
 )
 from flight_log.open_log import (
     A_RUN,
     NAMED,
-    ROSBAG2,
-    log_files,
-    missing_parts,
-    open_scan,
-    plain_batches,
 )
-from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
-from flight_log.scan import MessageBatch
 
 PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
-ROUTE = "route"
-# messages that are decoded together: of 1024, the tables are so large that the memory for each is
-# new
-BATCH = 512
-LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
-RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
-UNSTAMPED = ("route",)  # plans, which are often published without a stamp
 AIRCRAFT_TOPICS = (
     "y",
     "y_m",
@@ -94,17 +54,6 @@ AIRCRAFT_TOPICS = (
     "internals",
     "truth",
 )  # a namespace with one of these topics is that of an aircraft
-
-SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
-"""Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path
-to another folder."""
-
-
-class StoredFile(NamedTuple):
-    """A file inside the log."""
-
-    name: str
-    content: bytes
 
 
 class RecordedRun(NamedTuple):
@@ -186,24 +135,13 @@ def read_run(
     replacement = (
         None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     )
-    log = _read(run, full_names(remaps))
+    log = read_content(run, full_names(remaps))
     filled = {
         topic: signal
         for topic, samples in log.topics.items()
         if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
-    nothing = (
-        f"no sample of a flight among {has}"
-        if (has := listed(log.kinds))
-        else "no sample on any topic"
-    )
-    lacks = []
-    for topic, samples in log.topics.items():
-        if unset := samples.recording().unset:
-            lacks.append(f"{topic}: {unset} samples without a usable stamp")
-        if count := samples.refused():
-            lacks.append(refusal_note(topic, count))
-    require(bool(filled), str(run), "; ".join([nothing, *lacks, *log.notes_at(None)]), A_FLIGHT)
+    _require_samples(log, filled, run)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
     require(
@@ -212,59 +150,76 @@ def read_run(
         f"topics that begin with no slash: {', '.join(filled)}",
         "a recorded flight",
     )
-    stamped = names_within(aircraft, log.topics).items()
-    clocks = {
-        printable(name): clock
-        for topic, name in stamped
-        if (clock := log.topics[topic].recording()).found
-    }
-    stored_signals = {printable(name): filled[topic] for topic, name in names.items()}
-    signals, recording, leaps = without_leaps(stored_signals, clocks)
-    start_ns = _start_ns(signals)
-    end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    refused = {
-        printable(name): count for topic, name in stamped if (count := log.topics[topic].refused())
-    }
-    sentences = [refusal_note(name, count) for name, count in refused.items()]
-    sentences += [recording_note(name, clock, start_ns) for name, clock in recording.items()]
-    sentences += [
-        log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS
-    ]
-    notes = [
-        *log.notes_at(end),
-        *(leap_note(leap, start_ns) for leap in leaps),
-        *filter(None, sentences),
-    ]
-    outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
-    spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
-    processes = flight_processes(spans, ready_times(log.lines), aircraft)
     beside = [] if log.scenario else files_beside(run)
-    duration = _duration([*log.attachments, *beside])
-    tape = Tape(
-        signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, duration,
-        processes={printable(name): process for name, process in processes.items()},
-        refused=refused,
-    )  # fmt: skip
-    engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
-    steps = any(recording[name].step_ns for name in TIMED_TOPICS if name in recording)
+    tape = _tape(log, aircraft, names, {name: filled[topic] for topic, name in names.items()})
+    tape = replace(tape, duration=_duration([*log.attachments, *beside]))
+    stepped = any(tape.recording[name].step_ns for name in TIMED_TOPICS if name in tape.recording)
     sent = {topic: times for topic, times in log.sent.items() if names.get(topic) in TIMED_TOPICS}
-    stored = (
-        replacement
-        or log.scenario
-        or next((file for file in beside if file.name != PARAMETERS), None)
-    )
-    ages = age_of_u(log.diagnostics, aircraft)
+    other_files = (file for file in beside if file.name != PARAMETERS)
     return RecordedRun(
         tape,
-        stored,
+        replacement or log.scenario or next(other_files, None),
         log.metadata,
         tuple(log.attachments),
-        None if steps else latency(sent),
-        engaged,
+        None if stepped else latency(sent),
+        engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
         aircraft,
         run,
         log.kinds,
-        ages,
+        age_of_u(log.diagnostics, aircraft),
+    )
+
+
+def _require_samples(log: LogContent, filled: Mapping[str, Signal], run: Path) -> None:
+    """Raise ParameterError for a log without a sample of a flight, with the reasons."""
+    has = listed(log.kinds)
+    lacks = [f"no sample of a flight among {has}" if has else "no sample on any topic"]
+    for topic, samples in log.topics.items():
+        if unset := samples.recording().unset:
+            lacks.append(f"{topic}: {unset} samples without a usable stamp")
+        if count := samples.refused():
+            lacks.append(refusal_note(topic, count))
+    require(bool(filled), str(run), "; ".join([*lacks, *log.notes_at(None)]), A_FLIGHT)
+
+
+def _tape(
+    log: LogContent, aircraft: str, names: Mapping[str, str], filled: Mapping[str, Signal]
+) -> Tape:
+    """The tape of an aircraft, without the duration; `names` within the namespace by topic, signals
+    by name.
+    """
+    stamped = {
+        name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()
+    }
+    topics = {name: log.topics[topic] for topic, name in names.items()}
+    recordings = {printable(name): samples.recording() for name, samples in stamped.items()}
+    signals, recording, leaps = without_leaps(
+        {printable(name): signal for name, signal in filled.items()},
+        {name: clock for name, clock in recordings.items() if clock.found},
+    )
+    start_ns = _start_ns(signals)
+    end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
+    counts = {printable(name): samples.refused() for name, samples in stamped.items()}
+    refused = {name: count for name, count in counts.items() if count}
+    conflicts = (topics[name].conflict(name) for name in filled if name in AIRCRAFT_TOPICS)
+    notes = [
+        *log.notes_at(end),
+        *(leap_note(leap, start_ns) for leap in leaps),
+        *(refusal_note(name, count) for name, count in refused.items()),
+        *(recording_note(name, clock, start_ns) for name, clock in recording.items()),
+        *conflicts,
+    ]
+    outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
+    spans = _spans((name, topics[name].spans) for name in filled)
+    processes = flight_processes(spans, ready_times(log.lines), aircraft)
+    return Tape(
+        signals,
+        start_ns,
+        tuple(map(printable, filter(None, notes))),
+        outcome,
+        recording=recording,
+        processes={printable(name): process for name, process in processes.items()},
+        refused=refused,
     )
 
 
@@ -346,358 +301,6 @@ def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
         for topic in topics
         if topic.startswith(f"{chosen}/") and not topic.startswith(tuple(nested))
     }
-
-
-class _TopicSamples:
-    """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
-
-    def __init__(self, decode: Decoder, expected: int) -> None:
-        self._decode = decode
-        self._expected = expected
-        self._batch: list[
-            tuple[Table, NDArray[np.int64], NDArray[np.int64]]
-        ] = []  # of one length; log times, steps of numbers
-        self._batched = 0  # messages
-        self._clock = StampClock()
-        self._number: int | None = None  # of the last message, by the publisher
-        self._numbered = False
-        self._restarted = False
-        self._lost = 0
-        self._unset = 0  # samples with a zero stamp that `signal` left out
-        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self.spans: dict[str, Span] = {}  # by publisher
-        self._refused = 0
-
-    def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
-        steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
-        self._lost += int((steps[steps > 1] - 1).sum())
-        self._numbered = self._numbered or bool(sequence.any())
-        self._number = int(sequence[-1])
-        self._restarted = self._restarted or bool(
-            np.any(steps < 0)
-        )  # another publisher, or a restarted one
-        fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
-        if self._batched >= BATCH or not fits:
-            self._decode_batch(more=fits)
-        self._batch.append((table, log_ns, steps))
-        self._batched += len(table)
-
-    def _decode_batch(self, *, more: bool = False, end: bool = False) -> None:
-        if not self._batch:
-            return
-        table, log_ns, steps = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
-        self._batch = []
-        self._batched = 0
-        if table.shape[1] >= STAMP.stop:
-            keep, count = self._clock.usable(stamps_of(table), log_ns, steps, more=more, end=end)
-            if count < len(table):
-                self._batch = [(table[count:], log_ns[count:], steps[count:])]
-                self._batched = len(table) - count
-            table = table[:count] if keep.all() else table[:count][keep]
-        if not len(table):
-            return
-        decoded = self._decode(table)
-        self._refused += decoded.unreadable
-        for received, stamps, unordered, sender in decoded.samples:
-            if unordered.shape[1] == len({*received}) == len(received):
-                names, values = self._ordered(received, unordered)
-                finite = np.isfinite(values).all(axis=1)
-                self._refused += int(np.count_nonzero(~finite))
-                stamp_ns, values = (
-                    (stamps, values) if finite.all() else (stamps[finite], values[finite])
-                )
-                if not len(stamp_ns):
-                    continue
-                span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
-                self.spans[sender] = (
-                    span.joined(self.spans[sender]) if sender in self.spans else span
-                )
-                if names not in self._samples:
-                    expected = (
-                        0 if self._samples else self._expected
-                    )  # other names are few, or those of a hostile log
-                    self._samples[names] = Columns(len(names), max(expected, len(values)))
-                self._samples[names].append(stamp_ns, values)
-            else:
-                self._refused += len(stamps)
-
-    def _ordered(
-        self, names: tuple[str, ...], values: NDArray[np.float64]
-    ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and values in the order of the first sample with these names: values are matched by
-        name.
-        """
-        for known in self._samples:
-            if known != names and sorted(known) == sorted(names):
-                return known, values[:, [names.index(name) for name in known]]
-        return names, values
-
-    def signal(self, name: str) -> Signal | None:
-        """The samples of a topic in the order of the stamps; None without samples that have a
-        stamp.
-
-        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight
-        time. A plan needs no stamp.
-        """
-        self._decode_batch(end=True)
-        if not self._samples:
-            return None
-        names = self._names()
-        signal = self._samples[names].signal(tuple(map(printable, names)))
-        stamps = signal.stamp_ns
-        zero = stamps == 0
-        zeros = int(np.count_nonzero(zero))
-        usual = len(stamps) - 1 if name in RESTING else 1
-        if zeros > usual:  # a recorder may take each message twice
-            usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
-        if (
-            name not in UNSTAMPED
-            and zeros
-            and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS)
-        ):
-            self._unset = zeros
-            signal = signal.where(~zero)
-            if not len(signal.stamp_ns):
-                return None
-        if np.any(signal.stamp_ns[1:] < signal.stamp_ns[:-1]):
-            order = np.argsort(signal.stamp_ns, kind="stable")
-            stamps = signal.stamp_ns[order]
-            values = signal.values[order]
-            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(
-                axis=1
-            )  # of a part that is there twice
-            keep = np.append(True, ~again)
-            signal = Signal(stamps[keep], signal.names, values[keep])
-        return signal
-
-    def _names(self) -> tuple[str, ...]:
-        """The names of the first sample, or of the majority of samples with further names
-        beside.
-        """
-        first = next(iter(self._samples))
-        return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
-
-    def _count(self, names: tuple[str, ...]) -> int:
-        return self._samples[names].count
-
-    def conflict(self, name: str) -> str:
-        """The note on simultaneous publishers, of which the nodes accept the first; empty for
-        successive publishers.
-        """
-        spans = sorted(self.spans.items(), key=itemgetter(1))
-        if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
-            return ""
-        publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
-        return (
-            f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
-        )
-
-    def recording(self) -> Recording:
-        """The stamps in the order of the recording; after `signal`."""
-        return self._clock.recording(self._unset)._replace(
-            lost=self._lost if self._numbered and not self._restarted else None
-        )
-
-    def refused(self) -> int:
-        """How many samples were refused: damaged, not finite, or of other channels."""
-        return (
-            self._refused
-            + sum(map(self._count, self._samples))
-            - (self._count(self._names()) if self._samples else 0)
-        )
-
-
-class _Log:
-    """The content of the files of a bag."""
-
-    def __init__(self, remaps: Mapping[str, str]) -> None:
-        self.remaps = remaps
-        self.topics: dict[str, _TopicSamples] = {}  # by full topic name
-        self.notes: list[str] = []
-        self.scenario: StoredFile | None = None
-        self.metadata: dict[str, Mapping[str, str]] = {}
-        self.attachments: list[StoredFile] = []
-        self.truncated: list[str] = []  # names of the truncated files
-        self.last_ns = 0  # log time of the last message
-        self.known_end_ns = 0  # the latest log time in any index or metadata
-        self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
-        self.lines: list[bytes] = []  # of /rosout: that a node is ready
-        self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        self.reports: dict[
-            str, list[tuple[int, bytes]]
-        ] = {}  # of bridges by full topic name: time of sending, ns, and message
-        self.times: Times | None = None  # of the last y or u of a chunk
-        self.kinds: dict[str, str] = {}  # types of all topics, by full name
-
-    def reader_of(
-        self, topic: str, type_name: str, expected: int
-    ) -> Callable[[MessageBatch], None] | None:
-        """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
-        samples = self.samples_of(topic, type_name, expected)
-        is_timed = topic.rpartition("/")[2] in TIMED_TOPICS
-        if samples is not None:
-
-            def take(batch: MessageBatch) -> None:
-                samples.add(batch.data, batch.log_ns, batch.sequence)
-                if is_timed and batch.data.shape[1] >= STAMP.stop:
-                    self.times = Times(stamps_of(batch.data), batch.sent_ns)
-                    if batch.publish_ns.all():
-                        self.sent[topic].append(self.times)
-
-            return take
-        if topic == ROSOUT and type_name == LOG:
-            return lambda batch: self.lines.extend(
-                line for line in map(bytes, batch.data) if READY in line
-            )
-        if topic == DIAGNOSTICS and type_name == DIAGNOSTIC_ARRAY:
-            return lambda batch: self.diagnostics.extend(
-                data for data in map(bytes, batch.data) if IN_MESSAGE in data
-            )
-        if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
-            reports = self.reports.setdefault(topic, [])
-            return lambda batch: reports.extend(
-                zip(map(self._time_of_stamps, batch.sent_ns), map(bytes, batch.data), strict=True)
-            )
-        return None
-
-    def _time_of_stamps(self, sent_ns: np.int64) -> int:
-        """A time of sending by the clock of the stamps: the nodes keep their time when the system
-        clock is set.
-        """
-        if self.times is not None:
-            nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
-            offset_ns = self.times.sent_ns[nearest] - self.times.stamp_ns[nearest]
-            if abs(offset_ns) > LEAST_CLOCK_STEP_NS:
-                return int(sent_ns - offset_ns)
-        return int(sent_ns)
-
-    def samples_of(self, topic: str, type_name: str, expected: int = 0) -> _TopicSamples | None:
-        """The samples of a topic; None for a type without named vectors or waypoints."""
-        is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
-        if (
-            topic not in self.topics
-            and (decode := decode_routes if is_route else decoder(type_name)) is not None
-        ):
-            self.topics[topic] = _TopicSamples(decode, expected)
-        return self.topics.get(topic)
-
-    def add(self, record: McapRecord) -> None:
-        """Add an attachment or a metadata record."""
-        if isinstance(record, Metadata):
-            self.metadata[record.name] = record.metadata
-        elif isinstance(record, Attachment):
-            name = Path(record.name).name
-            if record.media_type == SCENARIO_MEDIA_TYPE:
-                self.scenario = StoredFile(
-                    name if SCENARIO_NAME.fullmatch(name) else "scenario.yaml", record.data
-                )
-            else:
-                self.attachments.append(StoredFile(name, record.data))
-
-    def notes_at(self, end: float | None) -> list[str]:
-        """The notes. `end` is the flight time of the last sample in s, None without samples."""
-        where = "" if end is None else f", t = {end:.3f} s"
-        missing = seconds(self.known_end_ns - self.last_ns)
-        more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
-        truncated = [
-            f"{name} is truncated: read up to its last complete chunk{where}{more}"
-            for name in self.truncated
-        ]
-        lost = [
-            f"{topic}: the recorder lost {count} messages"
-            for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()
-        ]
-        silent = [
-            f"{topic}: the recorder received nothing {text}"
-            for topic, text in self.metadata.get(SILENCES, {}).items()
-        ]
-        simulated = []
-        if (clock := self.metadata.get(SIMULATED_TIME)) is not None:
-            speed = f", at {clock['speed']} times real time" if "speed" in clock else ""
-            simulated = [f"flown by the simulated time of {clock.get('topic', '')}{speed}"]
-        return [*truncated, *self.notes, *lost, *silent, *simulated]
-
-
-def _read(run: Path, remaps: Mapping[str, str]) -> _Log:
-    log = _Log(remaps)
-    files = log_files(run)
-    if is_folder(run):
-        for folder in dict.fromkeys(file.parent for file in files):
-            _add_metadata(folder, log)
-    for file in files:
-        _read_file(file, log)
-    return log
-
-
-def _add_metadata(folder: Path, log: _Log) -> None:
-    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair
-    command.
-    """
-    information: Mapping[str, Any] = {}
-    try:
-        information, end_ns = read_bag_metadata(folder)
-        log.known_end_ns = max(log.known_end_ns, end_ns)
-    except ParameterError:
-        fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
-        mend = {".mcap": "rise-di report --repair", ".db3": "ros2 bag reindex"}.get(
-            bag_files(folder)[0].suffix
-        )
-        log.notes.append(
-            f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}"
-        )
-    if missing := missing_parts(bag_files(folder), information):
-        known = f"named in {METADATA}" if information else "a number before the last"
-        log.notes.append(
-            f"{', '.join(missing)}: {known} and missing; the log is a part of the recording"
-        )
-
-
-def _read_file(file: Path, log: _Log) -> None:
-    channels: dict[int, Callable[[MessageBatch], None]] = {}
-    schemas: dict[int, str] = {}
-    before_ns = log.last_ns
-    first_ns = 2**63
-    try:
-        with open_scan(file) as scan:
-            for record in scan.batches():
-                if isinstance(record, MessageBatch):
-                    log.last_ns = max(log.last_ns, int(record.log_ns.max()))
-                    first_ns = min(first_ns, int(record.log_ns.min()))
-                    if (take := channels.get(record.channel_id)) is not None:
-                        for batch in plain_batches(record):
-                            take(batch)
-                elif isinstance(record, Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, Channel):
-                    expected = scan.message_counts.get(record.id, 0)
-                    type_name = schemas.get(record.schema_id, "")
-                    is_cdr = record.message_encoding == "cdr"
-                    topic = stack_topic(record, log.remaps)
-                    log.kinds.setdefault(
-                        topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}"
-                    )
-                    if (
-                        is_cdr
-                        and (take := log.reader_of(topic, full_name(type_name), expected))
-                        is not None
-                    ):
-                        channels[record.id] = take
-                else:
-                    log.add(record)
-    except OSError as error:
-        raise ParameterError(
-            f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
-        ) from None
-    if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
-        log.notes.append(
-            f"{file.name} begins before the end of the part before: the parts are out of order, "
-            "or there twice"
-        )
-    if not scan.complete:
-        log.truncated.append(file.name)
-    if scan.damaged:
-        log.notes.append(f"{file.name} is damaged: {scan.damaged} of its parts left out")
-    log.known_end_ns = max(log.known_end_ns, scan.known_end_ns)
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:

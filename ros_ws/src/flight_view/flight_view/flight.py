@@ -20,10 +20,8 @@ from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import known_entries, settling_bands
+from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.run_folder import log_account
-from flight_analysis.report.summary import (
-    display_unit,
-)
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -37,6 +35,7 @@ from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, stamped_sentence
+from flight_log.log_content import StoredFile
 from flight_log.named_vectors import (
     JOINT_STATE,
     Decoder,
@@ -47,7 +46,7 @@ from flight_log.named_vectors import (
     typestore,
 )
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
-from flight_log.tape_reader import StoredFile, listed, read_run
+from flight_log.tape_reader import listed, read_run
 from flight_view.background import Line
 from flight_view.description import MODES, Flown, described, mission, rms_by_model
 from flight_view.series import Series

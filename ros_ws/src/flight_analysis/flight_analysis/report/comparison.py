@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.metrics import best_error
-from flight_analysis.report import figures, summary
+from flight_analysis.report import figures
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    NO_VALUE,
+    DisplayUnit,
+    channel_label,
+    format_value,
+)
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
@@ -20,7 +27,14 @@ from flight_analysis.report.plotting import (
     SampleStore,
     time_series_figure,
 )
-from flight_analysis.report.summary import Column, DisplayUnit, RecordedFlight
+from flight_analysis.report.summary import RecordedFlight
+from flight_analysis.report.summary_rows import (
+    ERROR_COLUMNS,
+    SWITCH_COLUMN,
+    Column,
+    metric,
+    slowest_settling,
+)
 from flight_core.tape import Signal, Tape
 
 # Okabe and Ito 2008, distinct to the colour blind too; lighter on a dark page.
@@ -101,17 +115,15 @@ def metric_tables(
     display = units(flights)
     tables = []
     for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
-        factor = display.get(channel, summary.NO_UNIT).factor
+        factor = display.get(channel, NO_UNIT).factor
         rows = []
         for group, head, path, scaled in columns:
             row = _row(
                 flights, f"{group} {head}".strip(), (key, channel, *path), factor if scaled else 1.0
             )
-            if set(row.texts) != {summary.NO_VALUE}:
+            if set(row.texts) != {NO_VALUE}:
                 rows.append(row._replace(lower_is_better=lower_is_better))
-        tables.append(
-            ComparisonTable(summary.channel_label(channel, display), tuple(rows), channel)
-        )
+        tables.append(ComparisonTable(channel_label(channel, display), tuple(rows), channel))
     return tables
 
 
@@ -120,7 +132,7 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
         for table in metric_tables(
-            flights, "errors", (*summary.ERROR_COLUMNS, summary.SWITCH_COLUMN), lower_is_better=True
+            flights, "errors", (*ERROR_COLUMNS, SWITCH_COLUMN), lower_is_better=True
         )
     ]
 
@@ -128,35 +140,29 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
 def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[ComparisonRow]:
     times = {}
     for kind in ("command", "gust"):
-        times[kind] = tuple(
-            summary.slowest_settling(flight.summary, channel, kind) for flight in flights
-        )
+        times[kind] = tuple(slowest_settling(flight.summary, channel, kind) for flight in flights)
     no_ratios = (None,) * len(flights)
     return [
         ComparisonRow(f"settling, {kind} (s)", texts, no_ratios)
         for kind, texts in times.items()
-        if set(texts) != {summary.NO_VALUE}
+        if set(texts) != {NO_VALUE}
     ]
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers as a table; none for zeros alone."""
     rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
-    nonzero = tuple(
-        row for row in rows if set(row.texts) - {summary.NO_VALUE, summary.format_value(0.0)}
-    )
+    nonzero = tuple(row for row in rows if set(row.texts) - {NO_VALUE, format_value(0.0)})
     return [ComparisonTable("Ticks of the controller", nonzero)] if nonzero else []
 
 
 def _row(
     flights: Sequence[RecordedFlight], name: str, path: Sequence[str], factor: float
 ) -> ComparisonRow:
-    values = [summary.metric(flight.summary, *path) for flight in flights]
+    values = [metric(flight.summary, *path) for flight in flights]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)
-    return ComparisonRow(
-        name, tuple(summary.format_value(value, factor) for value in values), ratios
-    )
+    return ComparisonRow(name, tuple(format_value(value, factor) for value in values), ratios)
 
 
 # ---- Figures

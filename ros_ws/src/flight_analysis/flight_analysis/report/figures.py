@@ -12,15 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import (
-    Windows,
-    known_entries,
-    mask_spans,
-    spectra,
-    tick_periods,
-    tracking_error,
-    true_error,
-)
+from flight_analysis.metrics import Windows, known_entries, mask_spans, tracking_error, true_error
+from flight_analysis.report.display_units import NO_UNIT, DisplayUnit
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
@@ -32,7 +25,8 @@ from flight_analysis.report.plotting import (
     set_layout,
     time_series_figure,
 )
-from flight_analysis.report.summary import NO_UNIT, DisplayUnit
+from flight_analysis.report.spectra import spectra
+from flight_analysis.report.timing import tick_periods
 from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

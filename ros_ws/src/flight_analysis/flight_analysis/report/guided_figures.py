@@ -13,6 +13,7 @@ import numpy as np
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
+from flight_analysis.report.display_units import QUANTITY_UNITS
 from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
 from flight_analysis.report.plotting import (
     INTERVAL_OPACITY,
@@ -24,7 +25,6 @@ from flight_analysis.report.plotting import (
     set_layout,
     time_series_figure,
 )
-from flight_analysis.report.summary import QUANTITY_UNITS
 from flight_core.modes import Mode as ControllerMode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

@@ -25,19 +25,17 @@ from flight_analysis.report import (
     plotting,
     tables,
 )
+from flight_analysis.report.display_units import QUANTITY_UNITS, format_seconds, format_value
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay
 from flight_analysis.report.summary import (
-    INPUT_COLUMNS,
-    QUANTITY_UNITS,
     RecordedFlight,
     command_results,
     finite_or_null,
-    format_seconds,
-    format_value,
     parts_legend,
     time_flown,
 )
+from flight_analysis.report.summary_rows import INPUT_COLUMNS
 from flight_core.files import replacing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError

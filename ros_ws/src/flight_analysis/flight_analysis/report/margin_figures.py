@@ -13,8 +13,9 @@ import numpy as np
 from flight_analysis.closed_loop.guarantee import Guarantee
 from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
 from flight_analysis.report import comparison
+from flight_analysis.report.display_units import NO_VALUE
 from flight_analysis.report.plotting import Figure, add_line, set_layout
-from flight_analysis.report.summary import NO_VALUE, Column
+from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_core.vectors import FloatArray
 from rise_di_controller.margins import Margins, disk_gain, disk_phase, loop_transfer

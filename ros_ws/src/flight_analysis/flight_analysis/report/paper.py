@@ -14,17 +14,10 @@ import numpy as np
 
 from flight_analysis.metrics import best_error
 from flight_analysis.report import comparison
+from flight_analysis.report.display_units import NO_UNIT, channel_label
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
-from flight_analysis.report.summary import (
-    ERROR_COLUMNS,
-    INPUT_COLUMNS,
-    NO_UNIT,
-    RecordedFlight,
-    channel_label,
-    columns_of,
-    table_rows,
-    taken_over,
-)
+from flight_analysis.report.summary import RecordedFlight, taken_over
+from flight_analysis.report.summary_rows import ERROR_COLUMNS, INPUT_COLUMNS, columns_of, table_rows
 from flight_core.arguments import as_names
 from flight_core.files import replacing, write_file
 from flight_core.parameters import one_of, require

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.report.summary import NO_UNIT, DisplayUnit, channel_label
+from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, channel_label
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

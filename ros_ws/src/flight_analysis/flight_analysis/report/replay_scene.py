@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_analysis.report.display_units import NO_UNIT
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.guided_figures import flown_routes
 from flight_analysis.report.plotting import PlotContext, pack, stored
-from flight_analysis.report.summary import NO_UNIT, RecordedFlight
+from flight_analysis.report.summary import RecordedFlight
 from flight_core.modes import Mode
 from flight_core.tape import Signal
 

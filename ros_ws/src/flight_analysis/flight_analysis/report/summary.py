@@ -15,24 +15,19 @@ from flight_analysis.metrics import (
     GUIDED_LEGEND,
     PARTS_LEGEND,
     TRUE_ERROR,
-    AgeMetrics,
-    TickMetrics,
     Transient,
-    age_metrics,
     best_error,
     engagements,
     errors_by_model,
     errors_by_part,
     guided_transients,
     inputs_by_part,
-    latency_metrics,
     live_commands,
     noise_floor,
     saturation_shares,
     settling_bands,
     settling_times,
     sign_switches,
-    tick_metrics,
 )
 from flight_analysis.report.account import (
     WHOLE,
@@ -43,60 +38,29 @@ from flight_analysis.report.account import (
     ends_last,
     final_outcome,
 )
-from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
+from flight_analysis.report.display_units import (
+    DisplayUnit,
+    display_unit,
+    display_units,
+    format_seconds,
+)
+from flight_analysis.report.guided import guidance_notices, guidance_summary
+from flight_analysis.report.timing import (
+    AgeMetrics,
+    LatencyMetrics,
+    TickMetrics,
+    age_metrics,
+    latency_metrics,
+    tick_metrics,
+)
 from flight_core.modes import Mode
 from flight_core.outcome import IMPORT
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape, refusal_note
-from flight_core.units import si_per_unit
 from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
 from rise_di_controller.linear_loop import delay_margin
-
-NO_VALUE = "-"
-
-
-class DisplayUnit(NamedTuple):
-    """Unit of tables and figures: displayed value = SI value * factor."""
-
-    unit: str
-    factor: float
-
-
-NO_UNIT = DisplayUnit("", 1.0)  # for a channel of unknown unit: its SI value without a unit
-
-
-QUANTITY_UNITS = {
-    name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0)
-    for name, unit in UNITS.items()
-}
-"""Units of the quantities that guidance holds."""
-
-
-def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
-    """The name of a channel with the unit."""
-    unit = units.get(name, NO_UNIT).unit
-    return f"{name} ({unit})" if unit else name
-
-
-def display_unit(unit: str) -> DisplayUnit:
-    """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same
-    unit.
-    """
-    return (
-        DisplayUnit("mrad/s", 1e3)
-        if unit == "rad/s"
-        else DisplayUnit(unit, 1.0 / si_per_unit(unit))
-    )
-
-
-def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units of tables and figures by channel of y and u."""
-    channels = scenario.aircraft.channels()
-    return {
-        name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()
-    }
 
 
 def pulse_edges(scenario: Scenario) -> list[Transient]:
@@ -187,37 +151,19 @@ def summarise(
         >>> rise_di.summarise(tape)["outcome"]
         'completed'
     """
-    flown = as_tape(tape).scenario if scenario is None else scenario
-    require(
-        flown is not None,
-        "scenario",
-        "none on the tape of a log",
-        "summarise(run.tape, recorded_scenario(run))",
-    )
-    scenario = as_scenario(flown)
+    scenario = _flown_scenario(tape, scenario)
     outcome = tape.outcome if outcome is None else outcome
-    for topic in ("y", "y_m"):
-        unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
-        refused = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
-        require(
-            topic in tape,
-            "the log",
-            f"no sample of {topic}{unset}{refused}",
-            "a flight with y and y_m",
-        )
+    _require_topics(tape)
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     events = transients(scenario, tape)
     flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
-    ticks = (
-        tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate"))
-        if "internals" in tape
-        else None
-    )
-    latency = latency_metrics(tape)
+    ticks = None
+    if "internals" in tape:
+        ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate"))
     age = age_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS and not ends_last(tape, "internals"):  # in real time
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
-    notes = [flight_account.busy] if flight_account.busy else []
+    busy = flight_account.busy
     summary = empty_summary(scenario, final_outcome(outcome, flight_account)) | {
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
@@ -227,22 +173,48 @@ def summarise(
             settling.transient._asdict() | {"until": settling.until, "settling": settling.time}
             for settling in settling_times(tape, events)
         ],
-        "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
-        "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
-        "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
+        "ticks": _finite(ticks),
+        "latency": _finite(latency_metrics(tape)),
+        "age_of_u": _finite(age),
         "guidance": guidance_summary(tape, scenario.guidance),
         "models": [span._asdict() for span in errors_by_model(tape)],
         "account": flight_account.as_json(),
         "notes": [
-            *notes,
+            *([busy] if busy else []),
             *late_u(scenario, age),
-            *(note for note in tape.notes if note != flight_account.busy),
+            *(note for note in tape.notes if note != busy),
             *mode_notes(tape, flight_account.over(*FIGURES["ticks"])),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),
         ],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
+    """The scenario of a flight, else the scenario on the tape. Raises ParameterError without."""
+    flown = as_tape(tape).scenario if scenario is None else scenario
+    require(
+        flown is not None,
+        "scenario",
+        "none on the tape of a log",
+        "summarise(run.tape, recorded_scenario(run))",
+    )
+    return as_scenario(flown)
+
+
+def _require_topics(tape: Tape) -> None:
+    """Raise ParameterError for a tape without y or y_m."""
+    for topic in ("y", "y_m"):
+        unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
+        refused = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
+        found = f"no sample of {topic}{unset}{refused}"
+        require(topic in tape, "the log", found, "a flight with y and y_m")
+
+
+def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[str, Any] | None:
+    """Metrics by name; None unless all are finite."""
+    return metrics._asdict() if metrics is not None and np.isfinite(metrics).all() else None
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
@@ -520,144 +492,7 @@ def finite_or_null(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class Column(NamedTuple):
-    """A column of a table: the heading, the common heading of neighbouring columns above, and the
-    path of the metric.
-    """
-
-    group: str
-    head: str
-    path: tuple[str, ...] = ()
-    scaled: bool = True  # in the unit of its row
-
-
-RMS_COLUMNS = (
-    Column("rms", "whole", ("whole", "rms")),
-    Column("rms", "undisturbed", ("calm", "rms")),
-    Column("rms", "command", ("command", "rms")),
-    Column("rms", "capture", ("capture", "rms")),
-    Column("rms", "turn", ("turn", "rms")),
-    Column("rms", "gust", ("gust", "rms")),
-)
-
-ERROR_COLUMNS = (
-    *RMS_COLUMNS,
-    Column("max", "command", ("command", "max")),
-    Column("max", "capture", ("capture", "max")),
-    Column("max", "turn", ("turn", "max")),
-    Column("max", "gust", ("gust", "max")),
-    Column("ultimate", "bound", ("bound",)),
-)
-"""Columns of every table of errors; `columns_of` chooses those of a flight."""
-
-NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
-SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), scaled=False)
-
-INPUT_COLUMNS = (
-    *RMS_COLUMNS,
-    Column("", "max", ("whole", "max")),
-    Column("rate", "whole", ("whole", "rate")),
-    Column("rate", "undisturbed", ("calm", "rate")),
-)
-"""Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a
-flight."""
-
-SATURATION_COLUMN = Column("saturated", "%")
-SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
-
-
-def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """The columns whose part of the flight the metrics have: a guided flight has "capture" and
-    "turn" in place of "command".
-    """
-    parts = set().union(*channels.values())
-    return tuple(column for column in columns if column.path[0] in parts)
-
-
 def parts_legend(summary: Mapping[str, Any]) -> str:
     """Legend of the parts of a flight."""
     guided = any("turn" in metrics for metrics in summary["errors"].values())
     return GUIDED_LEGEND if guided else PARTS_LEGEND
-
-
-def metric(summary: Mapping[str, Any], *path: str) -> float | None:
-    """A metric by the path in a summary; None for a missing metric."""
-    value: Any = summary
-    for key in path:
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value if isinstance(value, float | int) else None
-
-
-def format_value(value: float | None, factor: float = 1.0) -> str:
-    """A value with three digits, or NO_VALUE."""
-    return NO_VALUE if value is None else f"{value * factor:#.3g}".rstrip(".")
-
-
-def format_seconds(time: float | None) -> str:
-    """A time in s with a digit, or that it is not known."""
-    return "an unknown time" if time is None else f"{time:.1f} s"
-
-
-def model_rows(
-    models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
-) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows for "models" of a summary: model, times and rms of the errors."""
-    channels = list(models[0]["rms"]) if models else []
-    headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
-    rows = []
-    for span in models:
-        errors = (format_value(span["rms"][name], units[name].factor) for name in channels)
-        name = f"model {span['model']}" if span["model"] else "start"
-        rows.append([name, f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors])
-    return headings, rows
-
-
-def table_rows(
-    channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]
-) -> list[list[str]]:
-    """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per
-    column.
-    """
-    rows = []
-    for name, metrics in channels.items():
-        factor = units.get(name, NO_UNIT).factor
-        cells = [
-            format_value(metric(metrics, *column.path), factor if column.scaled else 1.0)
-            for column in columns
-        ]
-        rows.append([channel_label(name, units), *cells])
-    return rows
-
-
-def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent,
-    by magnitude / by rate.
-    """
-    rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
-    for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
-        shares = metrics["limited"]
-        row.append(
-            NO_VALUE
-            if shares is None
-            else " / ".join(f"{100 * shares[kind]:.3g}" for kind in ("magnitude", "rate"))
-        )
-    return rows
-
-
-def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
-    """The longest settling time of a channel after transients of a kind, s.
-
-    "> x" where the error did not settle after a transient; x is then the longest time, settled or
-    not.
-    """
-    settled: list[float] = []
-    unsettled: list[float] = []
-    for transient in summary["transients"]:
-        if transient["kind"] == kind and channel in transient["settling"]:
-            if (time := transient["settling"][channel]) is None:
-                unsettled.append(transient["until"][channel] - transient["start"])
-            else:
-                settled.append(time)
-    if unsettled:
-        return f"> {max(unsettled + settled):.2f}"
-    return f"{max(settled):.2f}" if settled else NO_VALUE

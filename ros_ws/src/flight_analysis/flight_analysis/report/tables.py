@@ -13,25 +13,22 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
+from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit, format_value
 from flight_analysis.report.guided import BANDS, leg_results
-from flight_analysis.report.summary import (
+from flight_analysis.report.summary import parts_legend, taken_over
+from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
     NOISE_FLOOR_COLUMN,
-    QUANTITY_UNITS,
     SATURATION_COLUMN,
     SETTLING_COLUMNS,
     SWITCH_COLUMN,
     Column,
-    DisplayUnit,
     columns_of,
-    format_value,
     input_rows,
     model_rows,
-    parts_legend,
     slowest_settling,
     table_rows,
-    taken_over,
 )
 from flight_core.modes import Mode
 from flight_core.tape import Tape

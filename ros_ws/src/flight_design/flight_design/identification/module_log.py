@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_analysis.closed_loop.replay import vary
+from flight_analysis.closed_loop.replay_ticks import vary
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape

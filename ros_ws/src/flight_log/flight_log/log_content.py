@@ -1,0 +1,445 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The content of the files of a bag: samples by topic, scenario, attachments, metadata, notes."""
+
+import re
+import shlex
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from numpy.typing import NDArray
+
+from flight_core.files import is_file, is_folder
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS, seconds
+from flight_core.tape import Recording, Signal
+from flight_core.text import printable
+from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE
+from flight_log.bag import (
+    LOST_MESSAGES,
+    SCENARIO_MEDIA_TYPE,
+    SILENCES,
+    SIMULATED_TIME,
+    stack_topic,
+)
+from flight_log.clock import SINCE_EPOCH_NS, StampClock
+from flight_log.columns import Columns
+from flight_log.engagements import ENGAGEMENT, KEY_VALUE
+from flight_log.flight_processes import (
+    LOG,
+    READY,
+    ROSOUT,
+    UNNAMED,
+    Span,
+)
+from flight_log.latency import TOPICS as TIMED_TOPICS
+from flight_log.latency import Times
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY
+from flight_log.named_vectors import (
+    PATH,
+    STAMP,
+    Decoder,
+    Table,
+    decode_routes,
+    decoder,
+    full_name,
+    stamps_of,
+)
+from flight_log.open_log import (
+    A_RUN,
+    ROSBAG2,
+    log_files,
+    missing_parts,
+    open_scan,
+    plain_batches,
+)
+from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
+from flight_log.scan import MessageBatch
+
+ROUTE = "route"
+
+
+# messages that are decoded together: of 1024, the tables are so large that the memory for each is
+# new
+BATCH = 512
+
+
+LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
+
+
+RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
+
+
+UNSTAMPED = ("route",)  # plans, which are often published without a stamp
+
+
+SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
+"""Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path
+to another folder."""
+
+
+class StoredFile(NamedTuple):
+    """A file inside the log."""
+
+    name: str
+    content: bytes
+
+
+class TopicSamples:
+    """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
+
+    def __init__(self, decode: Decoder, expected: int) -> None:
+        self._decode = decode
+        self._expected = expected
+        self._batch: list[
+            tuple[Table, NDArray[np.int64], NDArray[np.int64]]
+        ] = []  # of one length; log times, steps of numbers
+        self._batched = 0  # messages
+        self._clock = StampClock()
+        self._number: int | None = None  # of the last message, by the publisher
+        self._numbered = False
+        self._restarted = False
+        self._lost = 0
+        self._unset = 0  # samples with a zero stamp that `signal` left out
+        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
+        self.spans: dict[str, Span] = {}  # by publisher
+        self._refused = 0
+
+    def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
+        """Add messages of one length, a row each, with log times and the publisher's numbers."""
+        steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
+        self._lost += int((steps[steps > 1] - 1).sum())
+        self._numbered = self._numbered or bool(sequence.any())
+        self._number = int(sequence[-1])
+        self._restarted = self._restarted or bool(
+            np.any(steps < 0)
+        )  # another publisher, or a restarted one
+        fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
+        if self._batched >= BATCH or not fits:
+            self._decode_batch(more=fits)
+        self._batch.append((table, log_ns, steps))
+        self._batched += len(table)
+
+    def _decode_batch(self, *, more: bool = False, end: bool = False) -> None:
+        if not self._batch:
+            return
+        table, log_ns, steps = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
+        self._batch = []
+        self._batched = 0
+        if table.shape[1] >= STAMP.stop:
+            keep, count = self._clock.usable(stamps_of(table), log_ns, steps, more=more, end=end)
+            if count < len(table):
+                self._batch = [(table[count:], log_ns[count:], steps[count:])]
+                self._batched = len(table) - count
+            table = table[:count] if keep.all() else table[:count][keep]
+        if not len(table):
+            return
+        decoded = self._decode(table)
+        self._refused += decoded.unreadable
+        for received, stamps, unordered, sender in decoded.samples:
+            if unordered.shape[1] == len({*received}) == len(received):
+                names, values = self._ordered(received, unordered)
+                finite = np.isfinite(values).all(axis=1)
+                self._refused += int(np.count_nonzero(~finite))
+                stamp_ns, values = (
+                    (stamps, values) if finite.all() else (stamps[finite], values[finite])
+                )
+                if not len(stamp_ns):
+                    continue
+                span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
+                self.spans[sender] = (
+                    span.joined(self.spans[sender]) if sender in self.spans else span
+                )
+                if names not in self._samples:
+                    expected = (
+                        0 if self._samples else self._expected
+                    )  # other names are few, or those of a hostile log
+                    self._samples[names] = Columns(len(names), max(expected, len(values)))
+                self._samples[names].append(stamp_ns, values)
+            else:
+                self._refused += len(stamps)
+
+    def _ordered(
+        self, names: tuple[str, ...], values: NDArray[np.float64]
+    ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Names and values in the order of the first sample with these names: values are matched by
+        name.
+        """
+        for known in self._samples:
+            if known != names and sorted(known) == sorted(names):
+                return known, values[:, [names.index(name) for name in known]]
+        return names, values
+
+    def signal(self, name: str) -> Signal | None:
+        """The samples of a topic in the order of the stamps; None without samples that have a
+        stamp.
+
+        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight
+        time. A plan needs no stamp.
+        """
+        self._decode_batch(end=True)
+        if not self._samples:
+            return None
+        names = self._names()
+        signal = self._samples[names].signal(tuple(map(printable, names)))
+        stamps = signal.stamp_ns
+        zero = stamps == 0
+        zeros = int(np.count_nonzero(zero))
+        usual = len(stamps) - 1 if name in RESTING else 1
+        if zeros > usual:  # a recorder may take each message twice
+            usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
+        if (
+            name not in UNSTAMPED
+            and zeros
+            and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS)
+        ):
+            self._unset = zeros
+            signal = signal.where(~zero)
+            if not len(signal.stamp_ns):
+                return None
+        if np.any(signal.stamp_ns[1:] < signal.stamp_ns[:-1]):
+            order = np.argsort(signal.stamp_ns, kind="stable")
+            stamps = signal.stamp_ns[order]
+            values = signal.values[order]
+            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(
+                axis=1
+            )  # of a part that is there twice
+            keep = np.append(True, ~again)
+            signal = Signal(stamps[keep], signal.names, values[keep])
+        return signal
+
+    def _names(self) -> tuple[str, ...]:
+        """The names of the first sample, or of the majority of samples with further names
+        beside.
+        """
+        first = next(iter(self._samples))
+        return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
+
+    def _count(self, names: tuple[str, ...]) -> int:
+        return self._samples[names].count
+
+    def conflict(self, name: str) -> str:
+        """The note on simultaneous publishers, of which the nodes accept the first; empty for
+        successive publishers.
+        """
+        spans = sorted(self.spans.items(), key=itemgetter(1))
+        if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
+            return ""
+        publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
+        return (
+            f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
+        )
+
+    def recording(self) -> Recording:
+        """The stamps in the order of the recording; after `signal`."""
+        return self._clock.recording(self._unset)._replace(
+            lost=self._lost if self._numbered and not self._restarted else None
+        )
+
+    def refused(self) -> int:
+        """How many samples were refused: damaged, not finite, or of other channels."""
+        return (
+            self._refused
+            + sum(map(self._count, self._samples))
+            - (self._count(self._names()) if self._samples else 0)
+        )
+
+
+class LogContent:
+    """The content of the files of a bag."""
+
+    def __init__(self, remaps: Mapping[str, str]) -> None:
+        self.remaps = remaps
+        self.topics: dict[str, TopicSamples] = {}  # by full topic name
+        self.notes: list[str] = []
+        self.scenario: StoredFile | None = None
+        self.metadata: dict[str, Mapping[str, str]] = {}
+        self.attachments: list[StoredFile] = []
+        self.truncated: list[str] = []  # names of the truncated files
+        self.last_ns = 0  # log time of the last message
+        self.known_end_ns = 0  # the latest log time in any index or metadata
+        self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
+        self.lines: list[bytes] = []  # of /rosout: that a node is ready
+        self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
+        self.reports: dict[
+            str, list[tuple[int, bytes]]
+        ] = {}  # of bridges by full topic name: time of sending, ns, and message
+        self.times: Times | None = None  # of the last y or u of a chunk
+        self.kinds: dict[str, str] = {}  # types of all topics, by full name
+
+    def reader_of(
+        self, topic: str, type_name: str, expected: int
+    ) -> Callable[[MessageBatch], None] | None:
+        """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
+        samples = self.samples_of(topic, type_name, expected)
+        is_timed = topic.rpartition("/")[2] in TIMED_TOPICS
+        if samples is not None:
+
+            def take(batch: MessageBatch) -> None:
+                samples.add(batch.data, batch.log_ns, batch.sequence)
+                if is_timed and batch.data.shape[1] >= STAMP.stop:
+                    self.times = Times(stamps_of(batch.data), batch.sent_ns)
+                    if batch.publish_ns.all():
+                        self.sent[topic].append(self.times)
+
+            return take
+        if topic == ROSOUT and type_name == LOG:
+            return lambda batch: self.lines.extend(
+                line for line in map(bytes, batch.data) if READY in line
+            )
+        if topic == DIAGNOSTICS and type_name == DIAGNOSTIC_ARRAY:
+            return lambda batch: self.diagnostics.extend(
+                data for data in map(bytes, batch.data) if IN_MESSAGE in data
+            )
+        if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
+            reports = self.reports.setdefault(topic, [])
+            return lambda batch: reports.extend(
+                zip(map(self._time_of_stamps, batch.sent_ns), map(bytes, batch.data), strict=True)
+            )
+        return None
+
+    def _time_of_stamps(self, sent_ns: np.int64) -> int:
+        """A time of sending by the clock of the stamps: the nodes keep their time when the system
+        clock is set.
+        """
+        if self.times is not None:
+            nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
+            offset_ns = self.times.sent_ns[nearest] - self.times.stamp_ns[nearest]
+            if abs(offset_ns) > LEAST_CLOCK_STEP_NS:
+                return int(sent_ns - offset_ns)
+        return int(sent_ns)
+
+    def samples_of(self, topic: str, type_name: str, expected: int = 0) -> TopicSamples | None:
+        """The samples of a topic; None for a type without named vectors or waypoints."""
+        is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
+        if (
+            topic not in self.topics
+            and (decode := decode_routes if is_route else decoder(type_name)) is not None
+        ):
+            self.topics[topic] = TopicSamples(decode, expected)
+        return self.topics.get(topic)
+
+    def add(self, record: McapRecord) -> None:
+        """Add an attachment or a metadata record."""
+        if isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+        elif isinstance(record, Attachment):
+            name = Path(record.name).name
+            if record.media_type == SCENARIO_MEDIA_TYPE:
+                self.scenario = StoredFile(
+                    name if SCENARIO_NAME.fullmatch(name) else "scenario.yaml", record.data
+                )
+            else:
+                self.attachments.append(StoredFile(name, record.data))
+
+    def notes_at(self, end: float | None) -> list[str]:
+        """The notes. `end` is the flight time of the last sample in s, None without samples."""
+        where = "" if end is None else f", t = {end:.3f} s"
+        missing = seconds(self.known_end_ns - self.last_ns)
+        more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
+        truncated = [
+            f"{name} is truncated: read up to its last complete chunk{where}{more}"
+            for name in self.truncated
+        ]
+        lost = [
+            f"{topic}: the recorder lost {count} messages"
+            for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()
+        ]
+        silent = [
+            f"{topic}: the recorder received nothing {text}"
+            for topic, text in self.metadata.get(SILENCES, {}).items()
+        ]
+        simulated = []
+        if (clock := self.metadata.get(SIMULATED_TIME)) is not None:
+            speed = f", at {clock['speed']} times real time" if "speed" in clock else ""
+            simulated = [f"flown by the simulated time of {clock.get('topic', '')}{speed}"]
+        return [*truncated, *self.notes, *lost, *silent, *simulated]
+
+
+def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
+    """Read every file of a bag; `remaps` by full names. Raises ParameterError."""
+    log = LogContent(remaps)
+    files = log_files(run)
+    if is_folder(run):
+        for folder in dict.fromkeys(file.parent for file in files):
+            _add_metadata(folder, log)
+    for file in files:
+        _read_file(file, log)
+    return log
+
+
+def _add_metadata(folder: Path, log: LogContent) -> None:
+    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair
+    command.
+    """
+    information: Mapping[str, Any] = {}
+    try:
+        information, end_ns = read_bag_metadata(folder)
+        log.known_end_ns = max(log.known_end_ns, end_ns)
+    except ParameterError:
+        fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
+        mend = {".mcap": "rise-di report --repair", ".db3": "ros2 bag reindex"}.get(
+            bag_files(folder)[0].suffix
+        )
+        log.notes.append(
+            f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}"
+        )
+    if missing := missing_parts(bag_files(folder), information):
+        known = f"named in {METADATA}" if information else "a number before the last"
+        log.notes.append(
+            f"{', '.join(missing)}: {known} and missing; the log is a part of the recording"
+        )
+
+
+def _read_file(file: Path, log: LogContent) -> None:
+    channels: dict[int, Callable[[MessageBatch], None]] = {}
+    schemas: dict[int, str] = {}
+    before_ns = log.last_ns
+    first_ns = 2**63
+    try:
+        with open_scan(file) as scan:
+            for record in scan.batches():
+                if isinstance(record, MessageBatch):
+                    log.last_ns = max(log.last_ns, int(record.log_ns.max()))
+                    first_ns = min(first_ns, int(record.log_ns.min()))
+                    if (take := channels.get(record.channel_id)) is not None:
+                        for batch in plain_batches(record):
+                            take(batch)
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    expected = scan.message_counts.get(record.id, 0)
+                    type_name = schemas.get(record.schema_id, "")
+                    is_cdr = record.message_encoding == "cdr"
+                    topic = stack_topic(record, log.remaps)
+                    log.kinds.setdefault(
+                        topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}"
+                    )
+                    if (
+                        is_cdr
+                        and (take := log.reader_of(topic, full_name(type_name), expected))
+                        is not None
+                    ):
+                        channels[record.id] = take
+                else:
+                    log.add(record)
+    except OSError as error:
+        raise ParameterError(
+            f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
+        ) from None
+    if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
+        log.notes.append(
+            f"{file.name} begins before the end of the part before: the parts are out of order, "
+            "or there twice"
+        )
+    if not scan.complete:
+        log.truncated.append(file.name)
+    if scan.damaged:
+        log.notes.append(f"{file.name} is damaged: {scan.damaged} of its parts left out")
+    log.known_end_ns = max(log.known_end_ns, scan.known_end_ns)
