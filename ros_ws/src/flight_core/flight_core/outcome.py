@@ -8,6 +8,7 @@ COMPLETED = "completed"
 INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
+LOOP_LOST = "loop lost"  # after an outcome and a comma, before the inputs and outputs
 OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how long and how far
 NOT_FLOWN = (
     "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
@@ -21,8 +22,8 @@ UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # 0 completed or landed
-# completed with an incomplete log, a leg missed or not flown, an orbit not joined, or outside of
-# the fence, or landed outside of the touch-down zone
+# completed with a loop lost, an incomplete log, a leg missed or not flown, an orbit not joined, or
+# outside of the fence, or landed outside of the touch-down zone
 STATUS_INCOMPLETE = 4
 LOST_CONTACT = (
     "lost contact with"  # before the name of the node lost: the end of a node that is not the cause

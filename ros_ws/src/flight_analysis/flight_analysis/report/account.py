@@ -24,12 +24,14 @@ from flight_analysis.report.guided import (
     touched_beside,
     unflown_legs,
 )
+from flight_analysis.report.loop_lost import lost_parts
 from flight_core.modes import Mode
 from flight_core.outcome import (
     BESIDE,
     COMPLETED,
     INCOMPLETE,
     LANDED,
+    LOOP_LOST,
     MISSED,
     NEVER_FLEW,
     NOT_FLOWN,
@@ -60,8 +62,8 @@ OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its sta
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 APART = ("legs", "outside")  # in the section `guidance` of a summary
 SHORTFALL = re.compile(
-    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|{BESIDE}|"
-    rf"{INCOMPLETE}).*",
+    rf", (?:{LOOP_LOST}: |{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|"
+    rf"{BESIDE}|{INCOMPLETE}).*",
     re.DOTALL,
 )  # of an outcome
 
@@ -141,6 +143,7 @@ class Account(NamedTuple):
     outside: Outside | None = None  # of the fence; None without one
     off_orbit: float = 0.0  # m from the last orbit at the end; 0 of an orbit that is joined
     beside: float = 0.0  # m from the touch-down zone, of a landing; 0 inside
+    loop_lost: tuple[str, ...] = ()  # inputs between their limits, and errors that grow
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -225,6 +228,7 @@ def final_outcome(outcome: str, account: Account) -> str:
         return base
     parts = [
         base,
+        *([f"{LOOP_LOST}: {'; '.join(account.loop_lost)}"] if account.loop_lost else []),
         *outside,
         *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed),
     ]
@@ -385,6 +389,7 @@ def account(
         _processes(tape), late=first if first is not None and first > end / 2.0 else None,
         outside=time_outside(tape, section), off_orbit=off_orbit,
         beside=touched_beside(tape, section) if LANDED in outcome and section is not None else 0.0,
+        loop_lost=lost_parts(tape),
     )  # fmt: skip
 
 
