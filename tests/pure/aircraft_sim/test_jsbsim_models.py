@@ -15,6 +15,7 @@ import pytest
 from tests.builders import aircraft_parameters
 from tests.conftest import refusing
 
+from aircraft_sim import jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import (
@@ -28,7 +29,7 @@ from aircraft_sim.jsbsim_aircraft import (
 )
 from aircraft_sim.jsbsim_commands import hysteresis_of
 from aircraft_sim.jsbsim_model import JsbsimModel
-from aircraft_sim.jsbsim_trim import trim_solution
+from aircraft_sim.jsbsim_trim import TrimSolution, nearest_trim, trim_solution
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.vectors import FloatArray
@@ -308,3 +309,29 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
         match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$",
     ):
         trim_solution(condition)
+
+
+def test_nearest_trim_is_the_first_neighbour_that_trims(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an aircraft that needs 27 m/s and flies up to 4,000 m: a tenth faster is nearer than a
+    third, and half of the altitude is tried where no speed helps.
+    """
+    seconds = []
+
+    def trims(condition: FlightCondition, timeout: float) -> TrimSolution:
+        seconds.append(timeout)
+        if condition.speed < 27.0 or condition.altitude > 4000.0:
+            raise FlightEnded("no trim")
+        return ()
+
+    monkeypatch.setattr(jsbsim_trim, "trim_solution", trims)
+
+    def near(speed: float, altitude: float) -> str:
+        return nearest_trim(FlightCondition("plane", speed, altitude, STEP_NS))
+
+    assert near(25.0, 1000.0) == "it trims at 27.5 m/s and 1000 m"
+    assert near(22.0, 1000.0) == "it trims at 29.7 m/s and 1000 m"
+    assert near(40.0, 5000.0) == "it trims at 40 m/s and 2500 m"
+    assert near(15.0, 1000.0) == ""
+    assert near(40.0, 9000.0) == ""
+    # a refusal waits for at most six conditions
+    assert max(seconds) <= 3.0
