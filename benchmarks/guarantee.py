@@ -36,7 +36,7 @@ def row(name: str) -> list[str]:
     controller = scenario.controller
     frame = load_airframe(scenario.aircraft.airframe)
     begin = time.process_time()
-    box = box_of(frame, controller, UNCERTAINTY, effectors=controller.allocation)
+    box = box_of(frame, controller, UNCERTAINTY)
     linear = scenario_loop(scenario, controller)._replace(box=box)
     promise = guarantee(linear)
     worst = worst_in_box(linear.nominal, linear.law, linear.loop, box).worst

@@ -49,10 +49,7 @@ def boxed(name: str, uncertainty: float = 0.3) -> LinearLoop:
     scenario = find_scenario(name)
     frame = load_airframe(scenario.aircraft.airframe)
     linear = scenario_loop(scenario, scenario.controller)
-    controller = scenario.controller
-    return linear._replace(
-        box=box_of(frame, controller, uncertainty, effectors=controller.allocation)
-    )
+    return linear._replace(box=box_of(frame, scenario.controller, uncertainty))
 
 
 def integrator(k: float, part: float) -> LinearLoop:

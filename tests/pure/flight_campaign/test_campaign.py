@@ -470,7 +470,8 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
     phases = [loop_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
     assert found[1] is not None
     assert found[1].worst is not None
-    assert found[1].worst.phase.min() == approx(min(phases), rel=1e-6)
+    # a search over the box is at or below each aircraft that flies
+    assert found[1].worst.phase.min() < min(phases)
 
 
 @pytest.fixture

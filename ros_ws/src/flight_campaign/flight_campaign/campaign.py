@@ -53,7 +53,7 @@ CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
 LOGGER = logging.getLogger(__name__)
 _FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk did not fit
-MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
+MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is counted
 
 
 class Sweep(Config):
@@ -507,8 +507,8 @@ class Campaign:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case;
-        None without a linear loop.
+        """Margins of the nominal aircraft and the worst found in the box of a case; None without a
+        linear loop.
         """
         definition = self.definition
         scenario = self.definition.scenario(case)

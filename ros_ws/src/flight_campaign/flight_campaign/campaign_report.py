@@ -33,7 +33,7 @@ from flight_analysis.report.summary import finite_or_null
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_campaign import equipment
-from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
+from flight_campaign.campaign import Campaign, Definition
 from flight_campaign.statistics import (
     EDGES,
     FIRST_MODEL,
@@ -64,10 +64,9 @@ OF_LEARNER = {
 OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay "
     "margin: of all inputs at once."
-    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer by "
-    "their A and B; lags and delay of the controller's section. Uniform samples miss the "
-    "corners of the box: distribution corners flies these, rise-di gains --check --guarantee "
-    "bounds every aircraft"
+    " Nominal aircraft, in parentheses the worst found by a search over the box of A and B; lags "
+    "and delay of the controller's section. Uniform samples miss the corners of the box: "
+    "distribution corners flies these, rise-di gains --check --guarantee bounds every aircraft"
 )
 
 

@@ -30,7 +30,6 @@ from flight_analysis.report.margin_figures import (
 )
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.gains_guarantee import (
-    loop_of_effectors,
     require_guarantee,
     show_guarantee,
     write_unstable,
@@ -231,7 +230,7 @@ class Gains:
         if not self.guaranteed:
             return _Result({"scenario": answer})
         progress("bounding every aircraft of the box")
-        promise = guarantee(loop_of_effectors(answer, self.airframe, self.uncertainty))
+        promise = guarantee(answer.loop_with_box())
         write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _Result({"scenario": answer}, promise=promise)
 

@@ -3,7 +3,6 @@
 """What `rise-di gains --check --guarantee` shows and writes."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -11,14 +10,13 @@ from rich.console import Console
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.guarantee import Guarantee
-from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins, box_of
+from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_cli.output import LICENCE, new_table, write_text
 from flight_core.files import writing
 from flight_core.parameters import require
-from flight_design.gains.gain_selection import GainAssessment
 from rise_di_controller.margins import disk_gain, disk_phase
 
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
@@ -28,20 +26,6 @@ def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> N
     """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
     require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
     require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
-
-
-def loop_of_effectors(answer: GainAssessment[Any], airframe: str, uncertainty: float) -> LinearLoop:
-    """The loop of a check with the box of the airframe file.
-
-    Behind an allocation each entry of B of an effector is uncertain, in place of the entries of the
-    law's inputs, of which each sums several.
-    """
-    linear = answer.loop_with_box()
-    effectors = answer.controller.allocation
-    if linear.box is None or effectors is None:
-        return linear
-    box = box_of(load_airframe(airframe), answer.controller, uncertainty, effectors=effectors)
-    return linear._replace(box=box)
 
 
 def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
@@ -57,12 +41,6 @@ def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scena
         not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
     )
     require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
-    require(
-        chosen.controller.allocation is None,
-        "worst",
-        "an allocation",
-        "a scenario without one: the entries are those of the law's inputs",
-    )
     assert promise.unstable is not None  # noqa: S101 - for mypy
     with writing("--set worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)

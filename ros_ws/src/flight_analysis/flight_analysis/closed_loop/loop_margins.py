@@ -27,7 +27,6 @@ from rise_di_controller.linear_loop import (
     linear_law,
 )
 from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
-from rise_di_controller.model_sections import AllocationConfig
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.uncertain_loop import Box, aircraft_at
@@ -78,21 +77,23 @@ def margins(
     seed: int = 1,
     spread: Spread = UNIFORM,
 ) -> LoopMargins:
-    """Margins of a scenario's loop: of the nominal aircraft, and the worst of uncertain aircraft.
+    """Margins of a scenario's loop: of the nominal aircraft, and the least that a search finds
+    among uncertain aircraft.
 
     Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread`
-    says, the rows of angles excepted. The controller
-    gives lags and delay. The uncertainty of the scenario itself is left out.
+    says, the rows of angles excepted. Samples count for the number of stable aircraft alone: the
+    least margins are at corners, where none falls. The controller gives lags and delay. The
+    uncertainty of the scenario itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
-        aircraft: Number of uncertain aircraft.
+        aircraft: Number of uncertain aircraft that are drawn; 0 for the nominal aircraft alone.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         seed: Seed of the uncertain aircraft.
         spread: Distribution of the deviations, and deviations by entry.
 
     Returns:
-        Margins of the nominal and of the worst aircraft; delay margins in s.
+        Margins of the nominal aircraft and the worst found; delay margins in s.
 
     Raises:
         ParameterError: The law has the literal sign, or the aircraft is of JSBSim and the
@@ -197,12 +198,11 @@ def scenario_loop(
     """
     airframe = _model(scenario, controller)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
-    if (
-        controller.allocation is not None and not scenario.aircraft.is_jsbsim
-    ):  # B of each effector is drawn
-        B = B @ _distribution(airframe, controller.allocation)
-        airframe = through_allocation(airframe, controller)
-    return linear_loop(controller, airframe, A, B)
+    T = distribution(airframe, controller)  # B of each effector is drawn
+    seen = through_allocation(airframe, controller)
+    linear = linear_loop(controller, seen, A, B @ T)
+    box = box_of(airframe, controller, uncertainty, spread)
+    return linear._replace(box=box) if aircraft and box.part.any() else linear
 
 
 def linear_loop(
@@ -238,23 +238,18 @@ def box_of(
     controller: ControllerConfig,
     uncertainty: float,
     spread: Spread = UNIFORM,
-    effectors: AllocationConfig | None = None,
 ) -> Box:
-    """The box of the aircraft that `sampled_matrices` draws around an airframe, in the law's order;
-    with `effectors` B of each effector is uncertain.
+    """The box of the aircraft that `nominal_and_sampled` draws around an airframe file, in the
+    law's order; behind an allocation B of each effector is uncertain.
     """
-    distribution = np.eye(len(airframe.inputs))
-    seen = airframe
-    if effectors is not None:
-        distribution = _distribution(airframe, effectors)
-        seen = through_allocation(airframe, controller)
-    distribution = distribution[:, law_order(seen, controller)[1]]
+    seen = through_allocation(airframe, controller)
+    T = distribution(airframe, controller)[:, law_order(seen, controller)[1]]
     places = drawn_places(airframe)
     part = np.array([spread.entries.get(name, uncertainty) for name in places])
     n = len(airframe.states)
     E = np.zeros((n, len(places)))
     F = np.zeros((len(places), n))
-    G = np.zeros((len(places), distribution.shape[1]))
+    G = np.zeros((len(places), T.shape[1]))
     matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}
     for entry, (matrix, i, j) in enumerate(places.values()):
         E[i, entry] = 1.0
@@ -262,7 +257,7 @@ def box_of(
         if matrix == "A":
             F[entry, j] = size
         else:
-            G[entry] = size * distribution[j]
+            G[entry] = size * T[j]
     return Box(tuple(places), part, E, F, G)
 
 
@@ -274,15 +269,27 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
     """The airframe that the law of a controller sees: with its inputs v, u = T v; without an
     allocation as it is.
     """
-    if (allocation := controller.allocation) is None:
+    if not _has_effectors(airframe, controller):
         return airframe
-    return airframe.through(_distribution(airframe, allocation), controller.inputs)
+    return airframe.through(distribution(airframe, controller), controller.inputs)
 
 
-def _distribution(airframe: Airframe, allocation: AllocationConfig) -> FloatArray:
-    """T (p, m) with the rows in the order of the inputs of an airframe."""
+def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
+    """T (p, m) with the rows in the order of the inputs of an airframe; I without an allocation of
+    these.
+    """
+    allocation = controller.allocation
+    if allocation is None or not _has_effectors(airframe, controller):
+        return np.eye(len(airframe.inputs))
     T = np.reshape(allocation.T, (len(allocation.effectors), -1))
     return T[[allocation.effectors.index(name) for name in airframe.inputs]]
+
+
+def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
+    """Whether an allocation stands between the law and the inputs of an airframe: the model of an
+    aircraft of JSBSim has the inputs of the law.
+    """
+    return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
 
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:

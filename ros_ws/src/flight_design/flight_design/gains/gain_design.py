@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from control_laws.nominal_model import NominalModel
-from flight_analysis.closed_loop.loop_margins import loop_of, through_allocation
+from flight_analysis.closed_loop.loop_margins import distribution, loop_of, through_allocation
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
@@ -18,7 +18,7 @@ from flight_core.parameters import require
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
-from flight_design.gains.ideal_control import Study
+from flight_design.gains.ideal_control import Effected, Study
 from flight_design.gains.nominal import sizes
 from flight_design.gains.observer_gains import (
     ObserverGains,
@@ -134,11 +134,12 @@ def select_gains(
     require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
     loop = _loop(chosen, frame, rate, y_rate, lag, delay)
     if mixing == FULL or len(frame.inputs) > len(frame.outputs):
-        loop, frame = _allocated(loop, chosen, frame)
+        loop = _allocated(loop, chosen, frame)
     else:
         loop = _with_limits(_without_allocation(loop, chosen), chosen, frame)
+    seen = through_allocation(frame, loop.base)
     setting = loop._replace(
-        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
+        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order"),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
@@ -148,17 +149,22 @@ def select_gains(
     )
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
     pair = _two_speeds(speeds, observer=observer)
-    known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
-    selection = gain_selection.select_gains(
-        study(frame, chosen, uncertainty, samples, seed), setting
-    )
+    known_model = frame if model is None else load_airframe(model)
+    studied = study(frame, chosen, setting.base, uncertainty, samples, seed)
+    selection = gain_selection.select_gains(studied, setting)
     if not observer:
         return selection
     needed = setting.requirement._replace(
         phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase)
     )
     controller, origin = observed(
-        selection.chosen, chosen, known_model, margin, needed, speeds=pair, progress=progress
+        selection.chosen,
+        chosen,
+        through_allocation(known_model, setting.base),
+        margin,
+        needed,
+        speeds=pair,
+        progress=progress,
     )
     return replace(selection, chosen=controller, origin=origin)
 
@@ -212,25 +218,32 @@ def check_gains(
         True
     """
     chosen = find_scenario(scenario)
-    frame = through_allocation(load_airframe(airframe), chosen.controller)
+    frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
-    return gain_selection.check_gains(
-        chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2
-    )
+    studied = study(frame, chosen, chosen.controller, uncertainty, samples, seed)
+    return gain_selection.check_gains(chosen, studied, gamma_2)
 
 
 def study(
-    airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int
+    airframe: Airframe,
+    scenario: Scenario,
+    controller: ControllerConfig,
+    uncertainty: float,
+    samples: int,
+    seed: int,
 ) -> Study:
-    """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario.
-    Raises ParameterError.
+    """The airframe that the law of a controller sees, and uncertain airframes around it, along the
+    commands and gusts of a scenario. Raises ParameterError.
     """
+    seen = through_allocation(airframe, controller)
+    behind = None if seen is airframe else Effected(airframe, distribution(airframe, controller))
     return ideal_control.study_airframe(
-        airframe,
-        ideal_control.manoeuvre(scenario, airframe),
+        seen,
+        ideal_control.manoeuvre(scenario, seen),
         as_number(uncertainty, "uncertainty", 0.0, 1.0),
         as_count(samples, "samples", 0, MAX_SAMPLES),
         as_count(seed, "seed", 0),
+        behind,
     )
 
 
@@ -300,10 +313,8 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
     return loop._replace(base=loop.base.model_copy(update=plain), lag=lag | dict(loop.lag))
 
 
-def _allocated(
-    loop: LoopSetting, scenario: Scenario, airframe: Airframe
-) -> tuple[LoopSetting, Airframe]:
-    """The loop and the airframe that the law sees through an allocation by the airframe's own C B.
+def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
+    """The loop with an allocation by the airframe's own C B.
 
     Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops
     of the airframe's actuators.
@@ -348,16 +359,10 @@ def _allocated(
         "learn": None,
         "schedule": None,
     }
-    T = np.reshape(allocation.T, (len(names), m))
-    return (
-        loop._replace(
-            base=RiseDiConfig.validate_mapping(
-                scenario.rise_di().model_dump() | base, "controller"
-            ),
-            lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
-            rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
-        ),
-        airframe.through(T, law.names),
+    return loop._replace(
+        base=RiseDiConfig.validate_mapping(scenario.rise_di().model_dump() | base, "controller"),
+        lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
+        rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
     )
 
 

@@ -163,7 +163,8 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
     loop = linear_loop(controller, study.airframe, study.A, study.B)
     if study.uncertainty == 0.0:
         return loop
-    return loop._replace(box=box_of(study.airframe, controller, study.uncertainty))
+    drawn = study.airframe if study.effected is None else study.effected.airframe
+    return loop._replace(box=box_of(drawn, controller, study.uncertainty))
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,13 @@ class ChannelPairing(NamedTuple):
     inputs: tuple[str, ...]
 
 
+class Effected(NamedTuple):
+    """An airframe file whose effectors an allocation moves, u = T v: its entries are uncertain."""
+
+    airframe: Airframe
+    T: FloatArray  # (p, m)
+
+
 class Study(NamedTuple):
     """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's
     order, SI.
@@ -62,6 +69,7 @@ class Study(NamedTuple):
     slew_undisturbed: FloatArray  # (m,) the same without gusts
     stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
     uncertainty: float
+    effected: Effected | None = None  # None: the entries of `airframe` are uncertain
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
@@ -116,6 +124,7 @@ def study_airframe(
     uncertainty: float = 0.3,
     samples: int = 100,
     seed: int = 1,
+    effected: Effected | None = None,
 ) -> Study:
     """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain
     ones.
@@ -129,11 +138,14 @@ def study_airframe(
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
     Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are
-    differences, central and over 1e-5 s. f is that of the nominal airframe. Raises ParameterError
-    if Omega is singular or if the nominal airframe has a zero in the right half plane: then
-    Assumption 3 does not hold.
+    differences, central and over 1e-5 s. f is that of the nominal airframe. The entries of
+    `effected` are drawn, if any. Raises ParameterError if Omega is singular or if the nominal
+    airframe has a zero in the right half plane: then Assumption 3 does not hold.
     """
-    A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
+    drawn = airframe if effected is None else effected.airframe
+    A, B = nominal_and_sampled(drawn, uncertainty, samples, seed)
+    if effected is not None:
+        B = np.asarray(B @ effected.T)
     zeros = [
         invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf)
         for pair in zip(A, B, strict=True)
@@ -161,6 +173,7 @@ def study_airframe(
         undisturbed,
         stable,
         uncertainty,
+        effected,
     )
 
 
