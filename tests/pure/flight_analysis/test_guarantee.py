@@ -147,6 +147,52 @@ def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
     assert sizes == approx(radii(linear, d), abs=1e-5)
 
 
+@pytest.mark.parametrize("late", [0.003, 0.012, 0.026])
+def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
+    """A delay of late / 2 + f periods is d_0 = -f / h and d_1 = f (1 - f) / (g (1 - g)), both at
+    most 1 in size: the spectral radius is that of the exact loop, beyond the declared delay.
+    """
+    linear = boxed("osprey_servo", 0.5)
+    assert linear.box is not None
+    rng = np.random.default_rng(5)
+    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box, late)
+    channels = every_channel(whole)
+    m = len(linear.inputs)
+    half = late / 2.0 / linear.loop.period
+    part = min(half, 0.5)
+    for f in rng.uniform(0.0, min(half, 1.0), 5):
+        d = np.sign(rng.standard_normal(len(linear.box.names)))
+        delta = [-f / half, f * (1.0 - f) / (part * (1.0 - part))]
+        assert np.abs(delta).max() <= 1.0
+        wide = np.diag(np.concatenate([np.tile(d, 2), np.repeat(delta, m)]))
+        inner = wide @ np.linalg.inv(np.eye(len(wide)) - channels.D @ wide)
+        pulled = channels.A + channels.W @ inner @ channels.Z
+        loop = linear.loop._replace(delay=linear.loop.delay + late / 2.0 + f * linear.loop.period)
+        exact = radii(linear._replace(loop=loop), d[None])[0]
+        # the pulse of a part of a period has further coefficients: their effect is of the order
+        # (period rate)^2 of the delay alone
+        assert np.abs(np.linalg.eigvals(pulled)).max() == approx(exact, abs=1e-4)
+
+
+def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
+    """The loop of an integrator, u = -k y: no gain of the box and no delay within is unstable."""
+    linear = integrator(60.0, 0.1)
+    in_time = guarantee(linear)
+    promise = guarantee(linear, 0.01)
+    assert promise.holds
+    assert promise.stable < in_time.stable
+    assert promise.disk_all < in_time.disk_all
+    assert promise.unstable is not None
+    # z^2 - z + k T (1 + d) of a period of delay: 0.6 (1 + d) = 1
+    assert promise.unstable.deviation == approx(1.0 / 0.6 - 1.0, rel=1e-2)
+    d = np.linspace(-1.0, 1.0, 9)[:, None] * promise.stable / 0.1
+    for delay in np.linspace(0.0, 0.01, 9):
+        loop = linear.loop._replace(delay=linear.loop.delay + delay)
+        assert (radii(linear._replace(loop=loop), d) <= LIMIT).all()
+    # the disk around late / 2 is wider than the arc of delays: near pi / T, as here, it costs half
+    assert promise.stable > promise.unstable.deviation / 2.1
+
+
 def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     linear = boxed("osprey_servo")
     assert linear.box is not None

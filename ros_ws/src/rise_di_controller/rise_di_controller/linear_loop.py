@@ -23,6 +23,8 @@ MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
 of this stack."""
 
+ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
+
 SMALL = (
     2.0**-40
     # size of the steps from 0: below every limit and every width of a sign; a power of two loses no
@@ -149,11 +151,15 @@ class SampledPlant(NamedTuple):
     C: FloatArray  # (..., m, k)
 
 
-def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledPlant:
+def sampled_plant(
+    plant: LinearPlant, loop: Loop, extra: FloatArray, *, rising: bool = False
+) -> SampledPlant:
     """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of
     earlier ticks.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
+    With `rising` u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, in place of
+    1: the second Legendre polynomial.
     Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
     sampling of a plant with delay.
     """
@@ -184,8 +190,10 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
         (*batch, n + m, m + held * m)
     )  # effect of u of this tick, then of earlier ticks
     for i in range(m):
-        transition, new = zero_order_hold(motion, drive, loop.period - part[i])
-        _, old = zero_order_hold(motion, drive, part[i])
+        split = loop.period - part[i]
+        transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)
+        begin = split / loop.period
+        _, old = _driven(motion, drive, part[i], begin, loop.period if rising else None)
         inputs[..., ticks[i] * m + i] += new[..., i]
         inputs[..., (ticks[i] + 1) * m + i] += (transition @ old)[..., i]
     B[..., : n + m, :] = inputs[..., :m]
@@ -193,6 +201,24 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     B[..., n + m : n + 2 * m, :] = np.eye(m)
     A[..., n + 2 * m :, n + m : -m] = np.eye((held - 1) * m)
     return SampledPlant(A, B, C)
+
+
+def _driven(
+    motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """The transition over a time, s, and the motion by an input held, or with a period by ROOT (2 s
+    - 1), s rising from `begin` by time / period.
+    """
+    transition, held = zero_order_hold(motion, drive, time)
+    if period is None:
+        return transition, held
+    k, m = drive.shape
+    ramp = np.zeros((k + m, k + m))
+    ramp[:k, :k] = motion
+    ramp[:k, k:] = drive
+    slope = np.vstack([np.zeros((k, m)), np.eye(m) / period])
+    risen = zero_order_hold(ramp, slope, time)[1][:k]
+    return transition, ROOT * (2.0 * (begin * held + risen) - held)
 
 
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:

@@ -210,10 +210,11 @@ class Cover(NamedTuple):
 def cover(part: Channels, start: float, *, disks: bool = False) -> Cover:
     """The least level found, from `start` up, with mu(diag(scale) M) < 1 at every frequency.
 
-    scale is 1 / level in every channel: the loop is stable for abs(d_i) <= 1 / level. With `disks`
-    it is 1 in the real channels and 1 / level in the complex ones: 1 / level is then the disk of
-    each aircraft with abs(d_i) <= 1. One D and one G hold up to the next of the `crossings` on
-    either side; an interval that holds at a level holds above it too.
+    scale is 1 / level in every real channel: the loop is stable for abs(d_i) <= 1 / level. With
+    `disks` it is 1 in the real channels and 1 / level in those of the disks: 1 / level is then the
+    disk of each aircraft with abs(d_i) <= 1. It is 1 in the channels of a delay. One D and one G
+    hold up to the next of the `crossings` on either side; an interval that holds at a level holds
+    above it too.
     """
     search = _Search(part, start, disks=disks)
     for w in _modes(part):
@@ -240,11 +241,13 @@ class _Search:
     """The level, and the intervals at which it is proved."""
 
     def __init__(self, part: Channels, start: float, *, disks: bool) -> None:
-        c = len(part.D) - part.real
+        c = len(part.D) - part.real - part.late
         self.part = part
         self.level = start
         self.peak = 0.0
-        self.moves = np.r_[np.full(part.real, not disks), np.full(c, True)]
+        self.moves = np.r_[
+            np.full(part.real, not disks), np.full(part.late, False), np.full(c, True)
+        ]
         self.proved: list[tuple[float, float]] = []
         self.scalings: list[tuple[float, Scaling]] = []
 

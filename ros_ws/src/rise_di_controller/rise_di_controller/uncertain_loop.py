@@ -9,6 +9,13 @@ z holds the first TERMS Legendre coefficients of F x + G u over a period, w thos
 The motion is exact in d but for the coefficients left out, an error of the order of (period
 rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems",
 chapter 10.
+
+u may be late by an unknown time of 0 to `late`, s. Around late / 2 the input of a period changes by
+
+    w_0 + w_1 ROOT (2 s - 1),  w_0 = d_0 h (u_k - u_k-1),  w_1 = d_1 ROOT g (1 - g) (u_k - u_k-1)
+
+with h = late / (2 period), g = min(h, 1/2) and complex abs(d) <= 1: a shift by f periods leaves u_k
+- u_k-1, or u_k+1 - u_k, on a part f of the period, and each further period adds such a term.
 """
 
 from typing import NamedTuple
@@ -18,9 +25,11 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import (
+    ROOT,
     LinearLaw,
     LinearPlant,
     Loop,
+    SampledPlant,
     sampled_plant,
     zero_order_hold,
 )
@@ -29,8 +38,6 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 TERMS = 2  # Legendre coefficients of a signal within a period
-ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
-
 # singular value below which a direction of normalised vectors counts as none
 NO_DIRECTION = 1e-9
 # part of the sizes of row and column below which an entry of M counts as 0
@@ -56,6 +63,15 @@ def aircraft_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
     return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
 
 
+class Late(NamedTuple):
+    """2 m complex channels of a delay, those of w_0 first: W_l w, Z_l zeta + V_l v."""
+
+    W: FloatArray  # (q, 2 m)
+    D: FloatArray  # (p, 2 m) to the channels of the entries
+    Z: FloatArray  # (2 m, q)
+    V: FloatArray  # (2 m, m)
+
+
 class UncertainLoop(NamedTuple):
     """The loop with the channels of k entries pulled out, TERMS k columns of W, and of m inputs."""
 
@@ -67,10 +83,15 @@ class UncertainLoop(NamedTuple):
     V: FloatArray  # (p, m)
     K: FloatArray  # (m, q)
     period: float  # s
+    late: Late | None = None  # the channels of an unknown delay, 2 m; None without one
 
 
-def uncertain_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> UncertainLoop:
-    """The loop of a plant, A (n, n), with the entries of a box pulled out."""
+def uncertain_loop(
+    plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, late: float = 0.0
+) -> UncertainLoop:
+    """The loop of a plant, A (n, n), with the entries of a box pulled out, and u late by an unknown
+    time of 0 to `late`, s.
+    """
     n, m = plant.B.shape
     k = len(box.names)
     size = n + TERMS * k
@@ -80,7 +101,9 @@ def uncertain_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> 
     A[n + k :, n : n + k] = np.eye(k) / loop.period
     B = np.vstack([plant.B, box.G / loop.period, np.zeros((k, m))])
     C = np.hstack([plant.C, np.zeros((len(plant.C), TERMS * k))])
-    sampled = sampled_plant(LinearPlant(A, B, C), loop, np.zeros(m))
+    extra = np.full(m, late / 2.0)
+    pulled = LinearPlant(A, B, C)
+    sampled = sampled_plant(pulled, loop, extra)
 
     steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
     steps[:size, :size] = A
@@ -94,32 +117,96 @@ def uncertain_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> 
     driven = np.hstack([held, ROOT * (2.0 * rising - held)])
 
     kept = np.r_[0:n, size : len(sampled.A)]
-    first = np.arange(n, n + k)
-    places = (first, first + k)
-
-    def coefficients(matrix: FloatArray) -> FloatArray:
-        """From the integral of z and the integral of this one to the Legendre coefficients."""
-        once, twice = (matrix[rows] for rows in places)
-        return np.concatenate([once, ROOT * (once - 2.0 * twice)])
-
     P = sampled.A[np.ix_(kept, kept)]
     Pu = sampled.B[kept]
-    Q = coefficients(sampled.A)[:, kept]
-    Qu = coefficients(sampled.B)
+    Q = _coefficients(sampled.A, n, k)[:, kept]
+    Qu = _coefficients(sampled.B, n, k)
     C = sampled.C[:, kept]
     states = len(law.A)
     none = np.zeros((states, TERMS * k))
     W = np.zeros((len(kept), TERMS * k))
     W[:n] = driven[:n]
-    return UncertainLoop(
+    exact = UncertainLoop(
         np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
         np.vstack([W, none]),
         np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
-        coefficients(driven),
+        _coefficients(driven, n, k),
         np.vstack([Pu, np.zeros((states, m))]),
         Qu,
         np.hstack([law.D @ C, law.C]),
         loop.period,
+    )
+    if late == 0.0:
+        return exact
+    ramps = sampled_plant(pulled, loop, extra, rising=True)
+    return _with_late(exact, late, _chain(ramps, n, k, len(exact.A)))
+
+
+def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
+    """The Legendre coefficients of k channels, from the integrals of z behind n states, and the
+    integrals of these.
+    """
+    once = matrix[n : n + k]
+    twice = matrix[n + k : n + 2 * k]
+    return np.concatenate([once, ROOT * (once - 2.0 * twice)])
+
+
+class _Chain(NamedTuple):
+    """The states of a delay: w_1 of earlier ticks, c of them, then u of the tick before."""
+
+    on_states: FloatArray  # (q, c + m) of the motion
+    on_entries: FloatArray  # (p, c + m) of the channels of the entries
+    shift: FloatArray  # (c + m, c + m)
+    by_ramp: FloatArray  # (q + c + m, m) by w_1
+    ramp_on_entries: FloatArray  # (p, m)
+
+
+def _chain(ramps: SampledPlant, n: int, k: int, q: int) -> _Chain:
+    """The chain of a loop of q states, n of the aircraft, with k entries."""
+    m = ramps.B.shape[1]
+    size = n + TERMS * k
+    actuated = size + m
+    c = len(ramps.A) - actuated
+    effect = ramps.A[:actuated, actuated:]
+    none = np.zeros((m, m))
+    on_states = np.zeros((q, c + m))
+    on_states[: n + m, :c] = np.vstack([effect[:n], effect[size:]])
+    shift = np.zeros((c + m, c + m))
+    shift[:c, :c] = ramps.A[actuated:, actuated:]
+    beyond = np.zeros((q - n - m, m))
+    moved = (ramps.B[:n], ramps.B[size:actuated], beyond, ramps.B[actuated:], none)
+    on_entries = np.hstack([_coefficients(effect, n, k), np.zeros((TERMS * k, m))])
+    return _Chain(on_states, on_entries, shift, np.vstack(moved), _coefficients(ramps.B, n, k))
+
+
+def _with_late(exact: UncertainLoop, late: float, chain: _Chain) -> UncertainLoop:
+    """A loop with the channels of a delay."""
+    m = len(exact.K)
+    added = len(chain.shift)
+    command = np.zeros((added, len(exact.A)))
+    command[-m:] = exact.K
+    last = np.zeros((added, m))
+    last[-m:] = np.eye(m)
+    half = late / 2.0 / exact.period
+    part = min(half, 0.5)
+    sizes = np.repeat([half, ROOT * part * (1.0 - part)], m)[:, None]
+    before = np.hstack([np.zeros((m, added - m)), np.eye(m)])
+    change = np.hstack([exact.K, -before])
+    none = np.zeros((added, m))
+    widened = exact._replace(
+        A=np.block([[exact.A, chain.on_states], [command, chain.shift]]),
+        W=np.vstack([exact.W, np.zeros((added, exact.W.shape[1]))]),
+        Z=np.hstack([exact.Z, chain.on_entries]),
+        U=np.vstack([exact.U, last]),
+        K=np.hstack([exact.K, np.zeros((m, added))]),
+    )
+    return widened._replace(
+        late=Late(
+            np.hstack([np.vstack([exact.U, none]), chain.by_ramp]),
+            np.hstack([exact.V, chain.ramp_on_entries]),
+            sizes * np.vstack([change, change]),
+            sizes * np.vstack([np.eye(m), np.eye(m)]),
+        )
     )
 
 
@@ -132,6 +219,7 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # places of the entries in the box
     period: float
+    late: int = 0  # complex channels of a delay, behind the real ones
 
     @property
     def real(self) -> int:
@@ -161,16 +249,25 @@ def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels
     S - I / 2.
     """
     chosen = list(inputs)
-    p = loop.W.shape[1]
+    q, p = loop.W.shape
+    m = len(loop.K)
     c = len(chosen)
-    below = np.hstack([np.zeros((c, p)), np.eye(c) / 2.0])
+    late = loop.late or Late(np.zeros((q, 0)), np.zeros((p, 0)), np.zeros((0, q)), np.zeros((0, m)))
+    width = late.W.shape[1]
+    D = np.zeros((p + width + c, p + width + c))
+    D[:p, :p] = loop.D
+    D[:p, p : p + width] = late.D
+    D[:p, p + width :] = loop.V[:, chosen]
+    D[p : p + width, p + width :] = late.V[:, chosen]
+    D[p + width :, p + width :] = np.eye(c) / 2.0
     return Channels(
         loop.A,
-        np.hstack([loop.W, loop.U[:, chosen]]),
-        np.vstack([loop.Z, loop.K[chosen]]),
-        np.vstack([np.hstack([loop.D, loop.V[:, chosen]]), below]),
+        np.hstack([loop.W, late.W, loop.U[:, chosen]]),
+        np.vstack([loop.Z, late.Z, loop.K[chosen]]),
+        D,
         tuple(range(p // TERMS)),
         loop.period,
+        width,
     )
 
 
@@ -206,22 +303,25 @@ def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels
 
     every = every_channel(loop, inputs)
     k = len(every.entries)
+    m = len(loop.K)
     c = len(inputs)
+    late = np.tile(k + np.arange(m), every.late // m)
     at = np.pi / loop.period * np.array(PATTERN_PARTS)
     sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
     wide = sizes > NO_COUPLING * np.sqrt(np.outer(sizes.max(axis=1), sizes.max(axis=0)) + 1e-300)
-    node = np.r_[np.tile(np.arange(k), TERMS), k + np.arange(c)]
-    pattern = np.zeros((k + c, k + c), dtype=bool)
+    node = np.r_[np.tile(np.arange(k), TERMS), late, k + m + np.arange(c)]
+    pattern = np.zeros((k + m + c, k + m + c), dtype=bool)
     np.logical_or.at(pattern, (node[:, None], node[None]), wide)
     count, label = connected_components(csr_array(pattern), directed=True, connection="strong")
     parts = []
     for number in range(count):
         nodes = np.flatnonzero(label == number)
         looped = len(nodes) > 1 or pattern[nodes[0], nodes[0]]
-        if looped and (not inputs or nodes[-1] >= k):
+        if looped and (not inputs or nodes[-1] >= k + m):
             channels = np.flatnonzero(np.isin(node, nodes))
             entries = tuple(nodes[nodes < k].tolist())
-            parts.append(_reduced(every, channels)._replace(entries=entries))
+            count_late = int(np.isin(late, nodes).sum())
+            parts.append(_reduced(every, channels)._replace(entries=entries, late=count_late))
     return parts
 
 

@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.loop_margins import LinearLoop
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import closed_loop, is_stable
-from rise_di_controller.structured_value import cover
+from rise_di_controller.structured_value import Cover, cover
 from rise_di_controller.uncertain_loop import UncertainLoop, aircraft_at, parts_of, uncertain_loop
 from rise_di_controller.worst_case import first_unstable
 
@@ -43,6 +43,7 @@ class Guarantee(NamedTuple):
     inputs: tuple[str, ...]
     disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
     disk_all: float  # with independent disks in all inputs at once
+    late: float = 0.0  # s: u is late by an unknown time of 0 to this
 
     @property
     def holds(self) -> bool:
@@ -50,32 +51,25 @@ class Guarantee(NamedTuple):
         return self.stable >= self.uncertainty
 
 
-def guarantee(linear: LinearLoop) -> Guarantee:
-    """The guarantee for the box of a loop. Raises ParameterError for a loop without a box."""
+def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
+    """The guarantee for the box of a loop, with u late by an unknown constant time of 0 to `late`,
+    s, in each input. Raises ParameterError for a loop without a box.
+    """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
     largest = float(np.max(box.part))
     m = len(linear.inputs)
-    none = Guarantee(largest, 0.0, 0.0, None, linear.inputs, np.zeros(m), 0.0)
-    if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
+    none = Guarantee(largest, 0.0, 0.0, None, linear.inputs, np.zeros(m), 0.0, late)
+    if not is_stable(linear.nominal, linear.law, linear.loop, np.full(m, late / 2.0)):
         return none
-    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box)
-    stable = np.inf
-    frequency = 0.0
-    unstable: Unstable | None = None
-    for part in parts_of(whole):
-        covered = cover(part, LEAST_LEVEL)
-        if 1.0 / covered.level < stable:
-            stable = 1.0 / covered.level
-            frequency = covered.peak
-        for w in (covered.peak, 0.0):  # a slow divergence hides beside a peak
-            reached = first_unstable(part, w, len(box.names), LARGEST / largest)
-            confirmed = None if reached is None else _confirmed(linear, reached[1])
-            candidates = [each for each in (unstable, confirmed) if each is not None]
-            unstable = min(candidates, key=lambda each: each.deviation, default=None)
+    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
+    covers = [cover(part, LEAST_LEVEL) for part in parts_of(whole)]
+    limit = max(covers, key=lambda covered: covered.level, default=Cover(LEAST_LEVEL, 0.0, 0))
     found = none._replace(
-        stable=min(float(stable) * largest, 1.0), frequency=frequency, unstable=unstable
+        stable=min(largest / limit.level, 1.0),
+        frequency=limit.peak,
+        unstable=_first_unstable(linear, late, [covered.peak for covered in covers]),
     )
     if not found.holds:
         return found
@@ -83,6 +77,23 @@ def guarantee(linear: LinearLoop) -> Guarantee:
     # disks in all inputs at once cover a disk in one
     each = [max(_disk(whole, (i,)), disk_all) for i in range(m)]
     return found._replace(disk=np.array(each), disk_all=disk_all)
+
+
+def _first_unstable(linear: LinearLoop, late: float, peaks: list[float]) -> Unstable | None:
+    """The first unstable aircraft found, u in time or late by the whole time."""
+    box = linear.box
+    assert box is not None  # noqa: S101 - for mypy
+    candidates = []
+    for extra in sorted({0.0, late}):
+        loop = linear.loop._replace(delay=linear.loop.delay + extra)
+        delayed = linear._replace(loop=loop)
+        whole = uncertain_loop(linear.nominal, linear.law, loop, box)
+        for part in parts_of(whole):
+            for w in sorted({*peaks, 0.0}):  # a slow divergence hides beside a peak
+                reached = first_unstable(part, w, len(box.names), LARGEST / float(box.part.max()))
+                confirmed = None if reached is None else _confirmed(delayed, reached[1])
+                candidates += [] if confirmed is None else [confirmed]
+    return min(candidates, key=lambda each: each.deviation, default=None)
 
 
 def _disk(whole: UncertainLoop, inputs: tuple[int, ...]) -> float:

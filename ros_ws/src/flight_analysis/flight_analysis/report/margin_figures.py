@@ -201,7 +201,8 @@ def guarantee_text(promise: Guarantee) -> list[str]:
     """A guarantee in sentences."""
     stable = math.floor(1e3 * promise.stable) / 10.0
     where = f"limit of the bound at {promise.frequency:.2g} rad/s"
-    lines = [f"guarantee: stable for every aircraft within {stable:.1f} % ({where})"]
+    late = f", u up to {1e3 * promise.late:g} ms late," if promise.late else ""
+    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late} ({where})"]
     if promise.unstable is None:
         lines.append("no unstable aircraft found within 99 %")
     else:
@@ -232,6 +233,7 @@ def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
     """A guarantee: deviations as parts of an entry, frequencies in rad/s."""
     return {
         "uncertainty": promise.uncertainty,
+        "late": promise.late,
         "holds": promise.holds,
         "stable": promise.stable,
         "frequency": promise.frequency,
