@@ -189,6 +189,9 @@ class Gains:
     worst: Path | None = setting(
         "With --guarantee: folder for the first unstable aircraft, airframe.yaml and scenario.yaml."
     )
+    late: float = setting(
+        "With --guarantee: u is late by an unknown time of 0 to this in each input, s.", default=0.0
+    )
     as_json: bool = json_option()
 
     def execute(self) -> None:
@@ -199,7 +202,9 @@ class Gains:
             "it alone",
             "--write beside it, without --observer",
         )
-        require_guarantee(check=self.check, guaranteed=self.guaranteed, worst=self.worst)
+        require_guarantee(
+            check=self.check, guaranteed=self.guaranteed, worst=self.worst, late=self.late
+        )
         rate, delay, origin = _loop_of_px4(self.px4, self.rate, self.delay)
         result = replace(self, rate=rate, delay=delay)._result()
         if self.page is not None:
@@ -230,7 +235,7 @@ class Gains:
         if not self.guaranteed:
             return _Result({"scenario": answer})
         progress("bounding every aircraft of the box")
-        promise = guarantee(answer.loop_with_box())
+        promise = guarantee(answer.loop_with_box(), self.late)
         write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _Result({"scenario": answer}, promise=promise)
 

@@ -15,17 +15,21 @@ from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_cli.output import LICENCE, new_table, write_text
+from flight_core.arguments import as_number
 from flight_core.files import writing
 from flight_core.parameters import require
+from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.margins import disk_gain, disk_phase
 
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 
-def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None) -> None:
-    """Raise ParameterError for a guarantee without --check, or its folder without a guarantee."""
+def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None, late: float) -> None:
+    """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
     require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
     require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
+    require(guaranteed or late == 0.0, "late", "it alone", "--guarantee beside it")
+    as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
 
 
 def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
