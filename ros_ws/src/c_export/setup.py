@@ -12,7 +12,15 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["c_export"],
-    package_data={"c_export": ["py.typed", "source/*.*", "source/px4/*"]},
+    package_data={
+        "c_export": [
+            "py.typed",
+            "source/*.*",
+            "source/px4/*",
+            "source/rates/*",
+            "source/ardupilot/*",
+        ]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/c_export"]),
         ("share/c_export", ["package.xml"]),

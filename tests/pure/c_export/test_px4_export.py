@@ -16,10 +16,10 @@ import typer
 from pytest import approx
 from tests.conftest import REPOSITORY, refusing
 
+from c_export.autopilots import AXES, MODULE, SAMPLES, write_px4
 from c_export.constants import exportable
 from c_export.events import flight_recordings
 from c_export.proof import FLAGS, PARAMETERS, build, write_code
-from c_export.px4 import AXES, MODULE, SAMPLES, write_px4
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -319,7 +319,7 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
         rates.vary(aircraft={"actuators": {"upper": []}}),
         r"^aircraft\.actuators\.upper: found no end stop of elevator",
     )
-    with pytest.raises(typer.BadParameter, match="--c FOLDER or --px4 FOLDER"):
+    with pytest.raises(typer.BadParameter, match="--c FOLDER, --px4 FOLDER or"):
         Export(scenario="osprey_servo").execute()
     assert set(AXES) == set("pqr")
 

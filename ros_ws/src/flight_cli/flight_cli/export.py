@@ -46,6 +46,7 @@ class Export:
         "Folder to write the C code and the report of the proof to.", "--c", "--output"
     )
     px4: Path | None = option("Folder to write an external module of PX4 to, in place of --c.")
+    ardupilot: Path | None = option("Folder to write a fast task of ArduPlane to, in place of --c.")
     run: Path | None = option("Prove with the ticks of a recorded run, in place of flights.")
     float32: bool = option(
         "Compute in float. The proof then bounds the difference of u.", default=False
@@ -75,20 +76,22 @@ class Export:
 
     def execute(self) -> None:
         """Write the code, prove it, show the proof."""
-        chosen = self.folder or self.px4
-        if chosen is None or (self.folder and self.px4):
-            raise typer.BadParameter("expected --c FOLDER or --px4 FOLDER")
+        folders = {None: self.folder, "px4": self.px4, "ardupilot": self.ardupilot}
+        chosen = {autopilot: path for autopilot, path in folders.items() if path is not None}
+        if len(chosen) != 1:
+            raise typer.BadParameter("expected --c FOLDER, --px4 FOLDER or --ardupilot FOLDER")
+        ((autopilot, target),) = chosen.items()
         recorded = None if self.run is None else read_run(self.run)
         if recorded is not None:
             warn_of_lacks(recorded)
         with Console(stderr=True, quiet=self.as_json).status("flying and comparing"):
             exported = write_export(
                 self.scenario,
-                chosen,
+                target,
                 **values_of(self, *PROOF, "float32", "samples", "fmu"),
                 run=recorded,
                 compiler=self.compiler or (),
-                px4=self.px4 is not None,
+                autopilot=autopilot,
                 proof=not self.without_proof,
             )
         if self.as_json:

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from c_export.autopilots import MODULE, SAMPLES, VEHICLE, write_ardupilot, write_px4
 from c_export.constants import exportable
 from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import build_fmu
 from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
-from c_export.px4 import MODULE, SAMPLES, write_px4
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_path
@@ -24,6 +24,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # drawn steps of a recording
 LONGEST = 20.0  # s, of a flight without a duration
+SHELLS = {"px4": (write_px4, MODULE), "ardupilot": (write_ardupilot, VEHICLE)}
+"""What writes the code for an autopilot, and where the code lies in the folder."""
 
 
 class Exported(NamedTuple):
@@ -52,7 +54,7 @@ def export(
     compiler: Sequence[str] = (),
     runner: str = "",
     fmu: bool = False,
-    px4: bool = False,
+    autopilot: str | None = None,
     samples: int | None = None,
     proof: bool = True,
 ) -> Exported:
@@ -70,9 +72,9 @@ def export(
         compiler: Commands of C compilers; gcc and clang where none is named.
         runner: Command that starts a program of the compiler, as qemu-aarch64 for a cross compiler.
         fmu: Write a co-simulation unit of FMI 2.0 too.
-        px4: Write the code as an external module of PX4.
-        samples: Samples of y and of y_m that the controller keeps, 4 or more; None: 8 of a module,
-            else 100.
+        autopilot: "px4" or "ardupilot": write the code as a part of this autopilot.
+        samples: Samples of y and of y_m that the controller keeps, 4 or more; None: 8 inside an
+            autopilot, else 100.
         proof: Whether to prove.
 
     Returns:
@@ -93,14 +95,7 @@ def export(
     controller = exportable(chosen.controller)
     commands = compilers(compiler) if proof or fmu else []
     starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
-    kept = samples or (SAMPLES if px4 else SAMPLE_BUFFER_SIZE)
-    if px4:
-        code = folder / MODULE
-        files = write_px4(chosen, folder, float32=float32, samples=kept)
-    else:
-        code = folder
-        model = chosen.reference_model
-        files = write_code(controller, title, folder, model, float32=float32, samples=kept)
+    code, files, kept = _write(chosen, folder, autopilot, samples, float32=float32)
     if fmu:
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU))
     if not proof:
@@ -118,6 +113,23 @@ def export(
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
+
+
+def _write(
+    scenario: Scenario, folder: Path, autopilot: str | None, samples: int | None, *, float32: bool
+) -> tuple[Path, list[Path], int]:
+    """Write the code, alone or for an autopilot: its folder, all files, and the samples kept."""
+    if autopilot is None:
+        kept = samples or SAMPLE_BUFFER_SIZE
+        controller = exportable(scenario.controller)
+        title = printable(scenario.name)
+        model = scenario.reference_model
+        files = write_code(controller, title, folder, model, float32=float32, samples=kept)
+        return folder, files, kept
+    require(autopilot in SHELLS, "autopilot", autopilot, f"one of {', '.join(SHELLS)}")
+    write, place = SHELLS[autopilot]
+    kept = samples or SAMPLES
+    return folder / place, write(scenario, folder, float32=float32, samples=kept), kept
 
 
 def _logged(

@@ -2,13 +2,13 @@
  * SPDX-License-Identifier: Apache-2.0
  *
  * Which rate controller flies: RISE-DI or the spare, the autopilot's own. No header of an autopilot: times in us of its clock,
- * roll, pitch, yaw in rad/s, torque setpoints from -1 to 1. rise_di_px4.h maps these to the channels of the scenario.
+ * roll, pitch, yaw in rad/s, torque setpoints from -1 to 1. rise_di_axes.h maps these to the channels of the scenario.
  */
 #ifndef RISE_DI_RATES_H
 #define RISE_DI_RATES_H
 
 #include "rise_di.h"
-#include "rise_di_px4.h"
+#include "rise_di_axes.h"
 
 /* Why the spare flies. */
 typedef enum {
@@ -63,6 +63,9 @@ typedef struct {
 
 /* Begin with the spare. */
 void rise_di_rates_start(rise_di_rates *rates);
+
+/* Whether samples of this rate, Hz, are enough for a tick a period. */
+bool rise_di_rates_is_fast_enough(float rate);
 
 /* A cycle, at each sample of the rates and when these stop. Returns whether RISE-DI flies; rates->torque is to be sent. */
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle);

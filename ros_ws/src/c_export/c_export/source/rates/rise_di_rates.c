@@ -180,6 +180,8 @@ void rise_di_rates_start(rise_di_rates *rates) {
     }
 }
 
+bool rise_di_rates_is_fast_enough(float rate) { return (rate * (float)exported.period_ns) > 0.99e9f; }
+
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle) {
     const bool fresh = cycle->rates_us > rates->last_us;
     const float step = fresh ? least_of((float)(cycle->rates_us - rates->last_us) * 1e-6f, LONGEST) : 0.0f;

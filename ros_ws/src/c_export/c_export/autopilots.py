@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of body rates as an external module of PX4: the exported C code, and files of
-source/px4 around it.
+"""The controller of body rates inside an autopilot: the exported C code, source/rates that decides
+which controller flies, and the autopilot's shell, source/px4 or source/ardupilot.
 """
 
 import shutil
@@ -16,9 +16,10 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
-"""Channels of y and their axes of PX4: roll, pitch, yaw."""
+"""Channels of y and the axes of autopilots: roll, pitch, yaw."""
 
 MODULE = "src/modules/rise_di_control"
+VEHICLE = "ArduPlane"
 SAMPLES = 8  # kept: y_m is stepped past each y, so a tick needs the newest y and two of y_m
 SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed: where the dynamic pressure is clipped
 
@@ -27,7 +28,14 @@ FILES = {
     "msg/CMakeLists.txt": "set(config_msg_list_external RiseDiStatus.msg PARENT_SCOPE)\n",
     "extras.txt": "fw_rate_control stop\nfw_rate_control start vtol\nrise_di_control start\n",
 }
-"""Texts that are equal for every scenario."""
+"""Texts of PX4 that are equal for every scenario."""
+
+HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
+    void rise_di();
+ArduPlane/Plane.cpp, in scheduler_tasks, behind FAST_TASK(stabilize),
+    FAST_TASK(rise_di),
+"""
+"""The two lines that ArduPlane needs beside the files."""
 
 MESSAGE = """# Rate controller of RISE-DI: a cycle, in the order {channels}
 uint8 ORB_QUEUE_LENGTH = 16  # the logger misses no tick
@@ -55,42 +63,75 @@ def write_px4(
     The outputs are body rates; an input of u at the upper end stop of its actuator is a torque of
     1, with the sign of D.
     """
+    outputs = scenario.controller.outputs
+    files = _write(
+        scenario, folder, MODULE, "px4", AXES, "PX4 controls the speed",
+        float32=float32, samples=samples,
+    )  # fmt: skip
+    message = MESSAGE.format(channels=", ".join(outputs), m=len(outputs))
+    return [*files, *_texts({**FILES, "msg/RiseDiStatus.msg": message}, folder)]
+
+
+def write_ardupilot(
+    scenario: Scenario, folder: Path, *, float32: bool, samples: int = SAMPLES
+) -> list[Path]:
+    """Write the files of a fast task of ArduPlane to a folder, for its tree; hooks.txt has two
+    lines of it. Raises ParameterError.
+
+    The outputs are q, p or both; an input of u at the upper end stop is a deflection of 45 degrees.
+    """
+    axes = {name: axis for name, axis in AXES.items() if name != "r"}
+    files = _write(
+        scenario, folder, VEHICLE, "ardupilot", axes,
+        "ArduPlane controls the speed and coordinates turns by the rudder",
+        float32=float32, samples=samples,
+    )  # fmt: skip
+    return [*files, *_texts({"hooks.txt": HOOKS}, folder)]
+
+
+def _write(
+    scenario: Scenario,
+    folder: Path,
+    place: str,
+    shell: str,
+    axes: Mapping[str, int],
+    reason: str,
+    *,
+    float32: bool,
+    samples: int,
+) -> list[Path]:
+    """Write code, source/rates and a shell to `place` in a folder, for outputs among `axes`."""
     controller = exportable(scenario.controller)
     outputs = controller.outputs
-    expected = "some of p, q, r: PX4 controls the speed"
-    require(set(outputs) <= set(AXES), "controller.outputs", ", ".join(outputs), expected)
+    expected = f"some of {', '.join(sorted(axes))}: {reason}"
+    require(set(outputs) <= set(axes), "controller.outputs", ", ".join(outputs), expected)
     require(
         controller.allocation is None,
         "controller.allocation",
         "a section",
-        "none: PX4 allocates the torque",
+        "none: the autopilot allocates the torque",
     )
-    module = folder / MODULE
-    files = write_code(
-        controller,
-        scenario.name,
-        module,
-        scenario.reference_model,
-        float32=float32,
-        samples=samples,
-    )
-    message = MESSAGE.format(channels=", ".join(outputs), m=len(outputs))
-    texts = {
-        **FILES,
-        "msg/RiseDiStatus.msg": message,
-        f"{MODULE}/rise_di_px4.h": _map(scenario, "F" if float32 else ""),
-    }
-    with writing("px4", folder, "a folder that can"):
-        for source in sorted((SOURCE / "px4").iterdir()):
-            files.append(Path(shutil.copyfile(source, module / source.name)))
+    code = folder / place
+    model = scenario.reference_model
+    files = write_code(controller, scenario.name, code, model, float32=float32, samples=samples)
+    with writing(shell, folder, "a folder that can"):
+        for part in ("rates", shell):
+            for source in sorted((SOURCE / part).iterdir()):
+                files.append(Path(shutil.copyfile(source, code / source.name)))
+    return [*files, *_texts({"rise_di_axes.h": _axes(scenario, "F" if float32 else "")}, code)]
+
+
+def _texts(texts: Mapping[str, str], folder: Path) -> list[Path]:
+    """Write texts by their names to a folder."""
+    with writing("export", folder, "a folder that can"):
         for name, text in texts.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_file(folder / name, text)
-    return [*files, *(folder / name for name in texts)]
+    return [folder / name for name in texts]
 
 
-def _map(scenario: Scenario, suffix: str) -> str:
-    """The text of rise_di_px4.h: axes, torque of a unit of u, and the speed at which it holds."""
+def _axes(scenario: Scenario, suffix: str) -> str:
+    """The text of rise_di_axes.h: axes, torque of a unit of u, and the speed at which it holds."""
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))
@@ -104,11 +145,11 @@ def _map(scenario: Scenario, suffix: str) -> str:
     speed = channels.speed
     lines = [
         (
-            "/* Axes, signs and sizes of PX4 for the channels of the scenario, written by `rise-di "
-            "export`. */"
+            "/* Axes, signs and sizes of the autopilot for the channels of the scenario, written "
+            "by `rise-di export`. */"
         ),
-        "#ifndef RISE_DI_PX4_H",
-        "#define RISE_DI_PX4_H",
+        "#ifndef RISE_DI_AXES_H",
+        "#define RISE_DI_AXES_H",
         (
             f"#define RISE_DI_AXES {{{', '.join(str(AXES[name]) for name in controller.outputs)}}} "
             "/* roll 0, pitch 1, yaw 2 */"

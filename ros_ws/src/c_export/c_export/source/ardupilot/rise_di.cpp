@@ -1,0 +1,98 @@
+// SPDX-FileCopyrightText: RISE-DI contributors
+// SPDX-License-Identifier: Apache-2.0
+//
+// A fast task of ArduPlane between stabilize and set_servos: rates and deflections to rise_di_rates.c and back. Its own rate
+// controllers run on as the spare. Deflections are hundredths of a degree, 4500 at the end stop.
+#include "Plane.h"
+
+extern "C" {
+#include "rise_di_rates.h"
+}
+
+#ifndef RISE_DI_SWITCH
+#define RISE_DI_SWITCH 8 // channel of the transmitter, 1 to 16: above 1700 us RISE-DI flies
+#endif
+#ifndef RISE_DI_MAX_AGE
+#define RISE_DI_MAX_AGE 0.04f // s, of the gyro, at which the spare takes over
+#endif
+#ifndef RISE_DI_MAX_ERROR
+#define RISE_DI_MAX_ERROR 3.0f // rad/s, distance of a rate from its reference at which the spare takes over
+#endif
+
+static const float END = 4500.0f;
+static const SRV_Channel::Function surfaces[3] {SRV_Channel::k_aileron, SRV_Channel::k_elevator, SRV_Channel::k_rudder};
+
+static const char *text_of(bool flies, const rise_di_rates &rates)
+{
+    return flies ? "RISE-DI flies" : rise_di_refusal_text(rates.refusal);
+}
+
+static void write_log(const rise_di_rates &rates)
+{
+#if HAL_LOGGING_ENABLED
+    const rise_di_controller &law = rates.controller;
+    float y[3] {}, y_m[3] {}, u[3] {};
+
+    for (int i = 0; i < RISE_DI_M; i++) {
+        y[i] = (float)law.y[i];
+        y_m[i] = (float)law.y_m[i];
+        u[i] = (float)law.u[i];
+    }
+
+    AP::logger().WriteStreaming("RDI", "TimeUS,Y0,Y1,Y2,M0,M1,M2,U0,U1,U2,N,Ref", "QfffffffffIB", rates.y_us,
+                                (double)y[0], (double)y[1], (double)y[2], (double)y_m[0], (double)y_m[1], (double)y_m[2],
+                                (double)u[0], (double)u[1], (double)u[2], (unsigned)rates.number, (unsigned)rates.refusal);
+#endif
+}
+
+void Plane::rise_di()
+{
+    static rise_di_rates rates;
+    static bool begun = false;
+
+    if (!begun) {
+        rise_di_rates_start(&rates);
+        rates.started = rates.started && rise_di_rates_is_fast_enough((float)scheduler.get_loop_rate_hz());
+        begun = true;
+    }
+
+    const Vector3f &gyro = ahrs.get_gyro();
+    const bool manual = control_mode == &mode_manual || control_mode == &mode_training || control_mode == &mode_initializing;
+    const float targets[3] {rollController.get_pid_info().target, pitchController.get_pid_info().target,
+                            yawController.get_pid_info().target};
+    rise_di_cycle cycle {};
+    cycle.now_us = AP_HAL::micros64();
+    cycle.rates_us = AP::ins().get_gyro_health() ? cycle.now_us : rates.last_us;
+    cycle.setpoint_us = cycle.now_us; // stabilize has run in this loop
+    cycle.enabled = RC_Channels::get_radio_in(RISE_DI_SWITCH - 1) > 1700;
+    cycle.armed = hal.util->get_soft_armed();
+    cycle.has_rates = !manual;
+    cycle.landed = !is_flying();
+#if HAL_QUADPLANE_ENABLED
+    cycle.has_rates = cycle.has_rates && !quadplane.in_vtol_mode() && !quadplane.in_assisted_flight();
+#endif
+
+    for (int k = 0; k < 3; k++) {
+        cycle.rates[k] = gyro[k];
+        cycle.setpoint[k] = radians(targets[k]);
+        cycle.spare[k] = SRV_Channels::get_output_scaled(surfaces[k]) / END;
+    }
+
+    float airspeed = 0.0f;
+    cycle.airspeed = ahrs.airspeed_EAS(airspeed) ? airspeed : 0.0f;
+    cycle.max_age = RISE_DI_MAX_AGE;
+    cycle.max_error = RISE_DI_MAX_ERROR;
+
+    const bool flew = rates.refusal == RISE_DI_FLIES;
+    const bool flies = rise_di_rates_run(&rates, &cycle);
+
+    for (int k = 0; k < 3 && !manual; k++) {
+        SRV_Channels::set_output_scaled(surfaces[k], rates.torque[k] * END);
+    }
+
+    if (flies != flew) {
+        GCS_SEND_TEXT(flies ? MAV_SEVERITY_INFO : MAV_SEVERITY_WARNING, "RISE-DI: %s", text_of(flies, rates));
+    }
+
+    write_log(rates);
+}
