@@ -132,11 +132,7 @@ def select_gains(
     chosen.rise_di()
     require(callable(progress), "progress", progress, "a function of a text")
     require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
-    loop = _loop(chosen, frame, rate, y_rate, lag, delay)
-    if mixing == FULL or len(frame.inputs) > len(frame.outputs):
-        loop = _allocated(loop, chosen, frame)
-    else:
-        loop = _with_limits(_without_allocation(loop, chosen), chosen, frame)
+    loop = _mixed(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame, mixing)
     seen = through_allocation(frame, loop.base)
     setting = loop._replace(
         inputs=as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order"),
@@ -276,6 +272,15 @@ def _loop(
             base=loop.base.model_copy(update={"max_age": age}),
         )
     return loop
+
+
+def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: str) -> LoopSetting:
+    """The loop with an allocation where the airframe or the mixing asks for one, else with the
+    limits of the actuators.
+    """
+    if mixing == FULL or len(airframe.inputs) > len(airframe.outputs):
+        return _allocated(loop, scenario, airframe)
+    return _with_limits(_without_allocation(loop, scenario), scenario, airframe)
 
 
 def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
