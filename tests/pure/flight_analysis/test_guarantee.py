@@ -16,8 +16,11 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.guarantee import guarantee
+from flight_analysis.closed_loop.kept_guarantee import keep, kept
 from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.html import write_loop_page
+from flight_analysis.report.margin_figures import guarantee_text
 from flight_cli.cli import application
 from flight_core.vectors import FloatArray
 from rise_di_controller import structured_value
@@ -241,6 +244,30 @@ def test_search_over_two_entries_is_brute_force() -> None:
     brute = loop_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
     assert search.worst.phase == approx(brute.phase, rel=1e-6)
     assert search.worst.disk == approx(brute.disk, rel=1e-3)
+
+
+@pytest.fixture(autouse=True)
+def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command keeps what it computed in a folder of the test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+
+
+def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Path) -> None:
+    linear = integrator(150.0, 0.1)
+    assert kept(linear) is None
+    promise = guarantee(linear)
+    keep(linear, promise._replace(late=0.01))  # a report speaks of u in time
+    assert kept(linear) is None
+    keep(linear, promise)
+    again = kept(linear)
+    assert again is not None
+    assert guarantee_text(again) == guarantee_text(promise)
+    write_loop_page(tmp_path / "loop.html", "loop", linear)
+    assert guarantee_text(promise)[0] in (tmp_path / "loop.html").read_text()
+    assert kept(integrator(151.0, 0.1)) is None  # another gain
+    (file,) = (tmp_path / "caches" / "rise-di" / "guarantees").iterdir()
+    file.write_text("{")
+    assert kept(linear) is None
 
 
 def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:

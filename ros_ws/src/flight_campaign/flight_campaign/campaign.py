@@ -26,7 +26,9 @@ from aircraft_sim.uncertainty import (
     gust_directions,
     sampled_matrices,
 )
-from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
+from flight_analysis.closed_loop.guarantee import Guarantee
+from flight_analysis.closed_loop.kept_guarantee import kept
+from flight_analysis.closed_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign import equipment, learning_flights
 from flight_campaign.benchmark_course import Course, build_course
@@ -520,6 +522,14 @@ class Campaign:
                 definition.seed,
                 definition.spread,
             )
+        except ParameterError:
+            return None
+
+    def guarantee(self, case: int) -> Guarantee | None:
+        """The guarantee that was computed for the loop of a case; None without one."""
+        scenario = self.definition.scenario(case)
+        try:
+            return kept(scenario_loop(scenario, scenario.controller))
         except ParameterError:
             return None
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
+from flight_analysis.closed_loop.guarantee import Guarantee
 from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
@@ -26,7 +27,12 @@ from flight_analysis.report.display_units import (
     display_units,
 )
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
-from flight_analysis.report.margin_figures import LEAST_MARGINS, least_margins, margins_as_json
+from flight_analysis.report.margin_figures import (
+    LEAST_MARGINS,
+    guarantee_as_json,
+    least_margins,
+    margins_as_json,
+)
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_analysis.report.summary import finite_or_null
@@ -70,6 +76,12 @@ OVERVIEW_LEGEND = (
 )
 
 
+GUARANTEE_LEGEND = (
+    "largest deviation of each entry of A and B, u in time, no saturation; computed before by "
+    "rise-di gains --check --guarantee for this loop"
+)
+
+
 LEARNER_LEGEND = (
     "first model: when it flew; models refused: by the learner, which tells why in the flight, "
     "or by the controller; fallbacks:"
@@ -95,6 +107,7 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
                 "fly_again": _write_worst(campaign, case, tally),
             }
             | {"margins": None if loop_margins is None else margins_as_json(loop_margins)}
+            | {"guarantee": _guarantee_as_json(campaign.guarantee(case))}
             | {"influence": _influence(campaign, case, tally)}
             for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True))
         ]
@@ -114,6 +127,10 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
         write_file(campaign.folder / SUMMARY, json.dumps(figures, indent=1))
         write_page(campaign.folder / REPORT, definition, tallies, cases, margins)
     return figures, overview(definition, tallies, margins)
+
+
+def _guarantee_as_json(promise: Guarantee | None) -> dict[str, Any] | None:
+    return None if promise is None else guarantee_as_json(promise)
 
 
 def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
@@ -206,6 +223,8 @@ def write_page(
         f"above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
+    if any(case["guarantee"] for case in cases):
+        tables.append(_guarantees(labels, cases))
     if scenario.learns():
         tables.append(_without_model(labels, tallies))
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
@@ -237,6 +256,20 @@ def write_page(
     ]
     page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
     write_file(path, page_html(page))
+
+
+def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+    """The guarantees that were computed for the loops of the cases."""
+    rows = []
+    for label, case in zip(labels, cases, strict=True):
+        promise = case["guarantee"]
+        first = None if promise is None else promise["unstable"]
+        shown = [None if promise is None else promise["stable"]]
+        shown.append(None if first is None else first["deviation"])
+        rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in shown)])
+    heads = ("stable for every aircraft within, %", "first unstable aircraft found, %")
+    columns = [Column("", head) for head in heads]
+    return Table("Guarantee of the linear loop", columns, rows, GUARANTEE_LEGEND)
 
 
 def overview(

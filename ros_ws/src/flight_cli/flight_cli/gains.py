@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flight_analysis.closed_loop.guarantee import Guarantee, guarantee
+from flight_analysis.closed_loop.kept_guarantee import keep
 from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
@@ -235,7 +236,9 @@ class Gains:
         if not self.guaranteed:
             return _Result({"scenario": answer})
         progress("bounding every aircraft of the box")
-        promise = guarantee(answer.loop_with_box(), self.late)
+        loop = answer.loop_with_box()
+        promise = guarantee(loop, self.late)
+        keep(loop, promise)
         write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _Result({"scenario": answer}, promise=promise)
 

@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from flight_analysis.closed_loop.kept_guarantee import kept
 from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import (
@@ -104,7 +105,7 @@ def _write(path: Path, page: Page) -> None:
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
-    table = margin_figures.margin_table(loop_assessment(loop))
+    table = margin_figures.margin_table(loop_assessment(loop), kept(loop))
     _write(path, Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore()))
 
 
@@ -161,7 +162,11 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
             TableGroup(
                 [
                     *flight_tables,
-                    *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))]),
+                    *(
+                        []
+                        if loop is None
+                        else [margin_figures.margin_table(loop_assessment(loop), kept(loop))]
+                    ),
                 ]
             )
         ],

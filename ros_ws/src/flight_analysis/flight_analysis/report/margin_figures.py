@@ -157,13 +157,15 @@ def modes_text(margins: LoopMargins) -> str:
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 
-def margin_table(margins: LoopMargins) -> Table:
-    """The margins of a flight's loop."""
+def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> Table:
+    """The margins of a flight's loop, and the guarantee that was computed for it."""
+    sentences = [MARGIN_LEGEND, modes_text(margins)]
+    sentences += [] if promise is None else guarantee_text(promise)
     return Table(
         "Margins of the linear loop",
         MARGIN_COLUMNS,
         margin_rows(margins),
-        f"{MARGIN_LEGEND}. {modes_text(margins)}",
+        ". ".join(sentences),
     )
 
 

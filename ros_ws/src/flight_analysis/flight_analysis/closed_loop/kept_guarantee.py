@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guarantees that were computed, kept by the loop: a report shows the one of its loop, and computes
+none.
+
+The folder is rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache. A file is named by the digest
+of the nominal loop, so that a changed gain or airframe has none.
+"""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight_analysis.closed_loop.guarantee import Guarantee, Unstable
+from flight_analysis.closed_loop.loop_margins import LinearLoop
+from flight_core.files import write_file
+
+DIGITS = 10  # of the entries in the digest: two ways to the same loop differ by rounding
+BOUND = 1  # counts the ways by which this stack has bounded a loop
+
+
+def keep(linear: LinearLoop, promise: Guarantee) -> None:
+    """Keep a guarantee with u in time. A folder that cannot be written keeps none."""
+    if promise.late:
+        return
+    content = promise._asdict() | {"disk": promise.disk.tolist()}
+    if promise.unstable is not None:
+        content["unstable"] = promise.unstable._asdict()
+    path = _path(linear)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, json.dumps(content, default=float))
+    except OSError:
+        return
+
+
+def kept(linear: LinearLoop) -> Guarantee | None:
+    """The guarantee that was computed for a loop; None without one, or for a damaged file."""
+    try:
+        content: dict[str, Any] = json.loads(_path(linear).read_bytes())
+        first = content["unstable"]
+        content["unstable"] = None if first is None else Unstable(**first)
+        content["disk"] = np.array(content["disk"], dtype=np.float64)
+        return Guarantee(**content | {"inputs": tuple(content["inputs"])})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _path(linear: LinearLoop) -> Path:
+    nominal = linear.nominal
+    loop = linear.loop
+    arrays = (*nominal, *linear.law, loop.lag, np.array([loop.delay, loop.period, BOUND]))
+    digest = hashlib.sha256()
+    for array in arrays:
+        rounded = (f"{value + 0.0:.{DIGITS - 1}e}" for value in np.ravel(array).tolist())
+        digest.update(f"{np.shape(array)} {' '.join(rounded)}".encode())
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(caches) / "rise-di" / "guarantees" / f"{digest.hexdigest()}.json"
