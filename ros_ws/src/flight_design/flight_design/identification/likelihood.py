@@ -373,9 +373,14 @@ class Likelihood:
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
         return Innovations(r, e, -np.sum(e**2, axis=1) / 2.0 - half_log_det)
 
-    def cost(self, theta: FloatArray, used: NDArray[np.bool_]) -> float:
-        """The cost of `fit` for the best levels of a theta, (p,)."""
-        levels = self.levels(theta)
+    def cost(
+        self,
+        theta: FloatArray,
+        used: NDArray[np.bool_],
+        levels: NDArray[np.int64] | None = None,
+    ) -> float:
+        """The cost of `fit` for a theta, (p,), in winds of some levels, or the best of theta."""
+        levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)
 

@@ -4,7 +4,8 @@
 starts.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,15 @@ START_PROGRESS = 5.0
 PROGRESS = 0.3
 
 
+class End(NamedTuple):
+    """Where a search ends."""
+
+    cost: float
+    theta: FloatArray  # (p,)
+    hessian: FloatArray  # (p, p)
+    levels: NDArray[np.int64]  # (spans,) of the wind
+
+
 class Search(Likelihood):
     """The search of the most probable theta of one block."""
 
@@ -45,8 +55,6 @@ class Search(Likelihood):
         self,
         used: NDArray[np.bool_],
         progress: Callable[[], None] = lambda: None,
-        starts: Sequence[int] = STARTS,
-        levels: NDArray[np.int64] | None = None,
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
@@ -55,41 +63,42 @@ class Search(Likelihood):
 
         r are the normalised innovations, S their covariance, N the number of samples. The cost has
         further minima: a wrong wind explains a wrong model. So the search begins several times,
-        with a level of `starts` in a span, and with either sign of what the slope of the wind does
+        with a level of STARTS in a span, and with either sign of what the slope of the wind does
         to q, on means over the shortest lag. From the REFINED best starts, or 0, the search goes on
-        with the level of a span by theta, or with `levels`, and the strengths of the winds are
-        free. At last spans without a level to explain them do not count, nor a few gusts. A theta
-        to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a further
-        start.
+        with the level of a span by theta, and the strengths of the winds are free. The level that
+        most spans have then stands for all, and the search goes on from the best end: turbulence
+        is the same in every span, and levels that change with theta leave the search at a worse
+        minimum. At last spans without a level to explain them do not count, nor a few gusts. A
+        theta to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a
+        further start.
         """
         if begin is None:
-            ends = self._ends(starts, flown, used, levels, progress)
+            ends = self._ends(flown, used, progress)
         else:
             free = np.ones(len(begin), dtype=bool)
             theta = self._started(np.clip(begin, self._lower, self._upper), None, free, progress)
-            ends = [self._refined(theta, levels, used, progress)]
-        _, theta, hessian = min(ends, key=lambda end: end[0])
-        deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
+            ends = [self._refined(theta, None, used, progress)]
+        best = min(ends, key=lambda end: end.cost)
+        same = np.full_like(best.levels, np.bincount(best.levels).argmax())
+        steady = self._refined(best.theta, same, used, progress)
+        best = min(best, steady, key=lambda end: end.cost)
+        theta = best.theta
+        deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
         nominal = np.where(self._errors, 0.0, theta)
-        before = self.predicted(nominal, self.levels(nominal) if levels is None else levels)
-        winds = self.levels(theta) if levels is None else levels
-        return Fit(theta, deviation, before, self.predicted(theta, winds), winds)
+        winds = min(self.levels(nominal), same, key=lambda each: self.cost(nominal, used, each))
+        before = self.predicted(nominal, winds)
+        return Fit(theta, deviation, before, self.predicted(theta, best.levels), best.levels)
 
     def _ends(
-        self,
-        starts: Sequence[int],
-        flown: FloatArray | None,
-        used: NDArray[np.bool_],
-        levels: NDArray[np.int64] | None,
-        progress: Callable[[], None],
-    ) -> list[tuple[float, FloatArray, FloatArray]]:
-        """Costs, thetas and Hessians at the ends of the search from the best starts."""
+        self, flown: FloatArray | None, used: NDArray[np.bool_], progress: Callable[[], None]
+    ) -> list[End]:
+        """The ends of the search from the best starts."""
         coarse = self.coarse
         fitted = coarse.fitted()
         fixed = np.ones(len(self.prior), dtype=bool)
         fixed[self._winds] = False
         candidates = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
-        begins = [(np.zeros(len(self.prior)), level) for level in starts]
+        begins = [(np.zeros(len(self.prior)), level) for level in STARTS]
         if self._is_sheared:
             # with the wrong sign of the slope's effect the search ends at another model
             for sign in SIGNS:
@@ -104,7 +113,7 @@ class Search(Likelihood):
             candidates.append((coarse.cost(theta, fitted), theta))
         best = sorted(candidates, key=lambda start: start[0])[:REFINED]
         return [
-            self._refined(theta, levels, used, progress)
+            self._refined(theta, None, used, progress)
             for cost, theta in best
             if cost < best[0][0] + CLOSE
         ]
@@ -136,8 +145,8 @@ class Search(Likelihood):
         levels: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
         progress: Callable[[], None],
-    ) -> tuple[float, FloatArray, FloatArray]:
-        """Cost, theta and Hessian at the end of the search from a start."""
+    ) -> End:
+        """The end of the search from a start, with the levels of the spans by theta or given."""
         for iteration in range(STEPS):
             progress()
             flown = self.levels(theta) if levels is None else levels
@@ -147,7 +156,8 @@ class Search(Likelihood):
             )
             if iteration > 1 and progressed < PROGRESS:
                 break
-        return self.cost(theta, used), theta, hessian
+        winds = self.levels(theta) if levels is None else levels
+        return End(self.cost(theta, used, winds), theta, hessian, winds)
 
     def _step(
         self,
