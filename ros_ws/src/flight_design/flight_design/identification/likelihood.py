@@ -131,8 +131,8 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; where they are identified, the shear, the angles at the begin and the error of the
-    delay, in units of their deviations."""
+    the winds; where they are identified, the shear, the angles at the begin and the errors of the
+    delays, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
@@ -178,7 +178,7 @@ class Likelihood:
         model: NominalModel,
         block: Block,
         airframe: Airframe,
-        delay: float,
+        delay: float | FloatArray,
         unknown: Unknown = KNOWN,
         factor: int | None = None,
         *,
@@ -201,7 +201,7 @@ class Likelihood:
                 means, slow, block, airframe, delay, unknown, factor=1, coupled=coupled
             )
         self._period = recorded.period
-        self._delay = delay / recorded.period
+        self._delay = np.broadcast_to(delay, len(block.inputs)) / recorded.period
         self._delay_deviation = unknown.delay / recorded.period
         self._drift = unknown.drift
         angles = np.flatnonzero(block.restricted(model).gravity.any(axis=0))
@@ -230,7 +230,7 @@ class Likelihood:
 
     def believe(self, deviation: FloatArray) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
-        delay_prior = np.ones(1 if self._delay_deviation else 0)
+        delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
             self.coarse.believe(deviation)
@@ -244,14 +244,16 @@ class Likelihood:
         self._upper[self._errors] = (
             deviation / PRIOR * [largest_error(entry) for entry in self.nominal_entries()]
         )
+        self._late = slice(len(self.prior) - len(delay_prior), len(self.prior))
         rough = np.zeros(len(self.prior), dtype=bool)
         nominal = np.array([entry.nominal for entry in self.nominal_entries()])
         rough[self._errors] = (deviation > PRIOR) & (nominal != 0.0)
         self._upper[rough] = self._factor - 1.0
         self._lower[rough] = 1.0 / self._factor - 1.0
         if len(delay_prior):  # no u acts before it is sent
-            self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
-            self._upper[-1] = MAX_DELAY_ERROR
+            earliest = -self._delay / self._delay_deviation
+            self._lower[self._late] = np.maximum(-MAX_DELAY_ERROR, earliest)
+            self._upper[self._late] = MAX_DELAY_ERROR
         self._winds = slice(len(deviation), len(deviation) + len(wind_prior))
         self._shear = slice(self._winds.stop, self._winds.stop + len(shear_prior))
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
@@ -299,16 +301,23 @@ class Likelihood:
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
         if not self._delay_deviation:
-            return Models(bank, levels, begin, delayed(self._u, self._delay))
-        periods = np.maximum(self._delay + self._delay_deviation * thetas[:, -1], 0.0)
-        late = {value: delayed(self._u, value) for value in set(periods.tolist())}
-        return Models(bank, levels, begin, np.array([late[value] for value in periods.tolist()]))
+            return Models(bank, levels, begin, self._delayed(self._delay))
+        periods = self._delay + self._delay_deviation * thetas[:, self._late]
+        late = {row: self._delayed(np.array(row)) for row in set(map(tuple, periods.tolist()))}
+        return Models(bank, levels, begin, np.array([late[tuple(row)] for row in periods.tolist()]))
 
-    def delay(self, fit: Fit) -> float:
-        """The delay of u, periods."""
-        return self._delay + self._delay_deviation * (
-            float(fit.theta[-1]) if self._delay_deviation else 0.0
-        )
+    def _delayed(self, periods: FloatArray) -> FloatArray:
+        """u, (T, m), each input some periods later, (m,)."""
+        columns = zip(self._u.T, np.maximum(periods, 0.0).tolist(), strict=True)
+        return np.hstack([delayed(u[:, None], late) for u, late in columns])
+
+    def delays(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
+        """The delays of the inputs, s, and their standard deviations, (m,) each."""
+        if not self._delay_deviation:
+            return self._period * self._delay, 0.0 * self._delay
+        late = self._delay + self._delay_deviation * fit.theta[self._late]
+        deviation = self._delay_deviation * fit.deviation[self._late]
+        return self._period * late, self._period * deviation
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """The level of the wind in each span, (spans,), for theta, (p,).
@@ -415,7 +424,8 @@ class Likelihood:
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
         shears = [f"shear of {name}" for name in SHEARED * self._is_sheared]
-        others = [*self.names.winds, *shears, *angles, "delay"]
+        delays = [f"delay of {name}" for name in self.names.inputs]
+        others = [*self.names.winds, *shears, *angles, *delays]
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:

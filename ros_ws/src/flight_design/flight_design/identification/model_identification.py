@@ -80,9 +80,10 @@ class Part(NamedTuple):
     before: Prediction  # of the nominal model
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
-    delay: float  # s, of its inputs
+    delay: float  # s, of the input that is latest by two deviations
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
     delay_deviation: float = 0.0  # s, standard deviation of `delay`; 0 for a known delay
+    delays: tuple[float, ...] = ()  # s, of each input
 
 
 class Identification(NamedTuple):
@@ -142,18 +143,19 @@ class _Study(NamedTuple):
             no_better(*predictions),
         )
         refusal = next(filter(None, sentences), "")
-        delay = self.recorded.period * search.delay(fit)
+        delays, deviations = search.delays(fit)
+        latest = int(np.argmax(delays + 2.0 * deviations))
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
-        delay_deviation = self.unknown.delay * float(fit.deviation[-1])
         return Part(
             search.names.inputs,
             outputs,
             tuple(entries),
             *predictions,
             refusal,
-            delay,
+            float(delays[latest]),
             gusts,
-            delay_deviation,
+            float(deviations[latest]),
+            tuple(delays.tolist()),
         )
 
 
