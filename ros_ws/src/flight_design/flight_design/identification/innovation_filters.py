@@ -456,9 +456,10 @@ class Block(NamedTuple):
     def named(self, airframe: Airframe) -> Names:
         """The names of the indices."""
         every = (airframe.states, airframe.inputs, airframe.outputs, airframe.gusts)
+        lists = [list[str](names) for names in every]
         parts = (
-            tuple(map(tuple(names).__getitem__, places))
-            for names, places in zip(every, self, strict=True)
+            tuple(names[k] for k in places.tolist())
+            for names, places in zip(lists, self, strict=True)
         )
         return Names(*parts)
 

@@ -137,6 +137,7 @@ class Fit(NamedTuple):
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
     levels: NDArray[np.int64]  # (spans,) of the wind, with the identified model
+    flown: Innovations | None = None  # of the model that flies, in its best winds
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
-from flight_design.identification.likelihood import Fit, Likelihood
+from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 # of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
@@ -84,10 +84,15 @@ class Search(Likelihood):
         best = min(best, steady, key=lambda end: end.cost)
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
-        nominal = np.where(self._errors, 0.0, theta)
-        winds = min(self.levels(nominal), same, key=lambda each: self.cost(nominal, used, each))
-        before = self.predicted(nominal, winds)
-        return Fit(theta, deviation, before, self.predicted(theta, best.levels), best.levels)
+
+        def beside(errors: FloatArray | float) -> Innovations:
+            changed = np.where(self._errors, errors, theta)
+            winds = min(self.levels(changed), same, key=lambda each: self.cost(changed, used, each))
+            return self.predicted(changed, winds)
+
+        after = self.predicted(theta, best.levels)
+        by_flown = None if flown is None else beside(flown)
+        return Fit(theta, deviation, beside(0.0), after, best.levels, by_flown)
 
     def _ends(
         self, flown: FloatArray | None, used: NDArray[np.bool_], progress: Callable[[], None]

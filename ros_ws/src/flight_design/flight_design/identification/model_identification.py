@@ -55,6 +55,7 @@ from flight_design.identification.likelihood_search import (
 from flight_design.identification.model_quality import (
     MAX_WHITENESS,
     Prediction,
+    advantage,
     another_airframe,
     correlation,
     no_better,
@@ -84,6 +85,7 @@ class Part(NamedTuple):
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
     delay_deviation: float = 0.0  # s, standard deviation of `delay`; 0 for a known delay
     delays: tuple[float, ...] = ()  # s, of each input
+    file_advantage: float = 0.0  # of the nominal model over the one that flies, see `advantage`
 
 
 class Identification(NamedTuple):
@@ -156,6 +158,9 @@ class _Study(NamedTuple):
             gusts,
             float(deviations[latest]),
             tuple(delays.tolist()),
+            0.0
+            if fit.flown is None
+            else advantage(fit.before, fit.flown, span_length(self.recorded)),
         )
 
 

@@ -73,6 +73,22 @@ def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> F
     return np.asarray(total / LAGS)
 
 
+def advantage(first: Innovations, second: Innovations, span: int) -> float:
+    """By how many standard deviations one model predicts a record better than another one.
+
+        z = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
+
+    Where both models are equally far from the aircraft, z has a standard normal distribution,
+    whichever is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica 57(2), 1989,
+    here with spans of `span` samples, whose d_k are nearly independent.
+    """
+    d = first.log_likelihood - second.log_likelihood
+    count = len(d) // span
+    sums = np.nansum(d[: count * span].reshape(count, span), axis=1)
+    spread = np.sqrt(count) * np.std(sums, ddof=1)
+    return float(np.sum(sums) / spread) if spread > 0.0 else 0.0
+
+
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
     """The best known effect of an input on each output."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
@@ -104,15 +120,20 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
 def another_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
 ) -> str:
-    """The entries at a bound of the search, if more than `allowed`; `factor` is the largest one."""
+    """The entries at a bound of the search, if more than `allowed`; `factor` is the largest one.
+
+    One that the record shows, to half of its deviation before, is too many: the aircraft is beyond.
+    """
     at_bound = []
+    is_shown = False
     for entry in entries:
         lower, upper = -MAX_ERROR, largest_error(entry)
         if factor > MAX_FACTOR and entry.nominal:
             lower, upper = 1.0 / factor - 1.0, factor - 1.0
         if not lower < entry.error < upper:
             at_bound.append(entry.name)
-    if len(at_bound) > allowed:
+            is_shown |= entry.deviation < PRIOR / 2.0
+    if len(at_bound) > allowed or is_shown:
         return (
             f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, "
             f"{1.0 / factor:.2g} or {factor:.2g}"

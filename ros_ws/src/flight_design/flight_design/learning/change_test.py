@@ -73,7 +73,7 @@ def change_test(
     recorded: Recording,
     flown: Airframe,
     actuation: Actuation,
-    delays: Mapping[tuple[str, ...], float] | None = None,
+    delays: Mapping[tuple[str, ...], FloatArray] | None = None,
 ) -> tuple[Change, ...]:
     """The gains G of log-likelihood of the parts of the aircraft by a loss of effect, and inputs
     without effect.
@@ -134,7 +134,12 @@ class Effects(Search):
     """The search for a factor of every column of B of a part."""
 
     def __init__(
-        self, recorded: Recording, flown: Airframe, actuation: Actuation, block: Block, delay: float
+        self,
+        recorded: Recording,
+        flown: Airframe,
+        actuation: Actuation,
+        block: Block,
+        delay: float | FloatArray,
     ) -> None:
         """`delay` of u, s."""
         model = filter_model(flown, actuation, recorded)

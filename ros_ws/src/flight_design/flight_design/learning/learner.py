@@ -24,7 +24,7 @@ from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
-from flight_design.identification.likelihood import HELD_OUT, KNOWN, PRIOR, Unknown
+from flight_design.identification.likelihood import HELD_OUT, KNOWN, Unknown
 from flight_design.identification.model_identification import (
     Identification,
     identify,
@@ -35,9 +35,19 @@ from flight_design.identification.model_quality import (
     another_airframe,
 )
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
+from flight_design.learning.designs import (
+    margin_behind,
+    margin_of,
+    with_deviations,
+    with_margin,
+    without_effect,
+)
 from flight_design.learning.flight_record import SPREAD, FlightRecord, Sample, about, steady_end
 from flight_design.learning.part_checks import (
     DELAY_DEVIATION,
+    as_in_file,
+    back,
+    back_to_file,
     changed,
     explains,
     is_within,
@@ -54,10 +64,6 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 AT_BOUND = 1
-DELAY_LEFT = (
-    0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
-)
-FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
 SHORTEST = (
     20.0 * TRANSIENT
 )  # s, of a record: two held-out seconds of the six that `identify` needs at least
@@ -72,9 +78,10 @@ class Known(NamedTuple):
 
     end_ns: int  # of its window
     deviation: Mapping[str, float]  # of its entries by name, 1
-    delay: float  # of its inputs, s
+    delay: float  # of its latest input, s
     is_rough: bool  # that of the rough airframe as it is
     delay_deviation: float = 0.0  # s, standard deviation of `delay`
+    delays: tuple[float, ...] = ()  # of each input, s
 
     @property
     def latest(self) -> float:
@@ -280,10 +287,13 @@ class Learner:
             reason = "" if rough else part.refusal or not_white(part) or weaker(part, before)
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
+                if part.outputs in learned and self._prior is self._rough and back_to_file(part):
+                    model = with_entries(model, as_in_file(part))
+                    del known[part.outputs]
+                    name = "" if self._design_of_rough is None else self._rough.name
+                    sentences.append(back(part, name))
                 continue
-            entries = part.entries
-            if rough:
-                entries = tuple(entry._replace(error=0.0) for entry in entries)
+            entries = as_in_file(part) if rough else part.entries
             model = with_entries(model, entries)
             deviation = {
                 entry.name: abs(entry.deviation * entry.unit / entry.value)
@@ -291,7 +301,9 @@ class Learner:
                 if entry.value
             }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(end_ns, deviation, part.delay, rough, part.delay_deviation)
+            known[part.outputs] = Known(
+                end_ns, deviation, part.delay, rough, part.delay_deviation, part.delays
+            )
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
                 if rough
@@ -479,7 +491,7 @@ class Learner:
         recent, ratio = self._steady(whole)
         if len(recent.t) < len(whole.t):
             return []
-        delays = {part: known.delay for part, known in old.items()}
+        delays = {part: np.array(known.delays or known.delay) for part, known in old.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         return [change for change in changes if change.outputs in old]
 
@@ -523,7 +535,7 @@ class Learner:
         designed = start.model_copy(update={"learn": None})
         if flying:
             designed = design(with_margin(designed, margin_behind(delay, start)), model)
-            designed = _with_deviations(
+            designed = with_deviations(
                 designed, {k: v for part in known.values() for k, v in part.deviation.items()}
             )
         proposed = with_channels_of(
@@ -532,53 +544,3 @@ class Learner:
         return RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
         )
-
-
-def margin_of(controller: RiseDiConfig) -> float:
-    """The delay margin that a controller loads with, s."""
-    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
-    return controller.observer.margin
-
-
-def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
-    """A controller that loads with another delay margin, s."""
-    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
-    return controller.model_copy(
-        update={"observer": controller.observer.model_copy(update={"margin": margin})}
-    )
-
-
-def margin_behind(delay: float, start: RiseDiConfig) -> float:
-    """The delay margin of a model whose inputs are late by a delay, s: that of the start, or more.
-
-    Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
-    """
-    reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
-    return max(
-        margin_of(start), round(delay + reserve, 4)
-    )  # 0.1 ms, as few digits as the file of a scenario
-
-
-def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
-    """A controller whose model of the feedforward has the standard deviations of B, given by entry
-    and relative to it, PRIOR for an entry that no flight has shown.
-    """
-    model = designed.feedforward
-    assert model is not None  # noqa: S101 - a design has one
-    names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
-    values = tuple(
-        abs(value) * deviation.get(name, PRIOR) for name, value in zip(names, model.B, strict=True)
-    )
-    return designed.model_copy(
-        update={"feedforward": model.model_copy(update={"deviation": values})}
-    )
-
-
-def without_effect(model: Airframe, name: str) -> Airframe:
-    """A model with almost no effect of an input."""
-    column = model.matrix_b()[:, list(model.inputs).index(name)].tolist()
-    effects = zip(model.states, column, strict=True)
-    return with_entries(
-        model,
-        [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value],
-    )

@@ -7,11 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, best_known
 from flight_design.learning.change_test import Change
 
+LIKELIER = 1.645  # standard deviations of a normal distribution, passed with 5 %
 DELAY_DEVIATION = (
     0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
 )
@@ -54,13 +56,40 @@ def too_late(part: Part, delay: float) -> str:
     the loop, s.
     """
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
-    if part.delay < bound - 1e-6:  # s, of rounding
+    late = [
+        name
+        for name, found in zip(part.inputs, part.delays, strict=False)
+        if found >= bound - 1e-6  # s, of rounding
+    ]
+    if not late:
         return ""
-    names = " and ".join(part.inputs)
     return (
-        f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than "
-        f"{1e3 * bound:.0f} ms"
+        f"{' and '.join(late)}: found u {1e3 * bound:.0f} ms late or later, expected less: a servo "
+        "may be slower than its lag says"
     )
+
+
+def back_to_file(part: Part) -> bool:
+    """Whether the nominal model predicts a record better than the one that flies, with a
+    probability of at most 5 % where both are as near to the aircraft.
+    """
+    return part.file_advantage > LIKELIER
+
+
+def back(part: Part, name: str) -> str:
+    """What flies where the airframe file predicts better than the model that flew: the airframe of
+    a name, or the law of the start.
+    """
+    flies = f"the airframe {name} as it is" if name else "the law of the start"
+    return (
+        f"{' and '.join(part.outputs)} by {flies}: the file predicts this record better than the "
+        f"model that flew, by {part.file_advantage:.2g} standard deviations"
+    )
+
+
+def as_in_file(part: Part) -> tuple[Entry, ...]:
+    """The entries of a part as in the airframe file."""
+    return tuple(entry._replace(error=0.0) for entry in part.entries)
 
 
 def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
