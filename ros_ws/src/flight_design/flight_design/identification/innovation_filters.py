@@ -4,7 +4,7 @@
 many models side by side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -455,8 +455,13 @@ class Block(NamedTuple):
 
     def named(self, airframe: Airframe) -> Names:
         """The names of the indices."""
-        every = (airframe.states, airframe.inputs, airframe.outputs, airframe.gusts)
-        lists = [list[str](names) for names in every]
+        every: tuple[Iterable[str], ...] = (
+            airframe.states,
+            airframe.inputs,
+            airframe.outputs,
+            airframe.gusts,
+        )
+        lists = [list(names) for names in every]
         parts = (
             tuple(names[k] for k in places.tolist())
             for names, places in zip(lists, self, strict=True)

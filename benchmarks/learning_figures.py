@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The figures and the picture of benchmarks.learning."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from benchmarks import evidence
+from benchmarks.evidence import row
+from benchmarks.learning_flights import (
+    ALARM_FLIGHT,
+    CELLS,
+    DAMAGED,
+    LATE,
+    SEED,
+    SETTLED,
+    UPDATE,
+    WINDOWS,
+    WITHIN,
+    Cell,
+    Row,
+)
+from benchmarks.tables import plain
+from matplotlib.figure import Figure
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import sampled_matrices
+from control_laws.catalogue import LAWS
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_campaign import batch, tuning
+from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
+from flight_core.vectors import FloatArray
+from flight_design.gains.tuned_gains import load, tuned_file
+
+COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
+LABELS = {
+    "alone": "the law alone",
+    "file": "model of the file",
+    "learner": "learner",
+    "true": "true model",
+}
+RIVALS, OBJECTIVE = (
+    ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"),
+    "gust_turbulence",
+)
+"""Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file
+in the loop of osprey_servo. MRAC measures the full state, and INDI the actuators too."""
+
+
+def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
+    """The figures of every cell, with their goals."""
+    for name, cell in CELLS.items():
+        chosen = [each for each in rows if each.cell == name]
+        if chosen:
+            yield row(f"{name}: aircraft", float(len(chosen)))
+            yield row(
+                f"{name}: replay equal",
+                float(np.mean([each.replayed for each in chosen])),
+                at_least=1.0,
+            )
+            yield row(
+                f"{name}: update, mean",
+                float(np.mean([each.update for each in chosen])),
+                "s",
+                at_most=UPDATE,
+            )
+            yield row(f"{name}: update, longest", max(each.longest for each in chosen), "s")
+            yield from CELL_FIGURES[cell.kind](name, cell, chosen)
+
+
+def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
+    """Scores beside those of the others."""
+    yield from scores(name, chosen)
+    known = [each for each in chosen if not math.isnan(each.true)]
+    shares = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "turning": 0.75, "rough": 0.75}
+    near = shares.get(cell.kind)
+    within = COUPLED_WITHIN if cell.kind == "coupled" else WITHIN
+    share = float(np.mean([each.learner <= within * each.true for each in known]))
+    yield row(
+        f"{name}: share within {100 * (within - 1.0):.0f} % of the true model", share, at_least=near
+    )
+    file = [each for each in chosen if not math.isnan(each.file)]
+    worse = float(np.mean([each.learner > WORSE * each.file for each in file])) if file else 0.0
+    yield row(f"{name}: share 5 % worse than the model of the file", worse, at_most=0.05)
+    margins = [each.margin for each in chosen]
+    yield row(f"{name}: least delay margin left", min(margins), "s", at_least=0.0)
+    yield row(
+        f"{name}: worse than the law alone",
+        float(sum(each.learner > each.alone for each in chosen)),
+        at_most=0.0,
+    )
+    for key, label in LABELS.items():
+        unstable = float(np.mean([getattr(each, f"late_{key}") for each in chosen]))
+        limit = (0.0 if cell.uncertainty < 0.5 else 0.01) if key == "learner" else None
+        yield row(
+            f"{name}: share unstable with u {1e3 * LATE:.0f} ms late, {label}",
+            unstable,
+            at_most=limit,
+        )
+    begun = [each.first for each in chosen if not math.isnan(each.first)]
+    yield row(f"{name}: without a model", float(len(chosen) - len(begun)))
+    if begun:
+        yield row(f"{name}: first model, median", float(np.median(begun)), "s")
+
+
+def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
+    """Lost flights, and mean and largest score of the flights to the end, of each."""
+    for key, label in LABELS.items():
+        values = np.array([getattr(each, key) for each in chosen])
+        flown, whole = values[~np.isnan(values)], values[np.isfinite(values)]
+        if len(flown):
+            lost = float(len(flown) - len(whole))
+            yield row(f"{name}: lost, {label}", lost, at_most=0.0 if key == "learner" else None)
+        if len(whole):
+            yield row(f"{name}: score, {label}", float(np.mean(whole)))
+            yield row(f"{name}: largest score, {label}", float(np.max(whole)))
+
+
+def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
+    """Scores from SETTLED on; whether a dead input was found in time."""
+    yield from scores(name, chosen)
+    yield row(
+        f"{name}: lost with the learner and not with the law alone",
+        float(sum(each.lost for each in chosen)),
+        at_most=0.0,
+    )
+    if cell.kind == "weak":
+        ratio = np.mean([each.learner for each in chosen]) / np.mean([each.true for each in chosen])
+        yield row(f"{name}: mean over that of the true model", float(ratio), at_most=1.05)
+        yield row(
+            f"{name}: share found to have changed",
+            float(np.mean([each.alarms > 0 for each in chosen])),
+        )
+        flown = [json.loads(each.windows) for each in chosen]
+        for key, label in LABELS.items():
+            yield from window_figures(
+                name, label, np.array([each[key] for each in flown if key in each])
+            )
+        return
+    right = [each.found == each.dead and each.found_at <= SETTLED for each in chosen]
+    yield row(
+        f"{name}: share found within {SETTLED - DAMAGED:.0f} s",
+        float(np.mean(right)),
+        at_least=0.95,
+    )
+    wrong = [each.found not in {"", each.dead} for each in chosen]
+    yield row(f"{name}: another input found", float(sum(wrong)), at_most=0.0)
+
+
+def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence.Row]:
+    """Mean scores over WINDOWS of the flights to the end, of scores (N, W)."""
+    if len(whole := values[np.isfinite(values).all(axis=1)]):
+        for (first, end), mean in zip(WINDOWS, whole.mean(axis=0), strict=True):
+            yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
+
+
+def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
+    """Alarms without damage."""
+    yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
+    yield row(
+        f"{name}: false alarms",
+        float(sum(each.alarms + (each.found != "") for each in chosen)),
+        at_most=0.0,
+    )
+
+
+COUPLED_WITHIN = 1.15
+WORSE = 1.05
+CELL_FIGURES = {
+    "learn": learn_figures,
+    "turning": learn_figures,
+    "rough": learn_figures,
+    "coupled": learn_figures,
+    "untold": learn_figures,
+    "weak": damage_figures,
+    "dead": damage_figures,
+    "alarm": alarm_figures,
+}
+
+
+def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
+    """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there
+    with u LATE.
+
+    All aircraft have the same noise. Each law has its model and gains by the airframe file.
+    """
+    benchmark = tuning.build_benchmark(find_scenario("osprey_observer"))
+    tuned = load(tuned_file(find_scenario("osprey_servo")))
+    A, B = sampled_matrices(
+        load_airframe("osprey"), uncertainty, uncertainty, SEED, 0, max(numbers) + 1
+    )
+    of = np.tile(np.array(numbers), 2)
+    late = np.repeat([0, round(LATE / benchmark.model.period)], len(numbers))
+    flights = tuning.benchmark_fleet(A[of], B[of], late, tuning.GUST, benchmark)
+    for name in RIVALS:
+        law = LAWS[name]
+        params = law.params(tuning.as_gains(tuned[name][OBJECTIVE]), benchmark.model)
+        course = benchmark.courses[tuning.GUST][law.feedforward]
+        flown = batch.fly(
+            flights, benchmark.vehicle, course, law.control_law(benchmark.model), params
+        )
+        in_time, delayed = np.split(tuning.score(flown, benchmark.unit), 2)
+        subject = f"rivals, +-{100 * uncertainty:.0f} %"
+        yield row(f"{subject}: score, {law.title}", float(np.mean(in_time)))
+        yield row(f"{subject}: largest score, {law.title}", float(np.max(in_time)))
+        lost = float(np.mean(delayed > LOSS_OF_TRACK_SCORE))
+        yield row(f"{subject}: share lost with u {1e3 * LATE:.0f} ms late, {law.title}", lost)
+
+
+def plot(rows: Sequence[Row]) -> Figure:
+    """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the
+    mean.
+    """
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    for axis, uncertainty in zip(figure.subplots(1, 2, sharey=True), (0.3, 0.5), strict=True):
+        columns: dict[str, tuple[str, list[float]]] = {}
+        for name, cell in CELLS.items():
+            if cell.kind == "learn" and cell.uncertainty == uncertainty:
+                chosen = [each for each in rows if each.cell == name]
+                for key in ("alone", "file", "true"):
+                    columns.setdefault(
+                        LABELS[key].replace(" of", "\nof"),
+                        (COLOURS[key], [getattr(each, key) for each in chosen]),
+                    )
+                columns[f"learned in\n{cell.air}"] = (
+                    COLOURS["learner"],
+                    [each.learner for each in chosen],
+                )
+        for place, (colour, values) in enumerate(columns.values()):
+            spread = place + 0.5 * (np.arange(len(values)) / max(len(values) - 1, 1) - 0.5)
+            axis.plot(spread, values, ".", color=colour, markersize=3, alpha=0.6)
+            axis.plot(
+                [place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2
+            )
+        axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
+        plain(axis, f"A and B +-{100 * uncertainty:g} %: score", lines="y")
+    axis.set_ylim(
+        bottom=0.0
+    )  # of both panels, once all points are drawn: it ends the automatic limits
+    return figure

@@ -1,0 +1,527 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The flights of benchmarks.learning: uncertain aircraft that learn, beside what does not learn."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.turbulence import MODERATE
+from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
+from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
+from flight_analysis.closed_loop.loop_margins import law_order, linear_loop, loop_assessment
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.replay_ticks import vary
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_campaign.learning_flights import learned
+from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
+from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from flight_design.gains.gain_design import observed
+from flight_design.learning.scenario_learner import learner
+from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.proposals import Event
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+REPOSITORY = Path(__file__).parents[1]
+SEED = 11  # of the aircraft
+LEARNED, DAMAGED, SETTLED, END = (
+    64.0,
+    60.0,
+    75.0,
+    100.0,
+)  # s: when the last model flies; the fault, and what counts after it
+WINDOWS = ((0.0, 14.0), (14.0, 30.0), (30.0, DAMAGED), (DAMAGED, SETTLED), (SETTLED, END))
+"""s, of a flight with damage: before the first model, with the first ones, learned, from the damage
+on, and learned again."""
+UPDATE = 1.0  # s, of a core, for the two parts of the osprey
+LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
+REPEATED = 35.0  # s, after which the commands of osprey_learn come again
+ROUGH = 0.6  # deviation of the logarithms of the entries of a rough prior
+WEAK, COUPLING = 0.5, 0.1
+ALARM_FLIGHT = 600.0  # s
+TRAIN = {  # m/s, m, s: a gust every 3 to 7 s
+    "vertical": {"start": 1.0, "speed": 8.0, "length": 15.0, "every": 4.7},
+    "lateral": {"start": 2.5, "speed": 5.0, "length": 12.0, "every": 6.1},
+    "longitudinal": {"start": 4.0, "speed": 4.0, "length": 25.0, "every": 9.7},
+}
+AIR: dict[str, dict[str, Any]] = {
+    "turbulence": {"turbulence": MODERATE},
+    "gusts": {"turbulence": None, "gusts": TRAIN},
+    "calm": {"turbulence": None},
+    "light turbulence": {"turbulence": MODERATE | {"wind": 7.7}},
+    "severe turbulence": {"turbulence": MODERATE | {"wind": 23.1}},
+    "turbulence and gusts": {"turbulence": MODERATE, "gusts": TRAIN},
+    "air that turns": {"turbulence": MODERATE | {"rotary": True}},
+}
+
+
+class Cell(NamedTuple):
+    """What the aircraft of a cell have in common."""
+
+    kind: str  # "learn", "turning", "rough", "coupled", "untold", "weak", "dead" or "alarm"
+    air: str
+    uncertainty: float
+    share: float = 1.0  # of --aircraft
+    most: int = sys.maxsize  # aircraft
+    # keys of the aircraft, with sections, of which neither controller nor learner is told
+    untold: Mapping[str, Any] = MappingProxyType({})
+
+
+def untold(air: str, uncertainty: float = 0.3, **keys: Any) -> Cell:
+    """A cell with what neither controller nor learner is told."""
+    return Cell("untold", air, uncertainty, 0.25, untold=MappingProxyType(keys))
+
+
+CELLS = {
+    f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p)
+    for air in ("turbulence", "gusts", "calm")
+    for p in (0.3, 0.5)
+} | {
+    "rough prior": Cell("rough", "turbulence", 0.3, 0.5),
+    "air that turns": Cell("turning", "air that turns", 0.3, 0.25),
+    "coupled": Cell("coupled", "turbulence", 0.3, 0.25),
+    "u late": untold("turbulence", sensors={"delay": LATE}),
+    **{
+        f"servos {1e3 * late:.0f} ms late": untold("turbulence", actuators={"delay": late})
+        for late in (0.02, 0.03, 0.04)
+    },
+    "slow servos": untold("turbulence", actuators={"lag": [0.04, 0.2, 0.04, 0.04]}),
+    "noise x 3": untold("turbulence", sensors={"noise": [0.0051, 0.09, 0.0051, 0.0051]}),
+    "y in steps": untold("turbulence", sensors={"quantisation": [0.005, 0.25, 0.005, 0.005]}),
+    "severe turbulence, +-50 %": untold("severe turbulence", 0.5),
+    "inertial coupling": untold("turbulence", inertial_coupling=1.0),
+    "air that turns, inertial coupling": untold("air that turns", inertial_coupling=1.0),
+    "weak": Cell("weak", "turbulence", 0.3, 0.5),
+    "dead": Cell("dead", "turbulence", 0.3, 0.5),
+    **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1, 2) for air in AIR},
+}
+OSPREY = Cell(
+    "learn", "calm", 0.3
+)  # any cell with the airframe, the actuators and the noise of the library
+
+
+class Row(NamedTuple):
+    """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not
+    flown.
+    """
+
+    cell: str
+    number: int
+    alone: float = math.nan
+    file: float = math.nan
+    learner: float = math.nan
+    true: float = math.nan
+    late_alone: int = 0  # 1: unstable with u LATE
+    late_file: int = 0
+    late_learner: int = 0
+    late_true: int = 0
+    margin: float = math.nan  # s, delay margin on the true aircraft, learner; -1: unstable
+    first: float = math.nan  # s, when the first model flew
+    models: int = 0
+    refused: int = 0
+    alarms: int = 0  # of the change test
+    dead: str = ""  # the input without effect
+    found: str = ""  # the input found to be without effect
+    found_at: float = math.nan  # s
+    lost: int = 0  # 1: with the learner alone of the two
+    update: float = 0.0  # s of a core, mean: identification, test for a change and design
+    longest: float = 0.0  # s of a core, the same
+    replayed: int = 0
+    windows: str = (
+        ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
+    )
+    events: str = ""
+    revision: str = ""  # of the code that flew
+
+
+class Timed:
+    """A learner, and how long its steps take on one core."""
+
+    def __init__(self, own: Learner) -> None:
+        self._own, self.steps = own, list[float]()
+
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
+        """Of the learner."""
+        self._own.take(stamp_ns, y, u, flown)
+
+    def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
+        """Of the learner."""
+        begin = time.process_time()
+        proposal = self._own.propose(flown, given_up)
+        self.steps.append(time.process_time() - begin)
+        return proposal
+
+
+def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenario:
+    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again
+    and again.
+    """
+    shipped, seed = find_scenario("osprey_learn"), {"seed": 1000 + number}
+    sampled = {"A": cell.uncertainty, "B": cell.uncertainty, "seed": SEED, "number": number}
+    air = AIR[cell.air]
+    air = air | ({"turbulence": air["turbulence"] | seed} if air["turbulence"] else {})
+    pulses: dict[str, dict[str, list[float]]] = {}
+    for name, pulse in shipped.reference_model.pulses.items():
+        begins = [REPEATED * k for k in range(math.ceil(duration / REPEATED))]
+        times = {
+            key: [begin + t for begin in begins for t in getattr(pulse, key)]
+            for key in ("start", "stop")
+        }
+        pulses[name] = times | {"value": list(pulse.value) * len(begins)}
+    aircraft: dict[str, Any] = {"rate": 100.0, "step": 0.005, "uncertainty": sampled}
+    aircraft |= air | dict(cell.untold) | changed
+    for key in ("sensors", "actuators"):
+        section = getattr(shipped.aircraft, key).model_dump()
+        aircraft[key] = section | aircraft.get(key, {})
+    aircraft["sensors"] |= seed
+    reference = {"rate": 100.0, "pulses": pulses}
+    return shipped.vary(flight={"duration": duration}, aircraft=aircraft, reference_model=reference)
+
+
+def evaluation(flown: Scenario) -> Scenario:
+    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned and
+    other noise.
+    """
+    shipped = find_scenario("osprey_observer")
+    own = {
+        key: getattr(flown.aircraft, key).model_dump()
+        for key in ("uncertainty", "actuators", "sensors")
+    }
+    aircraft = own | {"airframe": flown.aircraft.airframe, "rate": 100.0, "step": 0.005}
+    aircraft["inertial_coupling"] = flown.aircraft.inertial_coupling
+    aircraft["sensors"]["seed"] += 5000
+    return shipped.vary(aircraft=aircraft, reference_model={"rate": 100.0})
+
+
+def score(
+    tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf
+) -> float:
+    """Sum over the outputs of the true rms error in units of a score; infinite for a flight that
+    ended early.
+    """
+    if tape.outcome != COMPLETED:
+        return math.inf
+    y_m, truth, t = tape["y_m"], tape["truth"], tape.time("y_m")
+    outputs = tuple(name for name in y_m.names if name not in without)
+    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[
+        (t >= first) & (t < end)
+    ]
+    return float(
+        np.sum(
+            np.sqrt(np.mean(e**2, axis=0))
+            / score_units(outputs, load_airframe("osprey").units_of_outputs())
+        )
+    )
+
+
+@lru_cache(maxsize=4)
+def file_design(cell: Cell) -> RiseDiConfig | None:
+    """The start of a cell with feedforward and observer of the file."""
+    chosen = learning(cell, 0, LEARNED)
+    return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
+
+
+def designed(
+    start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False
+) -> RiseDiConfig | None:
+    """The start with feedforward and observer of a model; None where no relaxation has the
+    margins.
+    """
+    try:
+        return observed(start, scenario, model, MARGIN, uncertain=uncertain)[0]
+    except ParameterError:
+        return None
+
+
+def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
+    """1 where the linear loop of an aircraft is unstable with u LATE, else 0."""
+    rows, columns = law_order(aircraft, controller)
+    plant = LinearPlant(
+        aircraft.matrix_a() + aircraft.matrix_gravity(),
+        aircraft.matrix_b()[:, columns],
+        aircraft.matrix_c()[rows],
+    )
+    loop, m = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate), len(columns)
+    return int(
+        not is_stable(
+            plant, linear_law(controller.tuned_law(), m, loop.period), loop, np.full(m, LATE)
+        )
+    )
+
+
+def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
+    """The delay margin of the linear loop of the true aircraft with its lags, beyond the delays of
+    u and y, s; -1 where the loop is unstable.
+    """
+    aircraft = chosen.aircraft
+    true = aircraft.sampled_airframe()
+    linear = linear_loop(controller, true, true.matrix_a()[None], true.matrix_b()[None])
+    _, columns = law_order(true, controller)
+    lag = np.array(aircraft.actuators.lag)[columns]
+    period = 1.0 / controller.rate
+    late = aircraft.actuators.delay + aircraft.sensors.delay
+    plant = linear.plant._replace(A=linear.plant.A[0], B=linear.plant.B[0])
+    if not is_stable(plant, linear.law, Loop(lag, 0.0, period), np.full(len(lag), late)):
+        return -1.0
+    return loop_assessment(linear._replace(loop=Loop(lag, 0.0, period))).delay - late
+
+
+class Learned(NamedTuple):
+    """A flight that learned."""
+
+    tape: Tape
+    controller: RiseDiConfig  # at its end, without the section learn
+    row: Row
+
+
+def fly(name: str, number: int, chosen: Scenario) -> Learned:
+    """Fly a scenario that learns."""
+    make, events, timed = learner(chosen), list[Event](), list[Timed]()
+    assert make is not None  # noqa: S101 - for the type checker
+
+    def watched(parameters: RiseDiConfig, make: Learn = make) -> Learner:
+        timed.append(Timed(make(parameters)))
+        return timed[0]
+
+    tape = simulate(chosen, learn=watched, announce=events.append)
+    controller: ControllerConfig = chosen.controller
+    for change in tape.changes:
+        controller = vary(controller, change)
+    assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
+    account = learned(tape, events)
+    dead = [event for event in events if "has no effect" in event.sentence]
+    found = dead[0].sentence.partition(" has no effect")[0].split()[-1] if dead else ""
+    summary = Row(
+        name,
+        number,
+        first=account.first_model,
+        models=account.models,
+        refused=account.refused,
+        alarms=sum("changed, log-likelihood" in event.sentence for event in events),
+        found=found,
+        found_at=dead[0].stamp_ns / 1e9 if dead else math.nan,
+        update=float(np.mean(timed[0].steps)),
+        longest=max(timed[0].steps),
+        replayed=int(replay(tape).equal()),
+        events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
+    )
+    return Learned(tape, controller.model_copy(update={"learn": None}), summary)
+
+
+def start_of(chosen: Scenario) -> RiseDiConfig:
+    """The controller of the start, without the section learn."""
+    return chosen.rise_di().model_copy(update={"learn": None})
+
+
+@lru_cache(maxsize=4)
+def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
+    """Score in the flight with gusts, and whether unstable with u late, of what does not learn: the
+    same in every air.
+    """
+    chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
+    flight, aircraft, start = (
+        evaluation(chosen),
+        chosen.aircraft.sampled_airframe(),
+        start_of(chosen),
+    )
+    controllers = {
+        "alone": start,
+        "file": file_design(OSPREY),
+        "true": designed(start, chosen, aircraft),
+    }
+    return {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
+
+
+def frozen(
+    controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
+) -> tuple[float, int]:
+    """Score of a controller in a flight, and whether it is unstable with u late."""
+    if controller is None:
+        return math.nan, 0
+    return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
+
+
+def learn(name: str, cell: Cell, number: int) -> Row:
+    """A learner beside what does not learn."""
+    with TemporaryDirectory() as folder:
+        chosen = learning(cell, number, LEARNED)
+        others = (
+            beside(cell.uncertainty, number) if cell.kind in {"learn", "turning", "rough"} else {}
+        )
+        if cell.kind == "rough":
+            prior = rough(number)
+            Path(folder, "prior.yaml").write_text(as_yaml(prior))
+            chosen = with_prior(chosen, folder)
+        elif cell.kind == "coupled":
+            Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")))
+            Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)))
+            chosen = with_prior(
+                learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder
+            )
+        flown = fly(name, number, chosen)
+        flight, aircraft, start = (
+            evaluation(chosen),
+            chosen.aircraft.sampled_airframe(),
+            start_of(chosen),
+        )
+        if cell.kind == "rough":
+            others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
+        if cell.kind in {"coupled", "untold"}:
+            true = designed(start, chosen, aircraft)
+            controllers = {"alone": start, "file": file_design(OSPREY), "true": true}
+            others = {
+                key: frozen(controller, flight, aircraft) for key, controller in controllers.items()
+            }
+        others = others | {"learner": frozen(flown.controller, flight, aircraft)}
+    values: dict[str, Any] = {key: value for key, (value, _) in others.items()}
+    values |= {f"late_{key}": late for key, (_, late) in others.items()}
+    values["margin"] = margin_left(flown.controller, chosen)
+    return flown.row._replace(**values)
+
+
+def with_prior(chosen: Scenario, folder: str) -> Scenario:
+    """A scenario whose learner begins with the airframe of a file."""
+    settings = chosen.rise_di().model_dump()["learn"] | {
+        "prior": {"file": str(Path(folder, "prior.yaml"))}
+    }
+    return chosen.vary(controller={"learn": settings})
+
+
+def rough(number: int) -> Airframe:
+    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of
+    angles stay.
+    """
+    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number])
+    A, B = airframe.matrix_a(), airframe.matrix_b()
+    dynamic = np.array([[float(state not in {"theta", "phi"})] for state in airframe.states])
+    direct = np.array([[float(state in airframe.outputs)] for state in airframe.states]) * (
+        np.abs(B) > 0.0
+    )
+    of_A, of_B = (np.exp(ROUGH * dynamic * rng.standard_normal(matrix.shape)) for matrix in (A, B))
+    of_B = np.where(direct > 0.0, 1.0 + rng.uniform(-0.3, 0.3, B.shape), of_B)
+    return airframe.with_matrices(
+        A * of_A, B * of_B, wind_factors(airframe, (A * of_A)[None], AIR_RELATIVE)[0]
+    )
+
+
+def coupled(number: int) -> Airframe:
+    """The osprey with entries between its two parts of up to COUPLING of the largest effect on the
+    row, in units of motion.
+    """
+    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number, 1])
+    A, B, size = (
+        airframe.matrix_a(),
+        airframe.matrix_b(),
+        np.array([1.0 if name == "V" else 0.1 for name in airframe.states]),
+    )
+    of_lon = np.array([name in {"V", "alpha", "q", "theta"} for name in airframe.states])
+    other = of_lon[:, None] != of_lon[None, :]
+    other_input = (
+        of_lon[:, None]
+        != np.array([name in {"elevator", "thrust"} for name in airframe.inputs])[None, :]
+    )
+    dynamic = np.array([name not in {"theta", "phi"} for name in airframe.states])
+    row_A, row_B = np.sqrt(np.sum((A * size) ** 2, axis=1)), np.abs(B).max(axis=1)
+    A = (
+        A
+        + COUPLING
+        * rng.uniform(-1.0, 1.0, A.shape)
+        * (row_A * dynamic)[:, None]
+        / size
+        * other
+        * dynamic[None, :]
+    )
+    B = B + COUPLING * rng.uniform(-1.0, 1.0, B.shape) * (row_B * dynamic)[:, None] * other_input
+    return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
+
+
+def damage(name: str, cell: Cell, number: int) -> Row:
+    """A learner beside the others when elevator and aileron lose half of their effect, or one
+    surface all of it.
+    """
+    inputs = tuple(load_airframe("osprey").inputs)
+    surfaces = [key for key in inputs if key != "thrust"]
+    dead = surfaces[number % len(surfaces)] if cell.kind == "dead" else ""
+    hit = {dead} if dead else {"elevator", "aileron"}
+    kind = "lost" if dead else "weak"
+    actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
+    actuators["faults"] = [f"{channel} {kind} {DAMAGED:g}" for channel in inputs if channel in hit]
+    chosen = learning(cell, number, END, actuators=actuators)
+    flown, start = fly(name, number, chosen), start_of(chosen)
+    aircraft = chosen.aircraft.sampled_airframe()
+    B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
+    damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
+    controllers = {"alone": start, "file": file_design(OSPREY)}
+    controllers |= {} if dead else {"true": designed(start, chosen, damaged)}
+    tapes = {
+        key: simulate(chosen.vary(controller=value))
+        for key, value in controllers.items()
+        if value is not None
+    }
+    without = {"elevator": "q", "aileron": "p", "rudder": "r"}.get(dead, "")
+    found: dict[str, Any] = {
+        key: score(tape, SETTLED, (without,))
+        for key, tape in (tapes | {"learner": flown.tape}).items()
+    }
+    lost = int(found["learner"] > LOSS_OF_TRACK_SCORE >= found["alone"])
+    windows = (
+        "" if dead else json.dumps(over_windows(tapes | {"learner": flown.tape}, chosen, aircraft))
+    )
+    return flown.row._replace(**found, dead=dead, lost=lost, windows=windows)
+
+
+def over_windows(
+    tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe
+) -> dict[str, list[float]]:
+    """Scores over WINDOWS; those of the true model until the damage with the model of the aircraft
+    as it was.
+    """
+    found = {
+        key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()
+    }
+    before = designed(start_of(chosen), chosen, aircraft)
+    if "true" in found and before is not None:
+        whole = simulate(chosen.vary(controller=before))
+        found["true"] = [
+            score(whole, first, (), end) if end <= DAMAGED else value
+            for (first, end), value in zip(WINDOWS, found["true"], strict=True)
+        ]
+    return found
+
+
+def alarms(name: str, cell: Cell, number: int) -> Row:
+    """A learner in a long flight without any damage."""
+    return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
+
+
+FLIGHTS = {
+    "learn": learn,
+    "turning": learn,
+    "rough": learn,
+    "coupled": learn,
+    "untold": learn,
+    "weak": damage,
+    "dead": damage,
+    "alarm": alarms,
+}
+
+
+def flown_rows(names: Sequence[str], number: int) -> list[Row]:
+    """The rows of an aircraft in some cells."""
+    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
