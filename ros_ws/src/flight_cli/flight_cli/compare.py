@@ -300,7 +300,7 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     airframe, _ = benchmark.scenario.aircraft.load()
     origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
     margins = (
-        loop_assessment(scenario_loop(benchmark.scenario, controller))
+        loop_assessment(scenario_loop(benchmark.scenario, controller, 1))
         if has_margins(LAWS[name])
         else None
     )
