@@ -32,8 +32,6 @@ MAX_NESTED = 1.0  # comprehensions inside another; these have 0 to 0.5
 MAX_FUNCTION = 60  # lines beside the docstring: a page of an editor
 MAX_FILE = 600  # lines
 STILL_LONG = {
-    "aircraft_sim/params.py",
-    "aircraft_sim/params.py:_check_airframe",
     "autopilot_bridge/bridge.py",
     "autopilot_bridge/node.py",
     "autopilot_bridge/node.py:__init__",
@@ -48,17 +46,6 @@ STILL_LONG = {
     "flight_campaign/law_comparison.py:compare",
     "flight_campaign/missions.py:_fly",
     "flight_campaign/tuning.py:tune",
-    "flight_design/identification/bridge_identification.py",
-    "flight_design/identification/bridge_identification.py:flying_scenario",
-    "flight_design/identification/innovation_filters.py:filter_bank",
-    "flight_design/identification/likelihood.py:__init__",
-    "flight_design/identification/model_identification.py:identify",
-    "flight_design/identification/response_identification.py",
-    "flight_design/identification/step_identification.py",
-    "flight_design/identification/step_identification.py:identify",
-    "flight_design/learning/learner.py",
-    "flight_design/learning/learner.py:_proposal",
-    "flight_design/learning/scenario_learner.py:learn_again",
     "flight_guidance/modes.py",
     "flight_guidance/modes.py:_bank",
     "flight_guidance/node.py:__init__",

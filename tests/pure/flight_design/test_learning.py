@@ -15,9 +15,11 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from pytest import approx
+from scipy import stats
 from tests.conftest import refusing
 from typer.testing import CliRunner
 
+import rise_di
 from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_analysis.closed_loop.replay import replay
@@ -32,13 +34,14 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.identification.likelihood import Innovations
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import Prediction, another_airframe
+from flight_design.identification.model_quality import Prediction, advantage, another_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
 from flight_design.learning.learner import Known, Learner
-from flight_design.learning.scenario_learner import learn_again, learner
+from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di_controller.learned_channels import (
@@ -209,6 +212,20 @@ def test_log_teaches_with_other_settings(flown: Flown) -> None:
     assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
 
 
+def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: Path) -> None:
+    chosen = scenario()
+    last = with_last_model(chosen, read_run(flown.run)).rise_di()
+    assert last.learn is None
+    assert last.models() == flown.learner._last.models() != chosen.rise_di().models()
+    exported = rise_di.export(chosen, tmp_path, run=flown.run, proof=False)
+    assert "rise_di.h" in [path.name for path in exported.files]
+    with refusing("controller.learn: found a section, expected none: C code replaces"):
+        rise_di.export(chosen, tmp_path, proof=False)
+    other = chosen.vary(controller={"rate": 50.0})
+    with refusing("run: found a flight with other parameters, expected those of"):
+        with_last_model(other, read_run(flown.run))
+
+
 def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     tape = read_run(flown.run).tape
     ticks, t = tape["internals"], tape.time("internals")
@@ -321,6 +338,50 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     after = made.propose(1).controller
     assert after is not None
     assert acting_inputs(after) == ("elevator", "thrust")
+
+
+@pytest.mark.parametrize("advantage, is_back", [(2.0, True), (1.0, False)])
+def test_refused_part_goes_back_to_the_file_that_predicts_better(
+    advantage: float, is_back: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beyond 1.645 standard deviations, 5 % by chance; else the model of before stays."""
+    made = learner_that_finds(lateral(), monkeypatch)
+    first = made.propose(0)
+    assert first.controller is not None
+    assert ("p", "r") in made._known
+    refused = lateral(whiteness=9.0)._replace(file_advantage=advantage)
+    monkeypatch.setattr(
+        design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(refused,))
+    )
+    made._planned.appendleft(0)  # an identification is due
+    after = made.propose(first.controller.digest())
+    assert (("p", "r") not in made._known) is is_back
+    assert "innovations of r: found a whiteness of 9" in after.sentence
+    if is_back:
+        # this learner's file was refused before, by the digest 0 that flew
+        assert "p and r by the law of the start: the file predicts" in after.sentence
+        assert after.controller is not None
+        assert after.controller.observer is not None
+        assert after.controller.observer.part == 0.0  # no observer flies
+
+
+def test_advantage_is_the_t_statistic_of_the_spans() -> None:
+    generator = np.random.default_rng(0)
+    first, second = generator.normal(size=(2, 305))
+    r = np.zeros((305, 1))
+    second[7] = np.nan  # a lost sample counts for neither
+    z = advantage(Innovations(r, r, first), Innovations(r, r, second), 10)
+    sums = np.nansum((first - second)[:300].reshape(30, 10), axis=1)
+    assert z == approx(stats.ttest_1samp(sums, 0.0).statistic)
+    assert advantage(Innovations(r, r, first), Innovations(r, r, first), 10) == 0.0
+
+
+def test_entry_that_the_record_shows_at_its_bound_is_refused() -> None:
+    """One that hardly shows, with half of its deviation before or more, may lie there."""
+    hidden = Entry("B", "p", "rudder", 1.0, -0.6, 0.2, 1.0)
+    assert another_airframe([hidden], "osprey", allowed=1) == ""
+    shown = hidden._replace(deviation=0.06)
+    assert "found B[p, rudder] at a bound" in another_airframe([shown], "osprey", allowed=1)
 
 
 def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:

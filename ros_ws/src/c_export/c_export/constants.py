@@ -126,7 +126,7 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
         controller.learn is None,
         "controller.learn",
         "a section",
-        "none: C code replaces no model in flight",
+        "none: C code replaces no model in flight; --run RUN exports the last model of a flight",
     )
     at_trim = controller.schedule is None or not controller.schedule.models
     require(

@@ -47,7 +47,10 @@ class Export:
     )
     px4: Path | None = option("Folder to write an external module of PX4 to, in place of --c.")
     ardupilot: Path | None = option("Folder to write a fast task of ArduPlane to, in place of --c.")
-    run: Path | None = option("Prove with the ticks of a recorded run, in place of flights.")
+    run: Path | None = option(
+        "Prove with the ticks of a recorded run, in place of flights; of a scenario that learns, "
+        "export the last model of the run."
+    )
     float32: bool = option(
         "Compute in float. The proof then bounds the difference of u.", default=False
     )

@@ -18,6 +18,7 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
 from flight_core.text import printable
+from flight_design.learning.scenario_learner import with_last_model
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -64,7 +65,8 @@ def export(
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         folder: Where the code and the report of the proof go.
-        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs.
+        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs. Of a
+            scenario that learns, the last model of this flight is exported.
         float32: Compute in float; the proof then bounds the difference of u.
         duration: Of a flight of the proof, s; None: that of the scenario, at most 20 s.
         drawn: Number of drawn steps of the proof.
@@ -90,6 +92,9 @@ def export(
         'rise_di.h'
     """
     chosen = find_scenario(scenario)
+    if run is not None and chosen.learns():
+        chosen = with_last_model(chosen, run if isinstance(run, RecordedRun) else read_run(run))
+        run = None  # several models flew in its ticks: the proof flies the last one
     folder = as_path(folder, "c", "the path of a folder")
     title = printable(chosen.name)  # of a file, whose name may hold any character
     controller = exportable(chosen.controller)

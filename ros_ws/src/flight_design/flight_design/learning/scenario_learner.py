@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning_loop import Entry, Learn
+from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.files import comment
 from flight_core.modes import Mode
@@ -25,6 +26,7 @@ from flight_design.gains.gain_design import observed
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched
 from flight_design.learning.learner import Learner
+from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.proposals import Updates
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -224,6 +226,20 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     require(bool(steps), "the log", length, first)
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
+
+
+def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
+    """A scenario that learns, with what flew last in one of its runs in place of `learn`. Raises
+    ParameterError for a run of another controller.
+    """
+    start = scenario.rise_di()
+    recorded = recorded_parameters(run.scenario_file())
+    same = recorded.digest() == start.digest()
+    require(same, "run", "a flight with other parameters", f"those of {scenario.name}")
+    flown = recorded
+    for change in recorded_changes(run, start):
+        flown = vary(flown, change)
+    return scenario.vary(controller=flown.model_copy(update={"learn": None}))
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
