@@ -19,7 +19,8 @@ from flight_core.tape import Signal, Tape
 from flight_guidance.guidance import digest
 from flight_guidance.guidance_state import LARGEST, Lateral
 from flight_guidance.notices import Notices
-from flight_guidance.params import GuidanceConfig, RouteConfig, ZoneConfig
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.sections import RouteConfig, ZoneConfig
 
 SECTION = GuidanceConfig.validate_mapping(
     {

@@ -163,6 +163,12 @@ def require_mission(scenario: Scenario) -> GuidanceConfig:
         "a route alone in a campaign of missions",
     )
     require(
+        guidance.landing is None,
+        "guidance.landing",
+        "a landing",
+        "none in a campaign of missions",
+    )
+    require(
         not reference.live.bounds,
         "reference_model.live.bounds",
         "bounds",

@@ -192,6 +192,7 @@ class Guidance:
         waypoints = parameters.waypoints()
         self.route = parameters.plan(waypoints) if waypoints else None
         self._digest = digest(self.route)
+        self._lander = parameters.lander(self.route)
         self._program = deque(
             (nanoseconds(start), target) for start, target in parameters.program_steps()
         )
@@ -280,6 +281,7 @@ class Guidance:
         taken by a step yet are void, and so are the legs of the program.
         """
         self.route = route
+        self._lander = None  # that of the parameters lands on their route
         self._digest = digest(route)
         self._given = {}
         self._route_waits = True
@@ -429,6 +431,19 @@ class Guidance:
             self._link_lost = self.home()  # again at the next step while guidance does not fly
         return age_ns
 
+    def _land(self) -> None:
+        """Add the commands of the landing, unless an operator or the program has others."""
+        state = self._state
+        if self._lander is None or self.route is None or state is None:
+            return
+        if any(
+            name in guidance_state.LATERAL or name in guidance_state.VERTICAL
+            for name in self._given
+        ):
+            self._lander.leave()
+        elif self._begin is Begin.NO:
+            self._given |= self._lander.commands(state, self.pose(), self.route)
+
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """A step at an instant and flight time t; None without fresh y, before the first pose, and
         while disengaged.
@@ -449,6 +464,7 @@ class Guidance:
             return None
         self._waits_from_ns = None
         link_age_ns = self._watch_link(now_ns)
+        self._land()
         y_values = tuple(y.value.tolist())
         pose_values = tuple(pose.value.tolist())
         inputs = Inputs(

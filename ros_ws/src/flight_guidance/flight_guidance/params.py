@@ -14,7 +14,6 @@ import numpy as np
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
-    Config,
     Names,
     NodeConfig,
     NonNegative,
@@ -37,10 +36,12 @@ from flight_guidance.guidance_state import (
     Home,
     Limits,
 )
+from flight_guidance.landing import Lander, Landing, landing_at
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.notices import Notices
 from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
+from flight_guidance.sections import HomeConfig, LandingConfig, RouteConfig, Steps, ZoneConfig
 from flight_guidance.targets import reach_sentence, read_target
 from flight_guidance.vertical import VerticalParams, path_lag
 from flight_guidance.zones import Fence, Zone, clearance, described
@@ -58,132 +59,6 @@ ALPHA_TIME = 2.0
 
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
-
-
-class Steps(Config):
-    """Successive commands of a channel of `target`."""
-
-    start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
-    value: Numbers = Field(description="values, in the channel's unit")
-
-    def _check(self) -> None:
-        require_length("value", self.value, [f"{start:g} s" for start in self.start])
-        rises = all(
-            later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False)
-        )
-        require(rises, "start", list(self.start), "times in rising order")
-
-
-class RouteConfig(Config):
-    """Waypoints in the local tangent plane of `pose`."""
-
-    north: Numbers = Field(description="m")
-    east: Numbers = Field(description="m")
-    altitude: Numbers = Field(description="m, as `pose`")
-    V: tuple[Positive, ...] = Field(
-        default=(), description="airspeed to each waypoint, m/s; none: trim speed"
-    )
-    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
-    wait: tuple[NonNegative, ...] = Field(
-        default=(), description="time on a circle round each waypoint, s"
-    )
-    leave: tuple[Number, ...] = Field(
-        default=(),
-        description="altitude at which a circle is left, m; none: `altitude`",
-    )
-
-    def _check(self) -> None:
-        waypoints = [f"waypoint {k}" for k in range(len(self.north))]
-        for key in (
-            "east",
-            "altitude",
-            *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key)),
-        ):
-            require_length(key, getattr(self, key), waypoints)
-        both = [
-            k
-            for k, (turns, wait) in enumerate(zip(self.turns, self.wait, strict=False))
-            if turns and wait
-        ]
-        require(
-            not both,
-            "turns",
-            f"turns and a wait at waypoint {both[0] if both else 0}",
-            "one of both",
-        )
-
-    def waypoints(self) -> tuple[Waypoint, ...]:
-        """The waypoints of the equations."""
-        count = len(self.north)
-        columns = (
-            self.V or (None,) * count,
-            self.turns or (0.0,) * count,
-            self.wait or (0.0,) * count,
-        )
-        rows = zip(
-            self.north,
-            self.east,
-            self.altitude,
-            *columns,
-            self.leave or (None,) * count,
-            strict=True,
-        )
-        return tuple(Waypoint(*row) for row in rows)
-
-
-class ZoneConfig(Config):
-    """A zone of the fence: a polygon of three or more corners, or a circle round a single point."""
-
-    north: Numbers = Field(description="of the corners, or of the centre, m")
-    east: Numbers = Field(description="m")
-    radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
-    exclude: bool = Field(default=False, description="keep out of the zone, not in")
-    group: Annotated[int, Field(ge=0, le=255)] | None = Field(
-        default=None,
-        description="of zones to stay in: inside every zone of one group at least; none: its own",
-    )
-
-    def _check(self) -> None:
-        require_length("east", self.east, [f"corner {k}" for k in range(len(self.north))])
-        fits = len(self.north) == 1 if self.radius else len(self.north) >= 3
-        shape = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
-        require(fits, "north", shape, "three or more corners, or a centre with a radius")
-        corners = list(zip(self.north, self.east, strict=True))
-        twice = [
-            k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]
-        ]
-        require(
-            not twice,
-            "north",
-            f"the corner {corners[twice[0]] if twice else ''} twice in succession",
-            "each corner once",
-        )
-        require(
-            self.group is None or not self.exclude,
-            "group",
-            f"{self.group} of a zone to keep out of",
-            "none",
-        )
-
-    def zone(self) -> Zone:
-        """The zone of the equations."""
-        return Zone(self.north, self.east, self.radius or 0.0, self.exclude, self.group)
-
-
-class HomeConfig(Config):
-    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the
-    operator's link by choice.
-    """
-
-    north: Number = Field(default=0.0, description="m")
-    east: Number = Field(default=0.0, description="m")
-    altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
-    after_loss: bool = Field(
-        default=False, description="fly home when pose returns; else level the wings"
-    )
-    link_timeout: Positive | None = Field(
-        default=None, description="time without an operator before the way home, s"
-    )
 
 
 class GuidanceConfig(NodeConfig):
@@ -259,8 +134,8 @@ class GuidanceConfig(NodeConfig):
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(
         default=0.75, description="damping of path following, 1"
     )
-    capture: Annotated[float, Field(gt=0, le=math.pi / 4.0)] = Field(
-        default=math.radians(30.0), description="largest angle at which a path is approached, rad"
+    capture: Annotated[float, Field(gt=0, le=math.pi / 2.0)] = Field(
+        default=math.radians(60.0), description="largest angle at which a path is approached, rad"
     )
     radius: Positive | None = Field(
         default=None, description="radius of fillets and of the last orbit, m; none: by rule"
@@ -288,6 +163,9 @@ class GuidanceConfig(NodeConfig):
     )
     touchdown: ZoneConfig | None = Field(
         default=None, description="where a landing is to touch down; none: anywhere"
+    )
+    landing: LandingConfig | None = Field(
+        default=None, description="a landing at a waypoint of the route"
     )
     home: HomeConfig = Field(
         default=HomeConfig(),
@@ -347,6 +225,10 @@ class GuidanceConfig(NodeConfig):
         self._check_home()
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
+        if self.landing is not None:
+            require(route is not None, "landing", "no route", "one with its waypoint")
+        if route is not None:
+            self.landing_on(route)
         for start, target in self.program_steps():
             read_target(target, params, route, f"program at {start:g} s")
 
@@ -583,6 +465,34 @@ class GuidanceConfig(NodeConfig):
         if (fence := self.fence_zones()) is not None:
             require_inside(route, fence, max(map(self.fence_margin, flown)))
         return route
+
+    def landing_on(self, route: Route) -> Landing | None:
+        """The landing at the end of a line of a route; None without one.
+
+        Raises ParameterError for a waypoint that no line leads to and none goes straight on from, a
+        line that does not descend, and an airspeed out of bounds.
+        """
+        if (section := self.landing) is None:
+            return None
+        waypoints = self.waypoints()
+        number = section.waypoint
+        require(
+            number < len(waypoints) - 1,
+            "landing.waypoint",
+            f"{number} of {len(waypoints)} waypoints",
+            "one before the last, which is that of a go-around",
+        )
+        floor, fastest = self._floor(), self._largest_speed()
+        if section.V is not None:
+            expected = f"{floor:g} to {fastest:g} m/s"
+            require(floor <= section.V <= fastest, "landing.V", f"{section.V:g} m/s", expected)
+        box = None if self.touchdown is None else self.touchdown.zone()
+        return landing_at(waypoints[number].point, route, section, box, self.params())
+
+    def lander(self, route: Route | None) -> Lander | None:
+        """What lands on the route of the parameters; None without a landing."""
+        landing = None if route is None else self.landing_on(route)
+        return None if landing is None else Lander(landing, self.params())
 
     def program_steps(self) -> list[tuple[float, dict[str, float]]]:
         """The targets of the program by instant, in order: (s, {channel: value})."""

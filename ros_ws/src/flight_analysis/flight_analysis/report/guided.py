@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times, settling_time
+from flight_core.outcome import LANDED
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
@@ -210,6 +211,53 @@ def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
     return max(-float(clearance((section.touchdown.zone(),), *place)[0]), 0.0)
 
 
+SCREEN = 15.24
+"""m, 50 ft. The height over the threshold of a runway at which 14 CFR 23.2130 counts a landing."""
+
+
+class Touch(NamedTuple):
+    """How a landing ended, by `pose`."""
+
+    sink: float  # m/s
+    sideways: float  # m/s, across the heading
+    crab: float  # rad, of the nose from the line
+    beside: float  # m, to the right of the line
+    beyond: float  # m, along the line from the waypoint on the ground
+    V: float  # m/s, airspeed
+    V_screen: float | None  # m/s, airspeed at SCREEN over the ground; None: never there
+
+
+def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
+    """The figures of a landing; None without a section `landing`, and of a flight that did not
+    land.
+    """
+    if section is None or section.landing is None or LANDED not in tape.outcome:
+        return None
+    landing = section.landing_on(section.plan(section.waypoints()))
+    if landing is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
+        return None
+    pose = {name: tape["pose"][name] for name in tape["pose"].names}
+    end = {name: float(values[-1]) for name, values in pose.items()}
+    line = np.array([math.cos(landing.course), math.sin(landing.course)])
+    place = np.array([end["north"] - landing.place[0], end["east"] - landing.place[1]])
+    speed = section.speed + tape["guidance"]["y.V"]
+    above = np.flatnonzero(pose["altitude"] > landing.ground + SCREEN)
+    low = None
+    if len(above):
+        row = np.searchsorted(tape["guidance"].stamp_ns, tape["pose"].stamp_ns[above[-1]])
+        low = float(speed[min(int(row), len(speed) - 1)])
+    across = end["v_east"] * math.cos(end["psi"]) - end["v_north"] * math.sin(end["psi"])
+    return Touch(
+        -end["climb"],
+        across,
+        math.remainder(end["psi"] - landing.course, 2.0 * math.pi),
+        float(line[0] * place[1] - line[1] * place[0]),
+        float(line @ place),
+        float(speed[-1]),
+        low,
+    )
+
+
 class Outside(NamedTuple):
     """The time outside of the fence, while guidance flew."""
 
@@ -274,6 +322,24 @@ def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
         for leg in legs
     ]
     return f"legs: {', '.join(results)}" if results else ""
+
+
+def landing_results(landing: Mapping[str, Any] | None) -> str:
+    """The figures of a `Touch` as a sentence; empty without one."""
+    if landing is None:
+        return ""
+    side = "right" if landing["beside"] > 0.0 else "left"
+    screen = landing["V_screen"]
+    parts = [
+        f"a sink of {landing['sink']:.2f} m/s",
+        f"{abs(landing['sideways']):.1f} m/s sideways",
+        f"the nose {abs(math.degrees(landing['crab'])):.1f} deg off the line",
+        f"{abs(landing['beside']):.1f} m to its {side}",
+        f"{landing['beyond']:.0f} m beyond its waypoint",
+        f"{landing['V']:.1f} m/s",
+    ]
+    parts += [] if screen is None else [f"at 50 ft {screen:.1f} m/s"]
+    return f"landing: {', '.join(parts)}"
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
@@ -343,7 +409,9 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     log = tape["guidance"]
     limited = log.group("limited")
     outside = time_outside(tape, section)
+    touch = landing_touch(tape, section)
     return {
+        "landing": None if touch is None else touch._asdict(),
         "segments": [_segment_figures(segment) for segment in segments(tape)],
         "legs": [leg._asdict() for leg in flown_legs(tape)],
         "fence": None if outside is None else outside._asdict(),

@@ -14,7 +14,7 @@ from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLI
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
 from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit, format_value
-from flight_analysis.report.guided import BANDS, leg_results
+from flight_analysis.report.guided import BANDS, landing_results, leg_results
 from flight_analysis.report.summary import parts_legend, taken_over
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
@@ -251,7 +251,8 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
                 *map(format_value, (quantity[name] for name in metrics), factors),
             ]
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
-    legend = sentences(leg_results(guidance["legs"]), GUIDANCE_LEGEND) if rows else ""
+    results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
+    legend = sentences(*results, GUIDANCE_LEGEND) if rows else ""
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
 
 

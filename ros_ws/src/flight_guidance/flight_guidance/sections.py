@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of the parameters of guidance: commands over time, route, zones, home, landing."""
+
+from typing import Annotated
+
+from flight_core.fields import Field
+from flight_core.parameters import (
+    Config,
+    NonNegative,
+    Number,
+    Numbers,
+    Positive,
+    require,
+    require_length,
+)
+from flight_guidance.route_file import Waypoint
+from flight_guidance.zones import Zone
+
+
+class Steps(Config):
+    """Successive commands of a channel of `target`."""
+
+    start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
+    value: Numbers = Field(description="values, in the channel's unit")
+
+    def _check(self) -> None:
+        require_length("value", self.value, [f"{start:g} s" for start in self.start])
+        rises = all(
+            later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False)
+        )
+        require(rises, "start", list(self.start), "times in rising order")
+
+
+class RouteConfig(Config):
+    """Waypoints in the local tangent plane of `pose`."""
+
+    north: Numbers = Field(description="m")
+    east: Numbers = Field(description="m")
+    altitude: Numbers = Field(description="m, as `pose`")
+    V: tuple[Positive, ...] = Field(
+        default=(), description="airspeed to each waypoint, m/s; none: trim speed"
+    )
+    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
+    wait: tuple[NonNegative, ...] = Field(
+        default=(), description="time on a circle round each waypoint, s"
+    )
+    leave: tuple[Number, ...] = Field(
+        default=(),
+        description="altitude at which a circle is left, m; none: `altitude`",
+    )
+
+    def _check(self) -> None:
+        waypoints = [f"waypoint {k}" for k in range(len(self.north))]
+        for key in (
+            "east",
+            "altitude",
+            *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key)),
+        ):
+            require_length(key, getattr(self, key), waypoints)
+        both = [
+            k
+            for k, (turns, wait) in enumerate(zip(self.turns, self.wait, strict=False))
+            if turns and wait
+        ]
+        require(
+            not both,
+            "turns",
+            f"turns and a wait at waypoint {both[0] if both else 0}",
+            "one of both",
+        )
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """The waypoints of the equations."""
+        count = len(self.north)
+        columns = (
+            self.V or (None,) * count,
+            self.turns or (0.0,) * count,
+            self.wait or (0.0,) * count,
+        )
+        rows = zip(
+            self.north,
+            self.east,
+            self.altitude,
+            *columns,
+            self.leave or (None,) * count,
+            strict=True,
+        )
+        return tuple(Waypoint(*row) for row in rows)
+
+
+class ZoneConfig(Config):
+    """A zone of the fence: a polygon of three or more corners, or a circle round a single point."""
+
+    north: Numbers = Field(description="of the corners, or of the centre, m")
+    east: Numbers = Field(description="m")
+    radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
+    exclude: bool = Field(default=False, description="keep out of the zone, not in")
+    group: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        default=None,
+        description="of zones to stay in: inside every zone of one group at least; none: its own",
+    )
+
+    def _check(self) -> None:
+        require_length("east", self.east, [f"corner {k}" for k in range(len(self.north))])
+        fits = len(self.north) == 1 if self.radius else len(self.north) >= 3
+        shape = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
+        require(fits, "north", shape, "three or more corners, or a centre with a radius")
+        corners = list(zip(self.north, self.east, strict=True))
+        twice = [
+            k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]
+        ]
+        require(
+            not twice,
+            "north",
+            f"the corner {corners[twice[0]] if twice else ''} twice in succession",
+            "each corner once",
+        )
+        require(
+            self.group is None or not self.exclude,
+            "group",
+            f"{self.group} of a zone to keep out of",
+            "none",
+        )
+
+    def zone(self) -> Zone:
+        """The zone of the equations."""
+        return Zone(self.north, self.east, self.radius or 0.0, self.exclude, self.group)
+
+
+class HomeConfig(Config):
+    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the
+    operator's link by choice.
+    """
+
+    north: Number = Field(default=0.0, description="m")
+    east: Number = Field(default=0.0, description="m")
+    altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
+    after_loss: bool = Field(
+        default=False, description="fly home when pose returns; else level the wings"
+    )
+    link_timeout: Positive | None = Field(
+        default=None, description="time without an operator before the way home, s"
+    )
+
+
+class LandingConfig(Config):
+    """A landing at a waypoint of the route, on the line to the waypoint, which is the glide path.
+
+    The line goes straight on to the next waypoint, which is that of a go-around.
+    """
+
+    waypoint: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        description="number of the waypoint on the ground, from 0 on; its altitude is that of the "
+        "pose on the wheels"
+    )
+    flare: Positive | None = Field(
+        default=None, description="height of the flare, m; none: 5 s of the sink of the glide path"
+    )
+    sink: Positive = Field(default=0.5, description="sink at the touch, m/s")
+    decrab: NonNegative = Field(
+        default=1.5, description="height below which the nose turns along the line, m; 0: never"
+    )
+    V: Positive | None = Field(
+        default=None, description="airspeed from the flare on, m/s; none: that of the line"
+    )
