@@ -4,8 +4,10 @@
 alarms.
 """
 
+import math
 import time
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +40,8 @@ def probe() -> dict[str, Any]:
     with flying(plane, SIM_SERVO_SPEED=0.03, RC_OVERRIDE_TIME=OVERRIDE_TIME):
         channel_map = plane.mavlink_map()
         times = {
-            surface: [stuck(plane, channel_map, surface) for _ in range(REPEATS)]
-            for surface in SERVOS
+            f"{surface} {number}": stuck(plane, channel_map, surface)
+            for surface, number in product(SERVOS, range(1, REPEATS + 1))
         }
         quiet = {name: unfailed(plane, channel_map, name) for name in KINDS}
     return {"stuck": times, "quiet": quiet}
@@ -58,8 +60,10 @@ def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
     return scenario
 
 
-def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> dict[str, Any]:
-    """The time from a surface that sticks where it is until the release, s, and its reason."""
+def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
+    """The time from a surface that sticks where it is until the release that names it, s; infinite
+    for another release, or none.
+    """
     number = SERVOS[surface]
     ends = {f"SERVO{number}_MIN": -1.0, f"SERVO{number}_MAX": 1.0, f"SERVO{number}_TRIM": 0.0}
     healthy = dict(zip(ends, (1100.0, 1900.0, 1500.0), strict=True))
@@ -76,8 +80,9 @@ def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> dict[str, Any]:
         for name, value in healthy.items():
             plane.say("param", name, f"{value:g}")
     (engagement,) = read_run(plane.run).engagements or []
-    stop_ns = engagement.stop_ns or int(1e18)
-    return {"seconds": stop_ns / NANOSECONDS - began, "reason": engagement.reason}
+    if engagement.stop_ns is None or not engagement.reason.startswith(f"{surface} does not answer"):
+        return math.inf
+    return engagement.stop_ns / NANOSECONDS - began
 
 
 def unfailed(plane: "ArduPlane", channel_map: str, name: str) -> dict[str, Any]:

@@ -451,7 +451,7 @@ GOALS: dict[str, dict[str, str]] = {
     "engagements": {"steps: .*": f"<= {LARGEST_STEP:g}"},
     "signs": {"right sign wrong": "<= 0", "miss a sign": "<= 0"},
     "pose": {"largest difference from 1": "<= 0.01"},
-    "probe": {"stuck: .*: seconds": "<= 8", "false alarms": "<= 0"},
+    "probe": {"stuck: .*": "<= 8", "false alarms": "<= 0"},
     "own_log": {"difference: (elevator|aileron)": f"<= {OMEGA_GOAL:g}"},
     "releases": {
         f"times: {re.escape(name)}": f"<= {limit:g}" for name, limit in RELEASE_GOALS.items()
