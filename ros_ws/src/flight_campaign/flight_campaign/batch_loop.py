@@ -173,7 +173,7 @@ def fly_run(
     def pattern(now: LoopState, ticks: Any) -> tuple[LoopState, None]:
         for k, kind in enumerate(run.pattern):
             at_tick = jax.tree.map(lambda values, k=k: values[k], ticks)
-            now = _tick(now, at_tick, kind, constants, control_law, timing)
+            now, _ = tick(now, at_tick, kind, constants, control_law, timing)
         return now, None
 
     return jax.lax.scan(pattern, state, jax.tree.map(patterns, in_time), unroll=run.unroll)[0]
@@ -188,15 +188,15 @@ def _chosen(
     return branches[known](*arguments)
 
 
-def _tick(
+def tick(
     now: LoopState,
     at_tick: tuple[Segments, Array | None, Array],
     kind: Kind,
     constants: Constants,
     control_law: ControlLaw,
     timing: Timing,
-) -> LoopState:
-    """The state at the next tick."""
+) -> tuple[LoopState, Sample]:
+    """The state at the next tick, and what the law took at this one."""
     segment, action, window = at_tick
     fleet, vehicle, params, mission = constants
     measure = partial(_measured, fleet=fleet, vehicle=vehicle)
@@ -238,7 +238,7 @@ def _tick(
     sensed, sample = sense(now, segment, action, window, vehicle, mission, kind)
     law, u, command = _chosen(kind.phase, segment.phase, (hold, engage, step), now, segment, sample)
     flown = sensed._replace(law=law, u=u)
-    return advance(flown, command, segment, fleet, vehicle, mission, timing, kind)
+    return advance(flown, command, segment, fleet, vehicle, mission, timing, kind), sample
 
 
 def _measured(
@@ -253,7 +253,8 @@ def _measured(
         matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)]
     )
     moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
-    u_trim = segment.u_ff[:, None] + 0.0 * y
+    u_ff = segment.u_ff if segment.u_ff.ndim == y.ndim else segment.u_ff[:, None]
+    u_trim = u_ff + 0.0 * y
     x_air = x - fleet.wind * segment.air[:, None]
     vane = vane_m = None
     if vehicle.vanes:

@@ -72,7 +72,7 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
-def _require_flyable(scenario: Scenario) -> None:
+def _require_flyable(scenario: Scenario, *, learns: bool) -> None:
     """Raise ParameterError for an aircraft or a controller beyond a campaign."""
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -82,7 +82,7 @@ def _require_flyable(scenario: Scenario) -> None:
         aircraft.airframe,
         "an airframe with matrices: JSBSim flies one at a time",
     )
-    fixed = getattr(controller, "learn", None) is None
+    fixed = learns or getattr(controller, "learn", None) is None
     require(
         fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn"
     )
@@ -117,16 +117,17 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
     return y_m, y_m_dot
 
 
-def build_course(scenario: Scenario) -> Course:
+def build_course(scenario: Scenario, *, learns: bool = False) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
+    `learns`: whether the controller may take models in flight; the feedforward is that before.
     Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u
     by a part of a tick, dropouts of a y with a different rate than the ticks, or dropouts longer
     than the age limit; for vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
-    _require_flyable(scenario)
+    _require_flyable(scenario, learns=learns)
     airframe = aircraft.load()[0]
     plant = aircraft.plant()
     tick_ns = period_ns(controller.rate, "controller.rate")

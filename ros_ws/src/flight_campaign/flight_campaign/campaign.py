@@ -23,7 +23,6 @@ from aircraft_sim.uncertainty import (
     Spread,
     WindEffect,
     drawn_entries,
-    gust_directions,
     sampled_matrices,
 )
 from flight_analysis.closed_loop.guarantee import Guarantee
@@ -55,6 +54,8 @@ CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
 LOGGER = logging.getLogger(__name__)
 _FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk did not fit
+# aircraft at once that learn: the flight takes 3 % of the time, and few leave no core idle
+LEARNING_CHUNK = 10
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is counted
 
 
@@ -257,7 +258,7 @@ def define(
     """The definition of a campaign over a scenario.
 
     `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units
-    of the score by output, SI. `chunk` None: what is fast on the device; 1 with a learner.
+    of the score by output, SI. `chunk` None: what is fast on the device, or LEARNING_CHUNK.
 
     Raises ParameterError if a campaign cannot fly it.
     """
@@ -311,9 +312,11 @@ def define(
 
 
 def _default_chunk(scenario: Scenario, aircraft: int) -> int:
-    """How many aircraft fly at once; those that learn fly one by one."""
-    if scenario.learns() or aircraft < 1:
+    """How many aircraft fly at once."""
+    if aircraft < 1:
         return 1
+    if scenario.learns():
+        return LEARNING_CHUNK
     from flight_campaign.device import chunk_of_device  # noqa: PLC0415 - JAX, as above
 
     return chunk_of_device(aircraft)
@@ -368,23 +371,15 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     """The first `count` of the `size` aircraft from number `first`, which fly at once. Those of a
     guided scenario fly missions.
     """
-    from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.device import turn  # noqa: PLC0415 - as above
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
 
     definition = Definition.model_validate_json(text)
-    part = definition.uncertainty
     scenario, course, vehicle, law, mission = _prepare(text, case)
-    airframe = scenario.aircraft.nominal_airframe()
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, size, definition.spread)
-    directions = gust_directions(airframe, A, definition.wind)
-    equipped = definition.drawn_equipment(scenario, first, size)
-    late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
     with turn():
-        aircraft = batch_matrices.assemble(
-            A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
-        )
-        vehicle = batch.with_equipment(vehicle, scenario, equipped)
-        flown = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
+        drawn = drawn_fleet(definition, scenario, course, vehicle, first, size)
+        flown = batch.fly(drawn.fleet, drawn.vehicle, course, law.control_law, law.params, mission)
         result = batch.on_host(flown)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
     outputs = scenario.controller.outputs
@@ -404,9 +399,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
         ("slew", inputs, slew),
     ):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    entries = drawn_entries(airframe, A[:count], B[:count]) | {
-        name: value[:count] for name, value in equipped.items()
-    }
+    entries = {name: value[:count] for name, value in drawn.entries.items()}
     return Chunk(first, result.diverged[:count], figures, entries)
 
 

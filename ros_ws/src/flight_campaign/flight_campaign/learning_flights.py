@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights of a campaign with a learner, by the loop of `rise-di fly --in-process`."""
+"""Flights of a campaign with a learner: side by side in the compiled loop, or one by one as those
+of `rise-di fly --in-process`.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,6 +16,7 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, inputs_by_part, true_error
+from flight_campaign.benchmark_course import build_course
 from flight_campaign.engines import Job
 from flight_campaign.rows import Chunk
 from flight_campaign.statistics import score, score_units
@@ -43,15 +46,21 @@ class LearningOutcome(NamedTuple):
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
     """Outcomes of the identifications of a flight, from its tape and its events."""
+    proposed = tape["learned"]["proposed"] if "learned" in tape else np.ones(0)
+    return _outcome(events, int(np.sum(proposed == 0.0)))
+
+
+def _outcome(events: Sequence[Event], unproposed: int) -> LearningOutcome:
+    """Outcomes from the events of a flight, and the number of identifications without a
+    proposal.
+    """
     flown = [
         event.stamp_ns
         for event in events
         if event.kind is EventKind.FLIES and UNVERIFIED not in event.sentence
     ]
     fallbacks = sum(event.kind in {EventKind.FALLBACK, EventKind.RESTART} for event in events)
-    refused = sum(event.kind is EventKind.REFUSED for event in events)
-    if "learned" in tape:
-        refused += int(np.sum(tape["learned"]["proposed"] == 0.0))
+    refused = unproposed + sum(event.kind is EventKind.REFUSED for event in events)
     return LearningOutcome(flown[0] / 1e9 if flown else math.nan, len(flown), refused, fallbacks)
 
 
@@ -107,8 +116,60 @@ def _by_channel(flights: Sequence[Flight], kind: str) -> dict[str, FloatArray]:
     return by_channel
 
 
+def _learners(scenarios: Sequence[Scenario], learner: MakeLearner) -> list[Learn]:
+    """What makes the learner of each aircraft: one for those that differ in A and B alone, which a
+    learner does not know.
+    """
+    made: dict[str, Learn | None] = {}
+    learn = []
+    for scenario in scenarios:
+        known = repr(scenario.aircraft.model_dump(exclude={"uncertainty"}))
+        if known not in made:
+            made[known] = learner(scenario)
+        each = made[known]
+        assert each is not None  # noqa: S101 - the scenario learns
+        learn.append(each)
+    return learn
+
+
+def _fly_side_by_side(
+    definition: "Definition", case: int, first: int, count: int, learner: MakeLearner
+) -> list[Flight]:
+    """The flights of the `count` aircraft from number `first`.
+
+    A flight that leaves the compiled loop, as one that falls back, flies again by itself.
+    """
+    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
+    from flight_campaign.learning_fleet import LearningFleet, flies_side_by_side  # noqa: PLC0415 - as above
+
+    scenario = definition.scenario(case)
+    scenarios = [definition.aircraft_scenario(first + k, case) for k in range(count)]
+    course = build_course(scenario, learns=True)
+    controller = scenario.rise_di()
+    if not flies_side_by_side(controller, course):
+        return [fly(each, learner) for each in scenarios]
+    drawn = drawn_fleet(definition, scenario, course, batch.vehicle(scenario), first, count)
+    learn = _learners(scenarios, learner)
+    fleet = LearningFleet(drawn.fleet, drawn.vehicle, course, controller, learn)
+    result, outcomes = fleet.fly()
+    flights = []
+    for k, outcome in enumerate(outcomes):
+        if outcome.left_loop:
+            flights.append(fly(scenarios[k], learner))
+            continue
+        rms, largest = (
+            dict(zip(controller.outputs, values[:, k].tolist(), strict=True))
+            for values in (result.rms, result.max)
+        )
+        slew = dict(zip(controller.effectors, result.slew[:, k].tolist(), strict=True))
+        came_to = _outcome(outcome.events, outcome.unproposed)
+        flights.append(Flight(False, rms, largest, slew, came_to))
+    return flights
+
+
 def fly_chunk(definition: "Definition", job: Job, learner: MakeLearner) -> Chunk:
-    """Fly a chunk of a campaign with learners, one aircraft after another."""
+    """Fly a chunk of a campaign with learners."""
     case, chunk = job
     first = chunk * definition.chunk
     count = definition.size(job)
@@ -117,7 +178,7 @@ def fly_chunk(definition: "Definition", job: Job, learner: MakeLearner) -> Chunk
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
     entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
-    flown = [fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    flown = _fly_side_by_side(definition, case, first, count, learner)
     outputs = scenario.controller.outputs
     by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
     rms = np.array([by_kind["rms"][name] for name in outputs])

@@ -88,7 +88,7 @@ def fly_campaign(
             {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
         chunk: Aircraft computed at once; None: 1000, on a GPU what its memory holds, with a
-            learner 1.
+            learner 10.
         workers: Threads, with a learner processes; None: one a core. A script with a learner calls
             the function under `if __name__ == "__main__":`.
         runs: Folder that the folder of the campaign is made in.

@@ -351,10 +351,7 @@ class Controller:
         effects = self._tested(inputs)
         self._measure_vanes(inputs)
         self._number += self.has_internals
-        e = inputs.y - inputs.y_m
-        self._errors = divergence.step(self._errors, e, inputs.dt, first_law=self._first_law)
-        if self._learns:
-            self._oscillations.take(e, inputs.dt, None if self._first_law else self._learned)
+        self.watch(inputs.y - inputs.y_m, inputs.dt)
         age = seconds(now_ns - inputs.stamp_ns)
         limits = self._guard
         digest = self._digest
@@ -371,6 +368,25 @@ class Controller:
             given_up,
         )
         return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log, effects)
+
+    def watch(self, e: FloatArray, dt: float) -> None:
+        """Take the error of a tick, for `diverging` and `oscillations`.
+
+        Args:
+            e: y - y_m, shape (m,), SI.
+            dt: Length of the tick, s.
+        """
+        self._errors = divergence.step(self._errors, e, dt, first_law=self._first_law)
+        if self._learns:
+            self._oscillations.take(e, dt, None if self._first_law else self._learned)
+
+    def resume(self, state: guard.ControllerState) -> None:
+        """Go on from the state of a flight that a campaign has stepped with the same parameters.
+
+        Args:
+            state: State of the guard and of the law after the last tick.
+        """
+        self._state = state
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
         """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flight_core import arithmetic
 from flight_core.arithmetic import product, sine
 from flight_core.integrators import rk4
-from flight_core.vectors import Array, FloatArray, array_namespace
+from flight_core.vectors import Array, array_namespace
 
 # 1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11
 # days.
@@ -114,10 +114,11 @@ def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
     return product(nominal.path_A, x) + product(nominal.path_gravity, sines(x, nominal)) + forced
 
 
-def sines(x: FloatArray, nominal: Nominal) -> FloatArray:
-    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N). NumPy
-    arrays only.
-    """
+def sines(x: Array, nominal: Nominal) -> Array:
+    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N)."""
+    if not isinstance(x, np.ndarray):
+        rows = [sine(row) if j in nominal.sine_states else 0.0 * row for j, row in enumerate(x)]
+        return array_namespace(x).stack(rows)
     values = np.zeros_like(x)
     for j in nominal.sine_states:
         values[j] = sine(

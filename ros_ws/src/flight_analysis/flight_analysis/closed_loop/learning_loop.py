@@ -123,6 +123,16 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
     return Proposal(end_ns, start.digest(), flown, change, proposal.sentence)
 
 
+def proposed(
+    learner: Learner, learning: Learning, controller: Controller, t_ns: int
+) -> LearnerResult:
+    """The proposal of the learner at a tick where one is due, also handed to the controller."""
+    proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
+    received = as_received(proposal, learning.start, t_ns, controller.digest)
+    learning.receive(received, controller, t_ns)
+    return proposal
+
+
 class ProposalStation:
     """Lets the due proposals act, falls back where the law diverges, and publishes `authority`."""
 
@@ -167,10 +177,7 @@ class LearnerStation:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u, controller.digest)
         if not self._learning.ticked(controller, t_ns):
             return
-        proposal = self._learner.propose(controller.digest, outputs_without(controller.parameters))
-        self._learning.receive(
-            as_received(proposal, self._learning.start, t_ns, controller.digest), controller, t_ns
-        )
+        proposal = proposed(self._learner, self._learning, controller, t_ns)
         if (identified := self._identifications.next(proposal)) is not None:
             self._topics.advertise("learned", identified.names)
             self._topics.publish("learned", StampedVector(t_ns, identified.values), t_ns)

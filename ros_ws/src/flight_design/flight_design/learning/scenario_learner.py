@@ -4,7 +4,6 @@
 of `rise-di gains`.
 """
 
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,13 +81,23 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
             start, scenario, model, margin, uncertain=errs, sketched=sketch, speeds=speeds
         )[0]
 
+    of_rough: dict[RiseDiConfig, RiseDiConfig] = {}
+
+    def design_of_rough(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
+        """As `design` for a model that errs; once for the learners of many aircraft."""
+        if model is not airframe:
+            return design(start, model, errs=True)
+        if start not in of_rough:
+            of_rough[start] = design(start, model, errs=True)
+        return of_rough[start]
+
     return lambda parameters: Learner(
         parameters,
         airframe,
         design,
         parameters.delay if real_time else 0.0,
         rough,
-        None if sketch else partial(design, errs=True),
+        None if sketch else design_of_rough,
     )
 
 
