@@ -32,7 +32,7 @@ For you who write or change a scenario file: every key, by section. A key that i
 
 SI and radians, if nothing else is said. Without a type a value is a number. `= 0.2` is a default. A key without a default and
 without *optional* is required. A list has an entry a channel. No number is above 1e9 in size, no time limit above 1e6 s. The
-instant `.inf` is never. The node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this
+instant `.inf` is never. `examples/scenarios/` has files that set the rarer keys. The node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this
 page: `python -m tools.parameters`.
 """  # noqa: E501 - a text as it is written
 MET = (

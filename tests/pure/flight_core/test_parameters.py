@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Invalid parameters: one sentence that names the key, what was found and what is expected."""
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -9,15 +10,17 @@ from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.builders import aircraft_parameters
-from tests.conftest import refusing
-from tools.parameters import SECTIONS
+from tests.conftest import REPOSITORY, refusing
+from tools.parameters import PAGE, SECTIONS
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign.campaign import Definition
 from flight_core.files import read_yaml, writing
 from flight_core.parameters import Config, ParameterError, flatten, nest
@@ -287,6 +290,74 @@ def test_key_may_override_same_key_of_merged_mapping(tmp_path: Path) -> None:
 def test_every_installed_scenario_is_valid() -> None:
     directory = find_scenario("osprey_gust").path.parent
     assert [load_scenario(path).name for path in sorted(directory.glob("*.yaml"))]
+
+
+EXAMPLES = sorted((REPOSITORY / "examples" / "scenarios").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_example_scenario_flies(path: Path) -> None:
+    """Two seconds show that each section is accepted by what flies it."""
+    scenario = load_scenario(path).vary(flight={"duration": 2.0})
+    assert simulate(scenario).outcome == "completed"
+
+
+SET_BY_THE_FLIGHT = {
+    *("aircraft.control_rate", "aircraft.duration", "aircraft.recorded"),
+    *("reference_model.u_m_rate", "guidance.y_rate", "guidance.authority_rate"),
+    *("controller.y_rate", "bridge.map", "bridge.dry_run", "bridge.first_y"),
+    *("recorder.directory", "recorder.attach", "recorder.metadata_file", "recorder.scenario_file"),
+}
+"""Keys that `rise-di fly` and the launch files set, by the scenario and the options."""
+IN_NO_FILE = {
+    "aircraft.commands",  # by the airframe of JSBSim: docs/aircraft.md has a line
+    "aircraft.shear.exponent",  # the power law in place of the log law
+    "controller.allocation.priority",
+    *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
+    *(f"controller.probe{key}" for key in ("", ".effect", ".lowest", ".window", ".false_alarm")),
+    *(f"controller.{key}" for key in ("amplitude", "width", "period", "lowest", "highest")),
+    "controller.pause",  # with these of `excitation`, which `rise-di identify --bridge` writes
+    *("controller.bandwidth", "controller.Omega"),  # of L1, which `rise-di compare` writes
+    *(f"controller.learn.{key}" for key in ("prior", "prior.file", "prior.off", "without")),
+}
+"""Keys that no shipped and no example file sets. The list only shrinks."""
+
+
+def test_every_key_is_in_a_file() -> None:
+    rows = re.findall(r"^## (.*)$|^\| `([^`]+)`", PAGE.read_text(), re.MULTILINE)
+    section = ""
+    keys = set()
+    for heading, key in rows:
+        if heading:
+            section = heading.split("`")[1] if heading.startswith("`") else ""
+        elif section:
+            keys.add(f"{section}.{key}")
+    files = [
+        *find_scenario("osprey_gust").path.parent.glob("*.yaml"),
+        *(REPOSITORY / "examples").rglob("*.yaml"),
+    ]
+    used = {key for path in files for key in scenario_keys(yaml.safe_load(path.read_text()))}
+    # a channel or a name in place of NAME
+    unused = {
+        key
+        for key in keys - used
+        if not any(re.fullmatch(re.escape(key).replace("NAME", r"\w+"), known) for known in used)
+    }
+    assert unused - SET_BY_THE_FLIGHT - IN_NO_FILE == set()
+
+
+def scenario_keys(tree: Any) -> Iterator[str]:
+    """The dotted keys of a scenario file and of their groups; none of another file."""
+    for name, value in tree.items() if isinstance(tree, dict) else ():
+        if isinstance(value, dict) and "ros__parameters" in value:
+            yield from _keys(value["ros__parameters"], f"{name.removeprefix('/**/')}.")
+
+
+def _keys(values: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    for name, value in values.items():
+        yield f"{prefix}{name}"
+        if isinstance(value, dict):
+            yield from _keys(value, f"{prefix}{name}.")
 
 
 NAMES = st.text(st.characters(categories=["Ll"]), min_size=1, max_size=4)
