@@ -56,7 +56,7 @@ IMPORTS: dict[str, set[str]] = {
     "flight_design.learning": {
         "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
         "flight_design.gains",
-        "flight_design.identification", "rise_di_controller",
+        "flight_design.identification", "flight_log", "rise_di_controller",
     },
     "flight_campaign": {
         "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",

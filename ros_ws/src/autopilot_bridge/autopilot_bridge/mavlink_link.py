@@ -106,6 +106,42 @@ def _zero(kind: str) -> Any:
     return 0.0 if kind in {"float", "double"} else np.dtype(kind.partition("_t")[0]).type(0)
 
 
+def _connection(config: LinkConfig) -> Any:
+    """The connection of pymavlink with MAVLink 2, signed where a passphrase is set.
+
+    Raises ParameterError for an address that cannot be opened.
+    """
+    require_package("pymavlink")
+    from pymavlink import mavutil  # noqa: PLC0415 - an extra
+    from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
+
+    try:
+        connection = mavutil.mavlink_connection(
+            config.url,
+            baud=config.baud,
+            source_system=config.system,
+            source_component=COMPANION,
+            dialect=DIALECT,
+            autoreconnect=True,
+            retries=RETRIES,
+            force_connected=True,  # a serial device that comes later
+        )
+    except (OSError, ValueError) as error:
+        expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
+        raise ParameterError(
+            f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
+        ) from None
+    # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the
+    # passphrase then.
+    connection.mav = dialect.MAVLink(connection, srcSystem=config.system, srcComponent=COMPANION)
+    if config.passphrase_file is not None:
+        passphrase = read_file(
+            Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase"
+        ).strip()
+        connection.setup_signing(hashlib.sha256(passphrase).digest())
+    return connection
+
+
 class Link:
     """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where
     there is none.
@@ -122,39 +158,9 @@ class Link:
     def __init__(
         self, config: LinkConfig, parameters: Sequence[str] = (), further: Sequence[str] = ()
     ) -> None:
-        require_package("pymavlink")
-        from pymavlink import mavutil  # noqa: PLC0415 - an extra
-        from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
-
         self._config = config
         self._is_udp = config.url.startswith("udp")
-        try:
-            self._connection: Any = mavutil.mavlink_connection(
-                config.url,
-                baud=config.baud,
-                source_system=config.system,
-                source_component=COMPANION,
-                dialect=DIALECT,
-                autoreconnect=True,
-                retries=RETRIES,
-                force_connected=True,  # a serial device that comes later
-            )
-        except (OSError, ValueError) as error:
-            expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
-            raise ParameterError(
-                f"link.url: found {config.url}, which cannot be opened ({error}), expected "
-                f"{expected}"
-            ) from None
-        # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the
-        # passphrase then.
-        self._connection.mav = dialect.MAVLink(
-            self._connection, srcSystem=config.system, srcComponent=COMPANION
-        )
-        if config.passphrase_file is not None:
-            passphrase = read_file(
-                Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase"
-            ).strip()
-            self._connection.setup_signing(hashlib.sha256(passphrase).digest())
+        self._connection = _connection(config)
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
         self._clash = ""  # what ends with another configuration alone

@@ -58,8 +58,8 @@ def too_late(part: Part, delay: float) -> str:
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
     late = [
         name
-        for name, found in zip(part.inputs, part.delays, strict=False)
-        if found >= bound - 1e-6  # s, of rounding
+        for name, delay in zip(part.inputs, part.delays, strict=False)
+        if delay >= bound - 1e-6  # s, of rounding
     ]
     if not late:
         return ""
