@@ -22,7 +22,8 @@ from flight_analysis.closed_loop.loop_margins import LinearLoop, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.account import account, final_outcome
+from flight_analysis.report.account import account
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_design.gains.gain_design import select_gains
 from rise_di_controller.worst_case import worst_in_box
 

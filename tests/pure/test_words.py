@@ -35,8 +35,6 @@ STILL_LONG = {
     "autopilot_bridge/bridge.py",
     "autopilot_bridge/node.py",
     "autopilot_bridge/node.py:__init__",
-    "flight_analysis/report/account.py",
-    "flight_analysis/report/account.py:account",
     "flight_campaign/batch_loop.py:advance",
     "flight_campaign/benchmark_course.py:build_course",
     "flight_campaign/engines.py:dask",

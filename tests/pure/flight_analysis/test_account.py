@@ -25,10 +25,12 @@ import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
-from flight_analysis.report.account import Account, TopicAccount, account, final_outcome
+from flight_analysis.report.account import Account, account
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.html import write_page
 from flight_analysis.report.paper import write_latex
 from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.sample_counts import TopicAccount
 from flight_analysis.report.summary import (
     RecordedFlight,
     command_results,

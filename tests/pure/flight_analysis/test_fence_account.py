@@ -5,7 +5,8 @@
 import numpy as np
 import pytest
 
-from flight_analysis.report.account import Account, account_of_json, final_outcome
+from flight_analysis.report.account import Account, account_of_json
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.guided import Outside, orbit_missed_by, time_outside, touched_beside
 from flight_core.outcome import (
     COMPLETED,

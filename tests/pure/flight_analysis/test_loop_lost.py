@@ -8,7 +8,8 @@ import pytest
 from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.account import Account, account, final_outcome
+from flight_analysis.report.account import Account, account
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.loop_lost import lost_parts
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
 from flight_core.tape import Signal, Tape

@@ -14,7 +14,8 @@ from pytest import approx
 from scipy.integrate import solve_ivp
 from tests.conftest import refusing
 
-from flight_analysis.report.account import account, final_outcome
+from flight_analysis.report.account import account
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
 from flight_core.rates import nanoseconds

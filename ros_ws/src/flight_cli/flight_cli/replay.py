@@ -28,8 +28,8 @@ from flight_analysis.closed_loop.replay import (
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.metrics import error_metrics
-from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.sample_counts import WHOLE
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
 from flight_cli.settings import parse_settings, settings_option

@@ -20,7 +20,8 @@ from flight_analysis.closed_loop.scenario import (
     parse_scenario,
     scenario_yaml,
 )
-from flight_analysis.report.account import Account, account, flown, outcome_of_log
+from flight_analysis.report.account import Account, account
+from flight_analysis.report.flight_outcome import flown, outcome_of_log
 from flight_analysis.report.summary import (
     RecordedFlight,
     empty_summary,

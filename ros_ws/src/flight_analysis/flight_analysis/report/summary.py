@@ -30,13 +30,10 @@ from flight_analysis.metrics import (
     sign_switches,
 )
 from flight_analysis.report.account import (
-    WHOLE,
     Account,
     Commands,
     account,
     account_of_json,
-    ends_last,
-    final_outcome,
 )
 from flight_analysis.report.display_units import (
     DisplayUnit,
@@ -44,7 +41,9 @@ from flight_analysis.report.display_units import (
     display_units,
     format_seconds,
 )
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.guided import guidance_notices, guidance_summary
+from flight_analysis.report.sample_counts import WHOLE, ends_last
 from flight_analysis.report.timing import (
     AgeMetrics,
     LatencyMetrics,
