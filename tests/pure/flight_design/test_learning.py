@@ -221,7 +221,7 @@ def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: P
     assert "rise_di.h" in [path.name for path in exported.files]
     with refusing("controller.learn: found a section, expected none: C code replaces"):
         rise_di.export(chosen, tmp_path, proof=False)
-    other = chosen.vary(controller={"rate": 50.0})
+    other = chosen.vary(controller={"ramp": 1.0})
     with refusing("run: found a flight with other parameters, expected those of"):
         with_last_model(other, read_run(flown.run))
 
@@ -404,7 +404,9 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
         return Part(start.inputs, outputs, entries, worse, better, "", 0.0, gusts=False)
 
     whole = part(NAMES, entry, Entry("B", "p", "elevator", 0.0, 0.3, 0.01, 29.0))
-    parts = [(whole,), (part(("q", "V"), entry), part(("p", "r"), entry))]
+    apart = (part(("q", "V"), entry), part(("p", "r"), entry))
+    worse_than_file = tuple(each._replace(coupled_advantage=2.0) for each in apart)
+    parts = [(whole,), apart, worse_than_file]
     identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
     monkeypatch.setattr(design_learner, "identify", identified)
     monkeypatch.setattr(made, "_design", lambda *_: start)
@@ -419,6 +421,11 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     )
     # the search begins at the model that flies too
     assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]
+    # 10 s of a window of 30 s are too short for a model with coupling
+    assert not any(call.kwargs["may_couple"] for call in identified.call_args_list)
+    # a model with coupling that predicts worse than the file by two deviations is forgotten
+    assert made.propose(0).sentence.startswith("no coupling any more: the file predicts")
+    assert made.model.matrix_b()[5, 0] == 0.0
 
 
 def test_part_that_the_controller_took_back_is_not_proposed_again(

@@ -207,6 +207,13 @@ class Search(Likelihood):
                 break
         return (several[int(lower.argmin())] if progressed > 0.0 else theta), hessian, progressed
 
+    def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
+        """The innovations of a model that flies, theta (p,), with winds, angles and delays of
+        parts.
+        """
+        theta = np.where(self._errors, flown, self.joined(parts))
+        return self.predicted(theta, self.levels(theta))
+
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
         """Theta, (p,), without errors, with winds, angles and delay of parts: means over the parts.
 

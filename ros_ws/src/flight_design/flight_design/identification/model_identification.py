@@ -86,6 +86,7 @@ class Part(NamedTuple):
     delay_deviation: float = 0.0  # s, standard deviation of `delay`; 0 for a known delay
     delays: tuple[float, ...] = ()  # s, of each input
     file_advantage: float = 0.0  # of the nominal model over the one that flies, see `advantage`
+    coupled_advantage: float = 0.0  # of the nominal airframe over one with coupling that flies
 
 
 class Identification(NamedTuple):
@@ -173,14 +174,16 @@ def identify(
     at_bound: int = 0,
     unknown: Unknown = KNOWN,
     flown: Airframe | None = None,
+    *,
+    may_couple: bool = True,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
     keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
     bound; `unknown` what else is identified; `flown` the model in flight, a further start;
-    `progress` takes the steps `completed` and their largest number `total`. Raises ParameterError
-    for an output that does not move.
+    `may_couple` whether parts may become one; `progress` takes the steps `completed` and their
+    largest number `total`. Raises ParameterError for an output that does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
@@ -210,7 +213,12 @@ def identify(
         correlation(fit.after.normalised, np.delete(recorded.u, block.inputs, axis=1), known)
         for (_, fit), block in zip(fits, every, strict=True)
     ]
-    if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
+    if flown is not None and _couples(flown, airframe):
+        search = study.search(model, whole_aircraft(model), coupled=True)
+        by_flown = search.flying(search.model_errors(flown), fits)
+        z = advantage(first, by_flown, span_length(recorded))
+        parts = [part._replace(coupled_advantage=z) for part in parts]
+    if may_couple and len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
         search = study.search(model, whole_aircraft(model), coupled=True)
         fit = search.fit(used, step, begin=search.joined(fits))
         part = study.part(search, fit)
@@ -225,6 +233,15 @@ def identify(
     after = prediction(last, validating)
     both = (first.r, last.r)
     return Identification(identified, recorded, validating, both, before, after, tuple(parts))
+
+
+def _couples(flown: Airframe, nominal: Airframe) -> bool:
+    """Whether a model has entries that are 0 in the nominal one."""
+    pairs = (
+        (flown.matrix_a(), nominal.matrix_a()),
+        (flown.matrix_b(), nominal.matrix_b()),
+    )
+    return any(bool(np.any((new != 0.0) & (old == 0.0))) for new, old in pairs)
 
 
 def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:

@@ -56,6 +56,11 @@ class FlightRecord:
             return 0.0
         return seconds(self.end_ns - self._samples[0].stamp_ns) + self.period
 
+    @property
+    def is_full(self) -> bool:
+        """Whether the record covers the window."""
+        return nanoseconds(self.length + self.period / 2.0) >= self._window_ns
+
     def take(self, sample: Sample) -> None:
         """Take a sample, if later than the last one, and forget what is older than the window."""
         if not self._samples or sample.stamp_ns > self.end_ns:

@@ -50,6 +50,8 @@ from flight_design.learning.part_checks import (
     back_to_file,
     changed,
     explains,
+    forgets_coupling,
+    forgotten,
     is_within,
     not_white,
     sentence,
@@ -275,6 +277,10 @@ class Learner:
                 for outputs in without_model
             ):
                 continue
+            if self._prior is self._rough and forgets_coupling(part, known):
+                known = {}
+                model = self._rough
+                sentences.append(forgotten(part))
             rough = (
                 part.outputs not in known
                 and part.before.whiteness.max() <= MAX_WHITENESS
@@ -412,6 +418,7 @@ class Learner:
             channels=channels,
             at_bound=AT_BOUND,
             unknown=unknown,
+            may_couple=self._record.is_full,
         )
         prior = self._prior
         model = self.model

@@ -104,6 +104,21 @@ def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
     )
 
 
+def forgets_coupling(part: Part, known: Iterable[tuple[str, ...]]) -> bool:
+    """Whether a flown model with coupling predicts a record worse than the airframe file, as in
+    `back_to_file`.
+    """
+    return bool(uncoupled(part, known)) and part.coupled_advantage > LIKELIER
+
+
+def forgotten(part: Part) -> str:
+    """Why a model with coupling is forgotten."""
+    return (
+        "no coupling any more: the file predicts this record better than the model that flew, by "
+        f"{part.coupled_advantage:.2g} standard deviations"
+    )
+
+
 def weaker(part: Part, flown: Airframe | None) -> str:
     """The effect that a record of gusts has weaker than the model that flies, if by more than
     MAX_DEVIATION.
