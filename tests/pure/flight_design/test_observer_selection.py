@@ -4,6 +4,7 @@
 without A, the command.
 """
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -12,10 +13,11 @@ import pytest
 import yaml
 from tests.builders import rms
 from tests.closed_loop import PROTOTYPE_SERVO
-from tests.conftest import refusing
+from tests.conftest import REPOSITORY, refusing
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -23,12 +25,18 @@ from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_search
+from flight_design.gains.gain_design import observed
 from flight_design.gains.observer_gains import gains_by_rule
+from flight_design.gains.observer_search import WORST_OF
 from flight_design.gains.observer_selection import (
+    FASTEST,
+    WORST_SEED,
+    WORST_UNCERTAINTY,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
 )
+from flight_design.gains.requirement import Requirement
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -180,3 +188,21 @@ def test_command_refuses_options_that_contradict_each_other(
             application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False
         )
     assert f"error: {refused.value}".startswith(sentence)
+
+
+def test_aircraft_that_no_gains_hold_do_not_count() -> None:
+    """With q, p, r held alpha and beta move by A - B (C B)^-1 C A: where it is unstable, no
+    observer has a margin.
+    """
+    folder = REPOSITORY / "examples" / "px4_airplane"
+    airframe = load_airframe(str(folder / "rates_airframe.yaml"))
+    scenario = find_scenario(str(folder / "rates.yaml"))
+    A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF, WORST_SEED)
+    C = airframe.matrix_c()
+    held = A - B @ np.linalg.solve(C @ B, C @ A)
+    diverging = int(np.sum(np.linalg.eigvals(held).real.max(axis=1)[1:] > FASTEST))
+    loose = Requirement(math.radians(20.0), 1.4, 3.0, 0.05, math.radians(5.0))
+    controller, origin = observed(scenario.rise_di(), scenario, airframe, 0.01, loose)
+    assert controller.observer is not None
+    assert f"{diverging} of {WORST_OF} uncertain aircraft do not count" in origin
+    assert 0 < diverging < WORST_OF / 2

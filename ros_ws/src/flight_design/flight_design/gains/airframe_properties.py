@@ -189,6 +189,13 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
     return np.sort_complex(numerators[finite] / denominators[finite])
 
 
+def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
+    """The largest real part of the zeros, 1/s; minus infinity without a zero. With one above 0 the
+    aircraft diverges while y is held.
+    """
+    return float(np.max(invariant_zeros(A, B, C).real, initial=-np.inf))
+
+
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x: the outputs, and n
     - m states beside them.

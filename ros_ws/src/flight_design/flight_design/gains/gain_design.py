@@ -442,7 +442,8 @@ def observed(
         f"{np.degrees(selected.phase_margin):.0f} deg"
     )
     vane_text = f" with vanes for {' and '.join(vanes)}" if vanes else ""
-    return selected.controller, f"observer of {model.name}{vane_text}: {origin}{lowered}; {margins}"
+    sentence = f"{origin}{lowered}; {margins}{selected.not_counted()}"
+    return selected.controller, f"observer of {model.name}{vane_text}: {sentence}"
 
 
 def _gain_sets(

@@ -4,7 +4,6 @@
 ones.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.integrators import rk4
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
-from flight_design.gains.airframe_properties import invariant_zeros, output_coordinates
+from flight_design.gains.airframe_properties import fastest_zero, output_coordinates
 from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelConfig
@@ -146,10 +145,7 @@ def study_airframe(
     A, B = nominal_and_sampled(drawn, uncertainty, samples, seed)
     if effected is not None:
         B = np.asarray(B @ effected.T)
-    zeros = [
-        invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf)
-        for pair in zip(A, B, strict=True)
-    ]
+    zeros = [fastest_zero(*pair, airframe.matrix_c()) for pair in zip(A, B, strict=True)]
     stable = np.array(zeros) <= ZERO_REAL_PART
     require(
         bool(stable[0]),

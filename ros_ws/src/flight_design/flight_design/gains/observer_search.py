@@ -68,6 +68,16 @@ class SelectedObserver(NamedTuple):
     # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
     relaxation: FloatArray
     place: int = 0  # of its gain set
+    left_out: int = 0  # uncertain aircraft that no gains hold
+
+    def not_counted(self) -> str:
+        """A sentence on the aircraft left out; "" where none is."""
+        if not self.left_out:
+            return ""
+        return (
+            f"; {self.left_out} of {WORST_OF} uncertain aircraft do not count: they diverge while "
+            f"{', '.join(self.controller.outputs)} are held, under any gains"
+        )
 
 
 class AtSpeed(NamedTuple):

@@ -33,6 +33,7 @@ from control_laws.observer_design import (
 from flight_analysis.closed_loop.loop_margins import law_order, loop_of
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
+from flight_design.gains.airframe_properties import fastest_zero
 from flight_design.gains.extended_state import extended_state_weights, integrator_model
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.nominal import nominal_model
@@ -52,6 +53,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # of the uncertain aircraft whose least phase margin counts
 WORST_UNCERTAINTY = 0.3
+# 1/s, of a zero on the right: the aircraft diverges so fast while its outputs are held
+FASTEST = 1e-3
 WORST_SEED = 1
 
 # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
@@ -97,7 +100,8 @@ def with_aircraft_observer(
     the first. `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or
     beta. The phase margin is also that of WORST_OF uncertain aircraft where the airframe is
     `uncertain`. `speeds` are two ratios to the trim speed: the controller has a schedule then, and
-    the margins at these speeds too. `progress` gets a sentence before a step of the search. Raises
+    the margins at these speeds too. Uncertain aircraft with a zero on the right do not count: no
+    gains hold all outputs there. `progress` gets a sentence before a step of the search. Raises
     ParameterError for an airframe with another D or without a wind, one that a feedforward refuses,
     and for margins that no relaxation reaches.
     """
@@ -124,6 +128,7 @@ def with_aircraft_observer(
         )
         searches.append(search)
     selected = least_relaxed([search.steps() for search in searches], progress)
+    selected = selected._replace(left_out=1 + WORST_OF * uncertain - len(plant.A))
     if speeds is None:
         return selected
     others = searches[selected.place].others
@@ -167,13 +172,19 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """The nominal aircraft and `count` uncertain ones, the vanes below the outputs."""
+        """The nominal aircraft and those of `count` uncertain ones that gains can hold, the vanes
+        below the outputs.
+        """
         A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED)
         _, columns = law_order(self.airframe, self.base)
         states = np.array(list(self.airframe.states))
         vane_rows = [(states == name).astype(np.float64) for name in vanes]
-        C = np.vstack([self.model.C, *vane_rows])
-        return LinearPlant(A + self.model.gravity, B[:, :, columns], C)
+        A = A + self.model.gravity
+        B = B[:, :, columns]
+        zeros = [fastest_zero(*pair, self.model.C) for pair in zip(A, B, strict=True)]
+        held = np.array(zeros) < FASTEST
+        held[0] = True  # the nominal aircraft: its margins say more
+        return LinearPlant(A[held], B[held], np.vstack([self.model.C, *vane_rows]))
 
     def observer(
         self, model: NominalModel, gains: ObserverGains
