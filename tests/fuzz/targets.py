@@ -17,6 +17,7 @@ import re
 import shutil
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -41,7 +42,7 @@ from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
 from c_export.constants import exportable, header
-from c_export.library import model_description
+from c_export.library import TUNABLE, Units, model_description
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
@@ -198,8 +199,12 @@ def _check_code(controller: RiseDiConfig) -> None:
     assert _tokens(text) == _tokens(
         header(exportable(find_scenario("osprey_gust").controller), "fuzz", float32=False)
     )
-    variables = ElementTree.fromstring(model_description(controller, "fuzz")).iter("ScalarVariable")
-    assert len([*variables]) == 2 * len(controller.outputs) + len(controller.effectors) + 4
+    units = Units(("1",) * len(controller.outputs), ("1",) * len(controller.effectors))
+    unit = ElementTree.fromstring(model_description(controller, "fuzz", units))
+    kinds = Counter(variable.get("causality") for variable in unit.iter("ScalarVariable"))
+    assert kinds["parameter"] == len(TUNABLE) * len(controller.outputs)
+    assert kinds["input"] == 2 * len(controller.outputs) + 3
+    assert kinds["output"] == len(controller.effectors) + 1
 
 
 def _tokens(text: str) -> list[str]:

@@ -8,6 +8,7 @@ import importlib.util
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,13 +19,14 @@ from tests.conftest import REPOSITORY, refusing
 
 from c_export.constants import exportable
 from c_export.events import run_recording
-from c_export.library import CController, build_fmu, build_library
+from c_export.library import CController, Units, build_fmu, build_library
 from c_export.proof import FLAGS, build, write_code
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
@@ -121,42 +123,114 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
     assert (moved > 0.0).all()
 
 
-def test_fmu_flies_to_the_bit(tmp_path: Path) -> None:
-    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one
-    process.
-    """
+UNITS = Units(("rad/s", "rad/s", "rad/s", "m/s"), ("rad", "rad", "rad", "1"))
+STEP = 0.01  # s
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fmu")
+    config = exportable(find_scenario("osprey_observer").controller)
+    write_code(config, "osprey_observer", folder / "code", float32=False)
+    path = folder / "rise_di.fmu"
+    return build_fmu(folder / "code", ["gcc"], config, "osprey_observer", path, UNITS)
+
+
+def flown(unit: Path, tape: Tape, outputs: Sequence[str], **start: float) -> FloatArray:
+    """The u of a unit along y and y_m of a tape, by FMPy, with other parameters."""
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
-    scenario = find_scenario("osprey_observer", 5.0).vary(
-        aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
-    )
-    config = exportable(scenario.controller)
-    write_code(config, "osprey_observer", tmp_path / "code", float32=False)
-    unit = build_fmu(
-        tmp_path / "code", ["gcc"], config, "osprey_observer", tmp_path / "rise_di.fmu"
-    )
-    tape = simulate(scenario)
-    groups = {group: tape["internals"].group(group) for group in ("y", "y_m", "u")}
     t = tape.time("internals")
-    names = [f"{group}.{name}" for group in ("y", "y_m") for name in config.outputs]
-    columns = [groups[group][name] for group in ("y", "y_m") for name in config.outputs]
-    assert pytest.importorskip("fmpy.validation").validate_fmu(str(unit)) == []
-    signals = np.zeros(len(t), dtype=[("time", float), *((name, float) for name in names)])
+    columns = {
+        f"{group}.{name}": tape["internals"].group(group)[name]
+        for group in ("y", "y_m")
+        for name in outputs
+    }
+    signals = np.zeros(len(t), dtype=[("time", float), *((name, float) for name in columns)])
     signals["time"] = t
-    for name, column in zip(names, columns, strict=True):
+    for name, column in columns.items():
         signals[name] = column
-    flown = fmpy.simulate_fmu(
+    names = [f"u.{name}" for name in find_scenario("osprey_observer").controller.inputs]
+    result = fmpy.simulate_fmu(
         str(unit),
         start_time=0.0,
         stop_time=float(t[-1]),
-        output_interval=0.01,
+        output_interval=STEP,
         input=signals,
-        output=[f"u.{name}" for name in config.inputs],
+        output=names,
+        start_values=start,
     )
-    u = np.column_stack([flown[f"u.{name}"] for name in config.inputs])
-    assert len(u) == len(t)
-    assert (
-        u[1:].tobytes() == groups["u"].values[:-1].tobytes()
-    )  # valid after the step, whose begin has the stamp
+    assert len(result) == len(t)
+    return np.column_stack([result[name] for name in names])
+
+
+def test_fmu_flies_to_the_bit(unit: Path, tmp_path: Path) -> None:
+    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one
+    process; a gain set before the flight is that of Python, and the sources compile by CMake.
+    """
+    scenario = find_scenario("osprey_observer", 5.0).vary(
+        aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    )
+    outputs = scenario.controller.outputs
+    tape = simulate(scenario)
+    u = tape["internals"].group("u").values[:-1]
+    assert pytest.importorskip("fmpy.validation").validate_fmu(str(unit)) == []
+    # valid after the step, whose begin has the stamp
+    assert flown(unit, tape, outputs)[1:].tobytes() == u.tobytes()
+    Lambda = scenario.rise_di().Lambda
+    slower = scenario.vary(controller={"Lambda": (0.5 * Lambda[0], *Lambda[1:])})
+    changed = simulate(slower)
+    again = flown(unit, changed, outputs, **{f"Lambda.{outputs[0]}": 0.5 * Lambda[0]})
+    assert again[1:].tobytes() == changed["internals"].group("u").values[:-1].tobytes()
+    if shutil.which("cmake") is not None:
+        with zipfile.ZipFile(unit) as packed:
+            members = [name for name in packed.namelist() if not name.startswith("binaries/")]
+            packed.extractall(tmp_path, members)
+        by_cmake = pytest.importorskip("fmpy.build").build_platform_binary
+        (tmp_path / "build").mkdir()
+        by_cmake(str(tmp_path), build_dir=str(tmp_path / "build"))
+        assert flown(tmp_path, tape, outputs)[1:].tobytes() == u.tobytes()
+
+
+def test_fmu_state_is_taken_back_and_a_wrong_gain_is_refused(unit: Path) -> None:
+    """From a saved state, also as bytes, the same steps give the same u."""
+    fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
+    slave = pytest.importorskip("fmpy.fmi2").FMU2Slave
+    description = fmpy.read_model_description(str(unit))
+    references = {variable.name: variable.valueReference for variable in description.modelVariables}
+    assert {variable.unit for variable in description.modelVariables} >= {"rad/s", "m/s", "rad"}
+    folder = fmpy.extract(str(unit))
+    instance = slave(guid=description.guid, unzipDirectory=folder, modelIdentifier="rise_di")
+    instance.instantiate()
+    instance.setupExperiment(startTime=0.0)
+    instance.enterInitializationMode()
+    instance.exitInitializationMode()
+
+    def steps(begin: int, count: int) -> list[float]:
+        u = []
+        for k in range(begin, begin + count):
+            instance.setReal([references["y.q"]], [0.1 * np.sin(0.1 * k)])
+            instance.doStep(currentCommunicationPoint=STEP * k, communicationStepSize=STEP)
+            u += instance.getReal([references["u.elevator"]])
+        return u
+
+    steps(0, 50)
+    state = instance.getFMUstate()
+    content = instance.serializeFMUstate(state)
+    first = steps(50, 50)
+    assert len(set(first)) > 40
+    instance.setFMUstate(state)
+    assert steps(50, 50) == first
+    instance.setFMUstate(instance.deSerializeFMUstate(content))
+    assert steps(50, 50) == first
+    instance.setReal([references["Lambda.q"]], [-1.0])
+    with pytest.raises(
+        Exception, match="fmi2DoStep failed with status 2"
+    ):  # discarded, and the law flies on unchanged
+        steps(100, 1)
+    instance.setReal([references["Lambda.q"]], [1.0])
+    assert np.isfinite(steps(101, 1)).all()
+    instance.freeInstance()
+    shutil.rmtree(folder)
 
 
 def test_program_of_the_page_flies(tmp_path: Path) -> None:

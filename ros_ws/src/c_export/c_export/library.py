@@ -6,20 +6,25 @@ import ctypes
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from c_export.constants import TABLE, constants
 from c_export.events import GUARD_TICK, RESTART, START, Recording
 from c_export.proof import CODE, FLAGS, PARAMETERS, SOURCE, build
 from flight_core.parameters import ParameterError
 from flight_core.text import printable
+from flight_core.units import quantity
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 _POINTER = ctypes.c_void_p
+MOST = float(np.finfo(np.float64).max)  # in place of infinity, as in the C code
 
 
 class CController:
@@ -102,43 +107,131 @@ VALUE_REFERENCES = {
     "y_new": 301,
     "y_m_new": 302,
     "mode": 400,
+    "parameter": 1000,
 }
-"""Value references of the first channel of each group, those of fmu.c."""
+"""Value references of the first channel of each group, those of fmu.c; of the parameters by their
+place."""
+
+TUNABLE: Mapping[str, str] = MappingProxyType(
+    {
+        "K": "diagonal of K (22), 1/s",
+        "Lambda": "diagonal of Lambda (4), 1/s",
+        "beta": "diagonal of beta (21), units of the output per s^2",
+        "input_scale": "units of the input times s per unit of the output",
+        "eps": "half-width of the softened sign, units of the output",
+        "limits.lower": "lower limit of u from trim",
+        "limits.upper": "upper limit of u from trim",
+        "limits.rate": "limit of the rate of u, per s",
+    }
+)
+"""Parameters that may change between two steps, and what each is; with a value a channel."""
 
 
-def model_description(controller: RiseDiConfig, scenario: str) -> str:
-    """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode;
-    a step is a tick.
-    """
-    groups = {"y": controller.outputs, "y_m": controller.outputs, "u": controller.effectors}
+class Units(NamedTuple):
+    """SI units of the outputs and of the commands, in their order."""
+
+    outputs: Sequence[str]
+    commands: Sequence[str]
+
+
+def si_units(units: Sequence[str]) -> tuple[str, ...]:
+    """The SI units of units of airframe files, as "rad/s" of "deg/s"."""
+    return tuple(_unit_name(quantity(unit).dimension) for unit in units)
+
+
+def _unit_name(dimension: tuple[int, int, int, int]) -> str:
+    """A name of the SI unit with these exponents of rad, m, s and kg."""
+    parts = list(zip(("rad", "m", "s", "kg"), dimension, strict=True))
+    above = [_power(name, exponent) for name, exponent in parts if exponent > 0]
+    below = [_power(name, -exponent) for name, exponent in parts if exponent < 0]
+    return "/".join(["*".join(above) or "1", *below])
+
+
+def _power(name: str, exponent: int) -> str:
+    return name if exponent == 1 else f"{name}{exponent}"
+
+
+def _definitions(units: Units) -> list[str]:
+    """UnitDefinitions of the units."""
+    lines = []
+    for name in sorted({*units.outputs, *units.commands}):
+        dimension = quantity(name).dimension
+        exponents = zip(("rad", "m", "s", "kg"), dimension, strict=True)
+        base = "".join(f' {unit}="{exponent}"' for unit, exponent in exponents if exponent)
+        lines.append(f"<Unit name={quoteattr(name)}><BaseUnit{base}/></Unit>")
+    return ["<UnitDefinitions>", *lines, "</UnitDefinitions>"]
+
+
+def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
+    """Variables of y, y_m, u, the flags and the mode."""
+    groups = {
+        "y": (controller.outputs, units.outputs),
+        "y_m": (controller.outputs, units.outputs),
+        "u": (controller.effectors, units.commands),
+    }
     variables = []
-    for group, names in groups.items():
-        for i, name in enumerate(names):
-            attributes = (
-                f"name={quoteattr(printable(f'{group}.{name}'))} "
-                f'valueReference="{VALUE_REFERENCES[group] + i}"'
+    for group, (names, group_units) in groups.items():
+        is_input = group != "u"
+        for i, (name, unit) in enumerate(zip(names, group_units, strict=True)):
+            start = ' start="0"' if is_input else ""
+            variables.append(
+                _variable(
+                    f"{group}.{name}",
+                    VALUE_REFERENCES[group] + i,
+                    "input" if is_input else "output",
+                    f"<Real unit={quoteattr(unit)}{start}/>",
+                )
             )
-            if group == "u":
-                variables.append(
-                    f'<ScalarVariable {attributes} causality="output" '
-                    'variability="discrete"><Real/></ScalarVariable>'
-                )
-            else:
-                kind = 'causality="input" variability="discrete"'
-                variables.append(
-                    f'<ScalarVariable {attributes} {kind}><Real start="0"/></ScalarVariable>'
-                )
     for name in ("active", "y_new", "y_m_new"):
-        attributes = (
-            f'name="{name}" valueReference="{VALUE_REFERENCES[name]}" '
-            'causality="input" variability="discrete"'
-        )
-        variables.append(f'<ScalarVariable {attributes}><Boolean start="true"/></ScalarVariable>')
-    attributes = (
-        f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" '
-        'variability="discrete"'
+        content = '<Boolean start="true"/>'
+        variables.append(_variable(name, VALUE_REFERENCES[name], "input", content))
+    return [*variables, _variable("mode", VALUE_REFERENCES["mode"], "output", "<Integer/>")]
+
+
+def _parameters(controller: RiseDiConfig) -> list[str]:
+    """Variables of the parameters TUNABLE, a channel each."""
+    variables = []
+    place = VALUE_REFERENCES["parameter"]
+    for member in constants(controller):
+        if not isinstance(member.value, np.ndarray):
+            continue
+        if member.name in TUNABLE:
+            _, least, largest = TABLE[member.name]
+            bounds = {"min": least, "max": largest}
+            limits = "".join(f' {key}="{x!r}"' for key, x in bounds.items() if np.isfinite(x))
+            is_limit = member.name.startswith("limits.")
+            names = controller.inputs if is_limit else controller.outputs
+            for i, name in enumerate(names):
+                value = float(np.nan_to_num(member.value[i], posinf=MOST, neginf=-MOST))
+                variables.append(
+                    _variable(
+                        f"{member.name}.{name}",
+                        place + i,
+                        "parameter",
+                        f'<Real{limits} start="{value!r}"/>',
+                        TUNABLE[member.name],
+                    )
+                )
+        place += member.value.size
+    return variables
+
+
+def _variable(
+    name: str, reference: int, causality: str, content: str, description: str = ""
+) -> str:
+    variability = "tunable" if causality == "parameter" else "discrete"
+    said = f" description={quoteattr(description)}" if description else ""
+    return (
+        f'<ScalarVariable name={quoteattr(printable(name))} valueReference="{reference}" '
+        f'causality="{causality}" variability="{variability}"{said}>{content}</ScalarVariable>'
     )
-    variables.append(f"<ScalarVariable {attributes}><Integer/></ScalarVariable>")
+
+
+def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
+    """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode;
+    parameters TUNABLE; a step is a tick.
+    """
+    variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
     outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
@@ -150,10 +243,17 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<fmiModelDescription fmiVersion="2.0" {model_attributes}>',
-        '<CoSimulation modelIdentifier="rise_di" canHandleVariableCommunicationStepSize="true"/>',
+        (
+            '<CoSimulation modelIdentifier="rise_di" canHandleVariableCommunicationStepSize="true" '
+            'canGetAndSetFMUstate="true" canSerializeFMUstate="true">'
+        ),
+        '<SourceFiles><File name="fmu.c"/></SourceFiles>',
+        "</CoSimulation>",
+        *_definitions(units),
         f'<DefaultExperiment startTime="0" stepSize="{1.0 / controller.rate!r}"/>',
         "<ModelVariables>",
         *variables,
+        *_parameters(controller),
         "</ModelVariables>",
         f"<ModelStructure><Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure>",
         "</fmiModelDescription>",
@@ -162,15 +262,20 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
 
 
 def build_fmu(
-    code: Path, compiler: Sequence[str], controller: RiseDiConfig, scenario: str, path: Path
+    code: Path,
+    compiler: Sequence[str],
+    controller: RiseDiConfig,
+    scenario: str,
+    path: Path,
+    units: Units,
 ) -> Path:
-    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64). Raises
-    ParameterError.
+    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64), with the
+    sources for others. Raises ParameterError.
     """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", model_description(controller, scenario))
+            archive.writestr("modelDescription.xml", model_description(controller, scenario, units))
             archive.write(library, "binaries/linux64/rise_di.so")
             for part in (*(code / name for name in (*CODE, PARAMETERS)), SOURCE / "fmu.c"):
                 archive.write(part, f"sources/{part.name}")

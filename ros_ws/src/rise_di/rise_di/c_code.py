@@ -10,7 +10,7 @@ from c_export.autopilots import MODULE, SAMPLES, VEHICLE, write_ardupilot, write
 from c_export.constants import exportable
 from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
-from c_export.library import build_fmu
+from c_export.library import Units, build_fmu, si_units
 from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -27,6 +27,14 @@ PART = 50_000  # drawn steps of a recording
 LONGEST = 20.0  # s, of a flight without a duration
 SHELLS = {"px4": (write_px4, MODULE), "ardupilot": (write_ardupilot, VEHICLE)}
 """What writes the code for an autopilot, and where the code lies in the folder."""
+
+
+class Material(NamedTuple):
+    """What a proof compares."""
+
+    sets: list[RiseDiConfig]  # the parameters, the first those of the code
+    recordings: Iterator[Recording]
+    line: str  # of the report
 
 
 class Exported(NamedTuple):
@@ -102,19 +110,20 @@ def export(
     starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
     code, files, kept = _write(chosen, folder, autopilot, samples, float32=float32)
     if fmu:
-        files.append(build_fmu(code, commands[0], controller, title, folder / FMU))
+        units = _units(chosen, controller)
+        files.append(build_fmu(code, commands[0], controller, title, folder / FMU, units))
     if not proof:
         return Exported(files, None, "")
     if run is None:
-        sets = parameter_sets(controller)
         length = min(chosen.flight.duration, LONGEST) if duration is None else duration
         flight = chosen.vary(flight={"duration": length})
-        recordings = _recordings(flight, sets, 0 if float32 else drawn, seed, kept)
-        logged = ""
+        material = _flown(flight, 0 if float32 else drawn, seed, kept)
     else:
-        sets, recordings, logged = _logged(run, controller, title)
-    proved = prove(code, commands, sets, recordings, float32=float32, runner=starter)
-    text = report(proved, title) + logged
+        material = _logged(run, controller, title)
+    proved = prove(
+        code, commands, material.sets, material.recordings, float32=float32, runner=starter
+    )
+    text = report(proved, title) + material.line
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
@@ -137,9 +146,15 @@ def _write(
     return folder / place, write(scenario, folder, float32=float32, samples=kept), kept
 
 
-def _logged(
-    run: FilePath | RecordedRun, controller: RiseDiConfig, title: str
-) -> tuple[list[RiseDiConfig], Iterator[Recording], str]:
+def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
+    """SI units of the outputs and of the commands of a scenario."""
+    channels = scenario.aircraft.channels()
+    outputs = [channels.outputs[name] for name in controller.outputs]
+    commands = [channels.inputs[name] for name in controller.effectors]
+    return Units(si_units(outputs), si_units(commands))
+
+
+def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
     """The parameters and the ticks of a flight, and a line on their u. Raises ParameterError for a
     flight with other parameters.
     """
@@ -147,7 +162,13 @@ def _logged(
     same = sets[0].digest() == controller.digest()
     require(same, "run", "a flight with other parameters", f"those of {title}")
     line = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
-    return sets, iter([recording]), line
+    return Material(sets, iter([recording]), line)
+
+
+def _flown(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
+    """Flights of a scenario and drawn inputs, with changes of the parameters."""
+    sets = parameter_sets(exportable(scenario.controller))
+    return Material(sets, _recordings(scenario, sets, drawn, seed, samples), "")
 
 
 def _recordings(

@@ -2,16 +2,26 @@
  * SPDX-License-Identifier: Apache-2.0
  *
  * The controller as a co-simulation unit of FMI 2.0. A step of the unit is a tick: y and y_m have the stamp of the begin of the step,
- * and u is valid after the step. Source: FMI 2.0.5, sections 2.1 and 4.2. Value references: modelDescription.xml.
+ * and u is valid after the step. Parameters of the law may change between two steps: the next step checks them. Source: FMI 2.0.5,
+ * sections 2.1 and 4.2. Value references: modelDescription.xml.
  */
 #include <stddef.h>
+#include <string.h>
 
 #include "rise_di.c"
+#include "rise_di_table.c"
 
-enum { Y = 0, Y_M = 100, U = 200, ACTIVE = 300, Y_NEW = 301, Y_M_NEW = 302, MODE = 400 };
+#ifdef _WIN32
+#define EXPORTED __declspec(dllexport)
+#else
+#define EXPORTED
+#endif
+
+enum { Y = 0, Y_M = 100, U = 200, ACTIVE = 300, Y_NEW = 301, Y_M_NEW = 302, MODE = 400, PARAMETER = 1000 };
 #define LONGEST 9e9 /* s, 285 years: what int64_t holds in ns */
 
 enum { OK = 0, DISCARD = 2, ERROR = 3 };
+#define REALS ((sizeof(rise_di_parameters) - offsetof(rise_di_parameters, period)) / sizeof(rise_di_real))
 
 typedef struct {
     void (*logger)(void *, const char *, int, const char *, const char *, ...);
@@ -23,48 +33,52 @@ typedef struct {
 
 typedef struct {
     rise_di_controller controller;
+    rise_di_parameters parameters[2]; /* in force: that of `flown`; and before */
+    rise_di_parameters wanted;        /* with the values of the importer */
+    int flown, edited;
     rise_di_real y[RISE_DI_M], y_m[RISE_DI_M];
     int active, y_new, y_m_new;
+    void *(*allocate)(size_t, size_t);
     void (*release)(void *);
 } unit;
 
 static const rise_di_parameters exported = RISE_DI_PARAMETERS;
 
-const char *fmi2GetTypesPlatform(void);
-const char *fmi2GetVersion(void);
-int fmi2SetDebugLogging(unit *, int, size_t, const char *const *);
-unit *fmi2Instantiate(const char *, int, const char *, const char *, const callbacks *, int, int);
-void fmi2FreeInstance(unit *);
-int fmi2SetupExperiment(unit *, int, double, double, int, double);
-int fmi2EnterInitializationMode(unit *);
-int fmi2ExitInitializationMode(unit *);
-int fmi2Terminate(unit *);
-int fmi2Reset(unit *);
-int fmi2GetReal(unit *, const unsigned *, size_t, double *);
-int fmi2GetInteger(unit *, const unsigned *, size_t, int *);
-int fmi2GetBoolean(unit *, const unsigned *, size_t, int *);
-int fmi2GetString(unit *, const unsigned *, size_t, const char **);
-int fmi2SetReal(unit *, const unsigned *, size_t, const double *);
-int fmi2SetInteger(unit *, const unsigned *, size_t, const int *);
-int fmi2SetBoolean(unit *, const unsigned *, size_t, const int *);
-int fmi2SetString(unit *, const unsigned *, size_t, const char *const *);
-int fmi2DoStep(unit *, double, double, int);
-int fmi2CancelStep(unit *);
+EXPORTED const char *fmi2GetTypesPlatform(void);
+EXPORTED const char *fmi2GetVersion(void);
+EXPORTED int fmi2SetDebugLogging(unit *, int, size_t, const char *const *);
+EXPORTED unit *fmi2Instantiate(const char *, int, const char *, const char *, const callbacks *, int, int);
+EXPORTED void fmi2FreeInstance(unit *);
+EXPORTED int fmi2SetupExperiment(unit *, int, double, double, int, double);
+EXPORTED int fmi2EnterInitializationMode(unit *);
+EXPORTED int fmi2ExitInitializationMode(unit *);
+EXPORTED int fmi2Terminate(unit *);
+EXPORTED int fmi2Reset(unit *);
+EXPORTED int fmi2GetReal(unit *, const unsigned *, size_t, double *);
+EXPORTED int fmi2GetInteger(unit *, const unsigned *, size_t, int *);
+EXPORTED int fmi2GetBoolean(unit *, const unsigned *, size_t, int *);
+EXPORTED int fmi2GetString(unit *, const unsigned *, size_t, const char **);
+EXPORTED int fmi2SetReal(unit *, const unsigned *, size_t, const double *);
+EXPORTED int fmi2SetInteger(unit *, const unsigned *, size_t, const int *);
+EXPORTED int fmi2SetBoolean(unit *, const unsigned *, size_t, const int *);
+EXPORTED int fmi2SetString(unit *, const unsigned *, size_t, const char *const *);
+EXPORTED int fmi2DoStep(unit *, double, double, int);
+EXPORTED int fmi2CancelStep(unit *);
+EXPORTED int fmi2GetFMUstate(unit *, unit **);
+EXPORTED int fmi2SetFMUstate(unit *, const unit *);
+EXPORTED int fmi2FreeFMUstate(unit *, unit **);
+EXPORTED int fmi2SerializedFMUstateSize(unit *, const unit *, size_t *);
+EXPORTED int fmi2SerializeFMUstate(unit *, const unit *, char *, size_t);
+EXPORTED int fmi2DeSerializeFMUstate(unit *, const char *, size_t, unit **);
 /* Not offered by the unit, as modelDescription.xml says by silence; every function of FMI 2.0 has to exist. */
-int fmi2GetFMUstate(unit *, void **);
-int fmi2SetFMUstate(unit *, void *);
-int fmi2FreeFMUstate(unit *, void **);
-int fmi2SerializedFMUstateSize(unit *, void *, size_t *);
-int fmi2SerializeFMUstate(unit *, void *, char *, size_t);
-int fmi2DeSerializeFMUstate(unit *, const char *, size_t, void **);
-int fmi2GetDirectionalDerivative(unit *, const unsigned *, size_t, const unsigned *, size_t, const double *, double *);
-int fmi2SetRealInputDerivatives(unit *, const unsigned *, size_t, const int *, const double *);
-int fmi2GetRealOutputDerivatives(unit *, const unsigned *, size_t, const int *, double *);
-int fmi2GetStatus(unit *, int, int *);
-int fmi2GetRealStatus(unit *, int, double *);
-int fmi2GetIntegerStatus(unit *, int, int *);
-int fmi2GetBooleanStatus(unit *, int, int *);
-int fmi2GetStringStatus(unit *, int, const char **);
+EXPORTED int fmi2GetDirectionalDerivative(unit *, const unsigned *, size_t, const unsigned *, size_t, const double *, double *);
+EXPORTED int fmi2SetRealInputDerivatives(unit *, const unsigned *, size_t, const int *, const double *);
+EXPORTED int fmi2GetRealOutputDerivatives(unit *, const unsigned *, size_t, const int *, double *);
+EXPORTED int fmi2GetStatus(unit *, int, int *);
+EXPORTED int fmi2GetRealStatus(unit *, int, double *);
+EXPORTED int fmi2GetIntegerStatus(unit *, int, int *);
+EXPORTED int fmi2GetBooleanStatus(unit *, int, int *);
+EXPORTED int fmi2GetStringStatus(unit *, int, const char **);
 
 const char *fmi2GetTypesPlatform(void) { return "default"; }
 
@@ -76,7 +90,11 @@ int fmi2SetDebugLogging(unit *u, int on, size_t count, const char *const *catego
 }
 
 int fmi2Reset(unit *u) {
-    const bool started = rise_di_start(&u->controller, &exported);
+    bool started;
+    u->parameters[0] = exported;
+    u->wanted = exported;
+    u->flown = u->edited = 0;
+    started = rise_di_start(&u->controller, &u->parameters[0]);
     fill(u->y, RISE_DI_M, ZERO);
     fill(u->y_m, RISE_DI_M, ZERO);
     u->active = u->y_new = u->y_m_new = 1;
@@ -91,6 +109,7 @@ unit *fmi2Instantiate(const char *name, int type, const char *guid, const char *
         return NULL;
     }
     if (u != NULL) {
+        u->allocate = functions->allocate;
         u->release = functions->release;
         if (fmi2Reset(u) != OK) {
             functions->release(u);
@@ -126,10 +145,32 @@ static rise_di_real *input_of(unit *u, unsigned reference) {
     return (group < 2 && i < RISE_DI_M) ? &groups[group][i] : NULL;
 }
 
+/* The place of a parameter among the values of the importer; NULL for an unknown reference. */
+static rise_di_real *parameter_of(unit *u, unsigned reference) {
+    return (reference >= PARAMETER && reference - PARAMETER < REALS) ? &(&u->wanted.period)[reference - PARAMETER] : NULL;
+}
+
 /* The place of a real variable; NULL for an unknown reference. */
 static const rise_di_real *real_of(unit *u, unsigned reference) {
-    const int commanded = reference >= U && reference < U + RISE_DI_COMMANDS;
-    return commanded ? &rise_di_command(&u->controller)[reference - U] : input_of(u, reference);
+    const rise_di_real *place = input_of(u, reference);
+    if (reference >= PARAMETER) {
+        place = parameter_of(u, reference);
+    } else if (reference >= U && reference < U + RISE_DI_COMMANDS) {
+        place = &rise_di_command(&u->controller)[reference - U];
+    }
+    return place;
+}
+
+/* Take the parameters of the importer, in place of those two changes ago. False where one is out of its bounds. */
+static bool are_taken(unit *u) {
+    if (u->edited && rise_di_check(&u->wanted) == NULL) {
+        u->wanted.digest = u->parameters[u->flown].digest + 1;
+        u->flown = 1 - u->flown;
+        u->parameters[u->flown] = u->wanted;
+        rise_di_retune(&u->controller, &u->parameters[u->flown]);
+        u->edited = 0;
+    }
+    return !u->edited;
 }
 
 static int *boolean_of(unit *u, unsigned reference) {
@@ -150,11 +191,12 @@ int fmi2GetReal(unit *u, const unsigned *references, size_t count, double *value
 
 int fmi2SetReal(unit *u, const unsigned *references, size_t count, const double *values) {
     for (size_t i = 0; i < count; i++) {
-        rise_di_real *place = input_of(u, references[i]);
+        rise_di_real *place = references[i] >= PARAMETER ? parameter_of(u, references[i]) : input_of(u, references[i]);
         if (place == NULL) {
             return ERROR;
         }
         *place = (rise_di_real)values[i];
+        u->edited = u->edited || references[i] >= PARAMETER;
     }
     return OK;
 }
@@ -211,7 +253,7 @@ int fmi2DoStep(unit *u, double t, double step_size, int no_set_state) {
     rise_di_status of_y = RISE_DI_TAKEN, of_y_m = RISE_DI_TAKEN;
     rise_di_output output;
     (void)step_size, (void)no_set_state;
-    if (!(t > -LONGEST && t < LONGEST)) {
+    if (!(t > -LONGEST && t < LONGEST) || !are_taken(u)) {
         return DISCARD;
     }
     now_ns = (int64_t)((t * 1e9) + 0.5);
@@ -225,20 +267,56 @@ int fmi2DoStep(unit *u, double t, double step_size, int no_set_state) {
     return (of_y == RISE_DI_TAKEN && of_y_m == RISE_DI_TAKEN) ? OK : DISCARD;
 }
 
-int fmi2GetFMUstate(unit *u, void **state) { return (void)u, (void)state, ERROR; }
-
-int fmi2SetFMUstate(unit *u, void *state) { return (void)u, (void)state, ERROR; }
-
-int fmi2FreeFMUstate(unit *u, void **state) { return (void)u, (void)state, ERROR; }
-
-int fmi2SerializedFMUstateSize(unit *u, void *state, size_t *size) { return (void)u, (void)state, (void)size, ERROR; }
-
-int fmi2SerializeFMUstate(unit *u, void *state, char *bytes, size_t size) {
-    return (void)u, (void)state, (void)bytes, (void)size, ERROR;
+int fmi2GetFMUstate(unit *u, unit **state) {
+    if (*state == NULL) {
+        *state = u->allocate(1, sizeof(unit));
+    }
+    if (*state == NULL) {
+        return ERROR;
+    }
+    **state = *u;
+    return OK;
 }
 
-int fmi2DeSerializeFMUstate(unit *u, const char *bytes, size_t size, void **state) {
-    return (void)u, (void)bytes, (void)size, (void)state, ERROR;
+int fmi2SetFMUstate(unit *u, const unit *state) {
+    void *(*const allocate)(size_t, size_t) = u->allocate;
+    void (*const release)(void *) = u->release;
+    *u = *state;
+    u->allocate = allocate;
+    u->release = release;
+    u->controller.parameters = &u->parameters[u->flown];
+    return OK;
+}
+
+int fmi2FreeFMUstate(unit *u, unit **state) {
+    if (*state != NULL) {
+        u->release(*state);
+    }
+    *state = NULL;
+    return OK;
+}
+
+int fmi2SerializedFMUstateSize(unit *u, const unit *state, size_t *size) {
+    (void)u, (void)state;
+    *size = sizeof(unit);
+    return OK;
+}
+
+int fmi2SerializeFMUstate(unit *u, const unit *state, char *bytes, size_t size) {
+    (void)u;
+    if (size < sizeof(unit)) {
+        return ERROR;
+    }
+    memcpy(bytes, state, sizeof(unit));
+    return OK;
+}
+
+int fmi2DeSerializeFMUstate(unit *u, const char *bytes, size_t size, unit **state) {
+    if (size != sizeof(unit) || fmi2GetFMUstate(u, state) != OK) {
+        return ERROR;
+    }
+    memcpy(*state, bytes, sizeof(unit));
+    return OK;
 }
 
 int fmi2GetDirectionalDerivative(unit *u, const unsigned *of, size_t of_count, const unsigned *by, size_t by_count,
