@@ -29,6 +29,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import read_run
+from rise_di.c_code import export
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -397,3 +398,26 @@ def test_wrong_samples_are_lost_as_by_controller(
         assert mode == (-1 if output is None else python.mode)
         assert u.tobytes() == python.state.u.tobytes()
     assert lost > 10  # 5 spikes, 2 at each end of the jump, 1 of y_m, some of the noise
+
+
+def test_export_at_another_rate_is_the_loop_at_that_rate(tmp_path: Path) -> None:
+    """Of two periods Phi is Phi^2; a rate at which the loop is unstable is refused."""
+    scenario = find_scenario("osprey_observer")
+    controller = scenario.rise_di()
+    nominal = controller.nominal()
+    assert controller.observer is not None
+    assert nominal is not None
+    Phi, Gamma, H, L, _ = controller.observer.matrices(nominal)
+    slow = controller.observer.at_rate(50.0, nominal)
+    assert slow.rate == 50.0
+    twice, driven, _, corrected, _ = slow.matrices(nominal)
+    np.testing.assert_allclose(twice, Phi @ Phi, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(driven, Phi @ Gamma + Gamma, rtol=1e-9, atol=1e-12)
+    again = L + L - L @ H @ L  # two corrections by the same y
+    np.testing.assert_allclose(corrected, again, rtol=1e-9, atol=1e-12)
+    exported = export(scenario, tmp_path, rate=80.0, duration=2.0, drawn=200)
+    assert exported.proof is not None
+    assert exported.proof.holds, exported.report
+    assert "80 Hz" in (tmp_path / "rise_di_parameters.h").read_text()
+    with refusing("found a spectral radius of"):  # too slow for this observer
+        export(str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"), tmp_path, rate=200.0)

@@ -71,6 +71,9 @@ class Export:
     samples: int | None = setting(
         "Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.", min=4
     )
+    rate: float | None = setting(
+        "Rate of law, reference model and y, Hz; the observer is discretised again."
+    )
     fmu: bool = option(
         "Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", default=False
     )
@@ -91,7 +94,7 @@ class Export:
             exported = write_export(
                 self.scenario,
                 target,
-                **values_of(self, *PROOF, "float32", "samples", "fmu"),
+                **values_of(self, *PROOF, "float32", "samples", "rate", "fmu"),
                 run=recorded,
                 compiler=self.compiler or (),
                 autopilot=autopilot,

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller of a scenario as C99 with its proof, as `rise-di export` writes it."""
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from c_export.autopilots import MODULE, SAMPLES, VEHICLE, write_ardupilot, write_px4
 from c_export.constants import exportable
@@ -14,9 +15,10 @@ from c_export.library import Units, build_fmu, si_units
 from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.arguments import FilePath, as_path
+from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
+from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
 from flight_design.learning.scenario_learner import with_last_model
 from flight_log.tape_reader import RecordedRun, read_run
@@ -24,6 +26,7 @@ from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # drawn steps of a recording
+RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 LONGEST = 20.0  # s, of a flight without a duration
 SHELLS = {"px4": (write_px4, MODULE), "ardupilot": (write_ardupilot, VEHICLE)}
 """What writes the code for an autopilot, and where the code lies in the folder."""
@@ -65,6 +68,7 @@ def export(
     fmu: bool = False,
     autopilot: str | None = None,
     samples: int | None = None,
+    rate: float | None = None,
     proof: bool = True,
 ) -> Exported:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
@@ -85,6 +89,8 @@ def export(
         autopilot: "px4" or "ardupilot": write the code as a part of this autopilot.
         samples: Samples of y and of y_m that the controller keeps, 4 or more; None: 8 inside an
             autopilot, else 100.
+        rate: Of law, reference model and y, Hz, in place of the scenario's: the observer is
+            discretised again.
         proof: Whether to prove.
 
     Returns:
@@ -103,6 +109,8 @@ def export(
     if run is not None and chosen.learns():
         chosen = with_last_model(chosen, run if isinstance(run, RecordedRun) else read_run(run))
         run = None  # several models flew in its ticks: the proof flies the last one
+    if rate is not None:
+        chosen = at_rate(chosen, rate)
     folder = as_path(folder, "c", "the path of a folder")
     title = printable(chosen.name)  # of a file, whose name may hold any character
     controller = exportable(chosen.controller)
@@ -127,6 +135,27 @@ def export(
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
+
+
+def at_rate(scenario: Scenario, rate: float) -> Scenario:
+    """A scenario with law, reference model and y at another rate, Hz. Raises ParameterError where
+    the observer has less than its delay margin there.
+    """
+    rate = as_number(rate, "rate", *RATES, "Hz")
+    controller = exportable(scenario.controller)
+    changes: dict[str, Any] = {"rate": rate}
+    if controller.observer is not None:
+        nominal = controller.nominal()
+        assert nominal is not None  # noqa: S101 - beside an observer
+        changes["observer"] = controller.observer.at_rate(rate, nominal).model_dump()
+    period = period_ns(rate, "rate")
+    fewest = math.ceil(seconds(period) / scenario.aircraft.step)
+    steps = next(count for count in range(fewest, period + 1) if period % count == 0)
+    return scenario.vary(
+        controller=changes,
+        reference_model={"rate": rate},
+        aircraft={"rate": rate, "step": seconds(period // steps)},
+    )
 
 
 def _write(

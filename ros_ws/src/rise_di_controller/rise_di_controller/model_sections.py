@@ -187,6 +187,29 @@ class ObserverConfig(Config):
         Phi, Gamma, L = (np.reshape(values, (s, -1)) for values in (self.Phi, self.Gamma, self.L))
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
+    def at_rate(self, rate: float, nominal: Nominal) -> "ObserverConfig":
+        """The observer for another rate of the law, a = self.rate / rate periods of this one long.
+
+        [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
+        """
+        from scipy.linalg import fractional_matrix_power  # noqa: PLC0415 - needed by few
+
+        Phi, Gamma, H, L, _ = self.matrices(nominal)
+        s, m = Gamma.shape
+        periods = self.rate / rate
+        moved = np.eye(s + m)
+        moved[:s] = np.hstack([Phi, Gamma])
+        moved = fractional_matrix_power(moved, periods).real
+        seen = H @ L
+        kept = fractional_matrix_power(np.eye(m) - seen, periods).real
+        matrices = {
+            "Phi": moved[:s, :s],
+            "Gamma": moved[:s, s:],
+            "L": L @ (np.eye(m) - kept) @ np.linalg.inv(seen),
+        }
+        changes = {name: tuple(values.ravel().tolist()) for name, values in matrices.items()}
+        return self.model_copy(update={"rate": rate, **changes})
+
 
 class AllocationConfig(Config):
     """An allocation of the inputs of the law to as many effectors or more, an extension of the
