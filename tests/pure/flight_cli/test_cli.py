@@ -226,10 +226,10 @@ def test_what_a_command_writes_is_its_output() -> None:
 def test_option_that_is_a_setting_names_it() -> None:
     result = invoke("gains", "osprey", "--y-rate", "50")
     assert str(result.exception) == "--y-rate: found no option, expected --set y_rate"
-    unknown = invoke("export", "osprey_servo", "--set", "rate=50")
+    unknown = invoke("export", "osprey_servo", "--set", "hz=50")
     assert (
         str(unknown.exception)
-        == "--set: found 'rate=50', expected one of drawn, runner, samples, seed"
+        == "--set: found 'hz=50', expected one of drawn, duration, rate, runner, samples, seed"
     )
 
 

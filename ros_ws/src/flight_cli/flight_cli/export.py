@@ -54,7 +54,7 @@ class Export:
     float32: bool = option(
         "Compute in float. The proof then bounds the difference of u.", default=False
     )
-    duration: float | None = option(
+    duration: float | None = setting(
         "Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0
     )
     drawn: int = setting(
