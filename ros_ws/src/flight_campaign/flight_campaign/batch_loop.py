@@ -340,19 +340,8 @@ def advance(
             jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0
         )
     )
-    commanded = rows_of(acting, np.argsort(vehicle.inputs))
-
-    def move(position: Array, t: Array) -> tuple[Array, Array]:
-        return actuators.move(t, position, commanded, vehicle.dt, vehicle.actuators)
-
-    # A loop of its own: without one the compiler of a CPU computes all mean positions again for
-    # each state that they act on.
-    position, means = jax.lax.scan(
-        move,
-        now.position,
-        segment.t + np.arange(timing.steps) * vehicle.dt,
-        unroll=kind is not ASKED,
-    )
+    times = segment.t + np.arange(timing.steps) * vehicle.dt
+    position, means = _actuated(now.position, acting, times, vehicle, unroll=kind is not ASKED)
     remainder = remainder_of(rows_of(now.x, vehicle.remainder_states), vehicle.remainder)
     moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
     matrices = at(segment.t, fleet)
@@ -377,6 +366,20 @@ def advance(
         travel=now.travel + jnp.abs(command - now.command),
         mission=flown,
     )
+
+
+def _actuated(
+    position: Array, acting: Array, times: Array, vehicle: Vehicle, *, unroll: bool
+) -> tuple[Array, Array]:
+    """The positions of the actuators after the steps at some times, and their means in each."""
+    commanded = rows_of(acting, np.argsort(vehicle.inputs))
+
+    def move(before: Array, t: Array) -> tuple[Array, Array]:
+        return actuators.move(t, before, commanded, vehicle.dt, vehicle.actuators)
+
+    # A loop of its own: without one the compiler of a CPU computes all mean positions again for
+    # each state that they act on.
+    return jax.lax.scan(move, position, times, unroll=unroll)
 
 
 @partial(jax.jit, static_argnames=("ticks", "timing"))

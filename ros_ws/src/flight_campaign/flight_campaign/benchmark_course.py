@@ -17,6 +17,7 @@ from aircraft_sim import sensors, turbulence
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AIR_STATE
 from aircraft_sim.plant import PlantParams
+from aircraft_sim.sensors import Sensors
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
@@ -150,25 +151,13 @@ def build_course(scenario: Scenario, *, learns: bool = False) -> Course:
     u_delay_ns = nanoseconds(aircraft.actuators.delay)
     u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
     _require_plain_vanes(scenario, late)
-    error = np.zeros((ticks, len(outputs)))
-    drift = sensors.initial_drift(errors)
-    noise, bias = np.zeros_like(error), 0.0 if errors.bias is None else errors.bias
-    for k in range(ticks):
-        error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
-        noise[k] = error[k] - bias - drift.value
-
+    error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     used = np.maximum(np.arange(ticks) - late, 0)
     wind, timed = _forcing(ticks, steps, plant)
-    axes = np.flatnonzero(wind.over_step.any(axis=0))
-    _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
-    basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
-    over_step, now = (
-        np.concatenate([blowing[:, axes], forcing @ basis], axis=1)
-        for blowing, forcing in zip(wind, timed, strict=True)
-    )
+    axes, basis, (over_step, now) = _reduced(wind, timed)
     guard = controller.guard()
     u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used])
     segments = Segments(
@@ -257,11 +246,39 @@ def _feedforward(
     return u_ff, x_m
 
 
+def _sensor_errors(
+    errors: Sensors, ticks: int, samples: int, channels: int
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of y at the ticks, each `samples` samples, and the noise in them, (T, channels)."""
+    error = np.zeros((ticks, channels))
+    noise = np.zeros_like(error)
+    drift = sensors.initial_drift(errors)
+    bias = 0.0 if errors.bias is None else errors.bias
+    for k in range(ticks):
+        error[k], drift = sensors.error(k * samples, drift, errors)
+        noise[k] = error[k] - bias - drift.value
+    return error, noise
+
+
 class _Forcing(NamedTuple):
     """A part of the forcing in time."""
 
     over_step: FloatArray  # (T K, ...) mean over each step of the integration
     at_tick: FloatArray  # (T, ...)
+
+
+def _reduced(
+    wind: _Forcing, timed: _Forcing
+) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
+    """`axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
+    axes = np.flatnonzero(wind.over_step.any(axis=0))
+    _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
+    basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
+    over_step, now = (
+        np.concatenate([blowing[:, axes], forcing @ basis], axis=1)
+        for blowing, forcing in zip(wind, timed, strict=True)
+    )
+    return axes, basis, (over_step, now)
 
 
 def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:

@@ -99,57 +99,25 @@ def dask(
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from distributed import CancelledError, Client, KilledWorker, as_completed  # noqa: PLC0415 - half a second
+        from distributed import CancelledError, KilledWorker  # noqa: PLC0415 - half a second
         from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
         waiting = iter(jobs)
         devices = _separate_devices() if on_devices and scheduler is None else []
         count = workers or len(devices) or os.cpu_count() or 1
         patience = CONNECT
-        for part in (
-            "",
-            ".client",
-            ".nanny",
-            ".scheduler",
-            ".worker",
-        ):  # they log the loss of a peer as tracebacks
+        # they log the loss of a peer as tracebacks
+        for part in ("", ".client", ".nanny", ".scheduler", ".worker"):
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
         lost: list[Job] = []
         while True:
             underway: dict[Any, Job] = {}
             with ExitStack() as stack:
+                client, threads_known = _connected(stack, scheduler, count, devices, patience)
+                ahead = AHEAD * max(count, threads_known)
+                first = [*lost, *islice(waiting, max(ahead - len(lost), 0))]
                 try:
-                    if scheduler is None:
-                        cluster = stack.enter_context(_local_cluster(count, devices))
-                    client = stack.enter_context(
-                        Client(scheduler or cluster, timeout=f"{patience:g}s")
-                    )
-                    if devices:
-                        client.register_plugin(_one_device_each(devices))
-                    workers_known = client.scheduler_info()["workers"].values()
-                    threads_known = sum(worker["nthreads"] for worker in workers_known)
-                    ahead = AHEAD * max(count, threads_known)
-                except (OSError, ValueError) as error:  # ValueError: no address at all
-                    if scheduler is None:
-                        raise ParameterError(
-                            f"--engine dask: its workers did not start on this host ({error})"
-                        ) from None
-                    where = f"found {scheduler}, expected a reachable dask scheduler"
-                    raise ParameterError(f"--scheduler: {where} ({error})") from None
-                try:
-                    for job in [*lost, *islice(waiting, max(ahead - len(lost), 0))]:
-                        underway[client.submit(work, job, pure=False)] = (
-                            job  # never a cached result
-                        )
-                    finished = as_completed(list(underway))
-                    for future in finished:
-                        result = future.result()
-                        job = underway.pop(future)
-                        for following in islice(waiting, 1):
-                            more = client.submit(work, following, pure=False)
-                            underway[more] = following
-                            finished.add(more)
-                        yield job, result
+                    yield from _results(client, work, first, waiting, underway)
                 except (CancelledError, CommClosedError):
                     lost = list(underway.values())
                     patience = RECONNECT
@@ -165,6 +133,49 @@ def dask(
                     return
 
     return fly
+
+
+def _connected(
+    stack: ExitStack, scheduler: str | None, count: int, devices: Devices, patience: float
+) -> tuple[Any, int]:
+    """A client of the scheduler, or of `count` processes of this machine, and the number of their
+    threads.
+    """
+    from distributed import Client  # noqa: PLC0415 - half a second
+
+    try:
+        cluster = scheduler or stack.enter_context(_local_cluster(count, devices))
+        client = stack.enter_context(Client(cluster, timeout=f"{patience:g}s"))
+        if devices:
+            client.register_plugin(_one_device_each(devices))
+        workers = client.scheduler_info()["workers"].values()
+        return client, sum(worker["nthreads"] for worker in workers)
+    except (OSError, ValueError) as error:  # ValueError: no address at all
+        if scheduler is None:
+            raise ParameterError(
+                f"--engine dask: its workers did not start on this host ({error})"
+            ) from None
+        where = f"found {scheduler}, expected a reachable dask scheduler"
+        raise ParameterError(f"--scheduler: {where} ({error})") from None
+
+
+def _results(
+    client: Any, work: Work, first: Iterable[Job], waiting: Iterator[Job], underway: dict[Any, Job]
+) -> Iterator[tuple[Job, Any]]:
+    """The first jobs and those that wait with their results; `underway` has the jobs by future."""
+    from distributed import as_completed  # noqa: PLC0415 - half a second
+
+    for job in first:
+        underway[client.submit(work, job, pure=False)] = job  # never a cached result
+    finished = as_completed(list(underway))
+    for future in finished:
+        result = future.result()
+        job = underway.pop(future)
+        for following in islice(waiting, 1):
+            more = client.submit(work, following, pure=False)
+            underway[more] = following
+            finished.add(more)
+        yield job, result
 
 
 def _separate_devices() -> Devices:

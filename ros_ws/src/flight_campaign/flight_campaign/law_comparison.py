@@ -10,15 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS, Law
 from flight_campaign import batch
+from flight_campaign.batch_matrices import Fleet
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
 from flight_design.gains.tuned_gains import TuningResult
+from rise_di_controller.control_law import ControlLaw
 from rise_di_controller.margins import Margins
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
@@ -89,52 +92,65 @@ def compare(
         TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
     }
 
+    study = _Study(benchmark, flights, levels, parts, delays)
+
     def results(name: str) -> list[LawResult]:
-        law = laws[name]
-        control_law = law.control_law(benchmark.model)  # one for all gain sets: it is compiled once
-        law_results = []
-        for objective, gains in tuned[name].items():
-            params = law.params(as_gains(gains), benchmark.model)
-            flown = {
-                wind: batch.fly(
-                    disturbed,
-                    benchmark.vehicle,
-                    benchmark.courses[wind][law.feedforward],
-                    control_law,
-                    params,
-                )
-                for wind, disturbed in flights.items()
-            }
-            scores = {
-                wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()
-            }
-            delayed = scores[GUST][len(in_time) :].reshape(len(delays), aircraft)
-            by_level = []
-            for level, part in zip(levels, parts, strict=True):
-                by_level.append(
-                    Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()})
-                )
-            law_results.append(
-                LawResult(
-                    name,
-                    objective,
-                    gains.costs,
-                    {wind: float(costs[0]) for wind, costs in scores.items()},
-                    tuple(by_level),
-                    {
-                        ticks * benchmark.model.period: _lost(costs)
-                        for ticks, costs in zip(delays, delayed, strict=True)
-                    },
-                    np.asarray(flown[GUST].rms)[:, 0],
-                    np.asarray(flown[GUST].slew)[:, 0],
-                    _margins(law, gains, benchmark),
-                )
-            )
-        return law_results
+        control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
+        return [
+            study.result(name, laws[name], control_law, objective, gains)
+            for objective, gains in tuned[name].items()
+        ]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for scored in pool.map(results, tuned):
             yield from scored
+
+
+class _Study(NamedTuple):
+    """The flights that all laws fly."""
+
+    benchmark: Benchmark
+    flights: Mapping[str, Fleet]  # by wind
+    levels: Sequence[float]
+    parts: Sequence[NDArray[np.int64]]  # places of the aircraft of each level
+    delays: Sequence[int]
+
+    def result(
+        self,
+        name: str,
+        law: Law,
+        control_law: ControlLaw,
+        objective: str,
+        gains: TuningResult,
+    ) -> LawResult:
+        """The figures of a law with a gain set."""
+        benchmark = self.benchmark
+        params = law.params(as_gains(gains), benchmark.model)
+        flown = {}
+        for wind, disturbed in self.flights.items():
+            course = benchmark.courses[wind][law.feedforward]
+            flown[wind] = batch.fly(disturbed, benchmark.vehicle, course, control_law, params)
+        scores = {wind: score(each, benchmark.unit) for wind, each in flown.items()}
+        in_time = 1 + sum(map(len, self.parts))
+        delayed = scores[GUST][in_time:].reshape(len(self.delays), len(self.parts[0]))
+        by_level = []
+        for level, part in zip(self.levels, self.parts, strict=True):
+            costs = {wind: _scores(of_wind[part]) for wind, of_wind in scores.items()}
+            by_level.append(Level(level, costs))
+        lost = {}
+        for ticks, costs_late in zip(self.delays, delayed, strict=True):
+            lost[ticks * benchmark.model.period] = _lost(costs_late)
+        return LawResult(
+            name,
+            objective,
+            gains.costs,
+            {wind: float(costs[0]) for wind, costs in scores.items()},
+            tuple(by_level),
+            lost,
+            np.asarray(flown[GUST].rms)[:, 0],
+            np.asarray(flown[GUST].slew)[:, 0],
+            _margins(law, gains, benchmark),
+        )
 
 
 def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:

@@ -371,21 +371,23 @@ class _GuidanceStep(NamedTuple):
             (leg.start[0], leg.start[1]), leg.start_course, leg.near, place, self.course
         )
 
+    def _off_path(self, leg: Legs, joining: Array) -> PathError:
+        """The error from a leg, or from the circle onto the leg."""
+        origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
+        joins_leg = joining != 0.0
+        line = path.line_error(origin, leg.track, self.position)
+        circle = path.circle_error(origin, leg.radius, self.position)
+        radius = jnp.where(joins_leg, joining, 1.0) * self.mission.radius
+        centre = path.joining_centre(start, leg.start_course, radius)
+        way = path.circle_error(centre, radius, self.position)
+        on_leg = [jnp.where(leg.is_line, *pair) for pair in zip(line, circle, strict=True)]
+        return PathError(*(jnp.where(joins_leg, *pair) for pair in zip(way, on_leg, strict=True)))
+
     def _fly(
         self, before: GuidanceState, number: Array, joining: Array, missed: Array
     ) -> MissionState:
         leg, following, joins_leg = self._legs_at(number), self._legs_at(number + 1), joining != 0.0
-        origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
-        line, circle = (
-            path.line_error(origin, leg.track, self.position),
-            path.circle_error(origin, leg.radius, self.position),
-        )
-        radius = jnp.where(joins_leg, joining, 1.0) * self.mission.radius
-        way = path.circle_error(
-            path.joining_centre(start, leg.start_course, radius), radius, self.position
-        )
-        on_leg = [jnp.where(leg.is_line, *pair) for pair in zip(line, circle, strict=True)]
-        error = PathError(*(jnp.where(joins_leg, *pair) for pair in zip(way, on_leg, strict=True)))
+        error = self._off_path(leg, joining)
 
         def begins(place: path.Point) -> Array:
             return jnp.where(

@@ -7,6 +7,7 @@ aircraft and around it.
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -342,15 +343,7 @@ def tune(
         result = batch.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ flown.weight
 
-    def lacking(part: FloatArray) -> FloatArray:
-        """Costs of missing margins, (together,), of logarithms (together, d)."""
-        if objective.requirement is None or not has_margins(law):
-            return np.zeros(together)
-        margins = nominal_margins(law, gains_of(part), benchmark.model)
-        return np.asarray(
-            MAX_COST * (1.0 - np.minimum(least_fractions(margins, objective.requirement), 1.0))
-        )
-
+    lacking = partial(_lacking, law, objective, benchmark)
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [
         cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds
@@ -360,10 +353,9 @@ def tune(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for generation in range(generations):
             asked = [np.array(search.ask()) for search in searches]
-            parts = np.split(np.concatenate(asked), PARTS)
+            parts = [gains_of(part) for part in np.split(np.concatenate(asked), PARTS)]
             params = [
-                spread_over(law.params(gains_of(part), benchmark.model), single, each)
-                for part in parts
+                spread_over(law.params(part, benchmark.model), single, each) for part in parts
             ]
             weighted = np.array(list(pool.map(costs, product(params, flights)))).reshape(
                 PARTS, len(flights), together
@@ -371,19 +363,39 @@ def tune(
             by_search = (weighted.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(
                 len(seeds), POPULATION
             )
-            for k, (search, values) in enumerate(zip(searches, by_search, strict=True)):
-                search.tell(list(asked[k]), list(values))
-                least = int(np.argmin(values))
-                if values[least] < best[k][0]:
-                    best[k] = (float(values[least]), asked[k][least])
+            best = [_after(*each) for each in zip(searches, asked, by_search, best, strict=True)]
             if progress is not None:
                 progress(generation + 1, min(value for value, _ in best))
-    winner = int(np.argmin([value for value, _ in best]))
-    gains = {}
-    for name, gain in gains_of(best[winner][1][None]).items():
-        gains[name] = [float(f"{value:.5g}") for value in gain[:, 0]]
     lowest = [round(value, 4) for value, _ in best]
+    winner = int(np.argmin([value for value, _ in best]))
+    gains = _rounded(gains_of(best[winner][1][None]))
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
+
+
+def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
+    """Costs of the missing margins of N candidates, (N,)."""
+    if objective.requirement is None or not has_margins(law):
+        return np.zeros(next(iter(gains.values())).shape[-1])
+    margins = nominal_margins(law, gains, benchmark.model)
+    fractions = least_fractions(margins, objective.requirement)
+    return np.asarray(MAX_COST * (1.0 - np.minimum(fractions, 1.0)))
+
+
+def _rounded(gains: Gains) -> dict[str, list[float]]:
+    """The gains of the first candidate, to five digits."""
+    first = {}
+    for name, gain in gains.items():
+        first[name] = [float(f"{value:.5g}") for value in gain[:, 0]]
+    return first
+
+
+def _after(
+    search: Any, asked: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
+) -> tuple[float, FloatArray]:
+    """The least cost so far and its candidate, after the search took the costs of those asked."""
+    search.tell(list(asked), list(values))
+    least = int(np.argmin(values))
+    return (float(values[least]), asked[least]) if values[least] < best[0] else best
 
 
 def as_gains(tuned: TuningResult) -> Gains:
