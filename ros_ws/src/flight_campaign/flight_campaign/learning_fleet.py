@@ -76,6 +76,7 @@ def _fly_span(
     program.
     """
     nominal = nominal._replace(sine_states=sines)
+    window = jnp.asarray(batch_loop.window_of(np.arange(len(segments.t)), timing.windows))
 
     def step(k: Array, now: FleetState) -> FleetState:
         segment = jax.tree.map(lambda values: values[k], segments)
@@ -84,7 +85,7 @@ def _fly_span(
         steps = segment.phase == STEP
         model = jax.tree.map(partial(jnp.where, steps), moved, now.feedforward)
         u_ff = jnp.where(steps, u_ff, 0.0)
-        at_tick = (segment._replace(u_ff=u_ff), None, np.int64(0))
+        at_tick = (segment._replace(u_ff=u_ff), None, window[k])
         loop, sample = batch_loop.tick(now.loop, at_tick, ASKED, constants, law, timing)
         new = Ticks(sample.y, loop.u, u_ff)
         ticks = jax.tree.map(lambda values, value: values.at[k].set(value), now.ticks, new)
@@ -163,15 +164,17 @@ class LearningFleet:
         course: Course,
         parameters: RiseDiConfig,
         learn: Sequence[Learn],
+        windows: tuple[int, ...] = (),
     ) -> None:
-        """`learn` makes the learner of each aircraft. Raises ParameterError."""
+        """`learn` makes the learner of each aircraft; `windows` as for `batch.fly`. Raises
+        ParameterError.
+        """
         self._fleet = fleet
         self._vehicle = vehicle
         self._course = course
         self._segments = jax.tree.map(jnp.asarray, course.segments)
-        self._timing = Timing(
-            fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), ()
-        )
+        late = int(np.max(np.asarray(fleet.late)))
+        self._timing = Timing(fleet.blocks, course.steps, course.late, late, windows)
         self._aircraft = [_Aircraft(parameters, each) for each in learn]
         self._law = parameters.tuned_law().control_law
         self._period_ns = period_ns(parameters.rate, "controller.rate")
@@ -250,11 +253,11 @@ class LearningFleet:
         ticks = slice(first, last)
         y, u = (np.moveaxis(np.asarray(values[ticks]), -1, 0) for values in state.ticks[:2])
         stamp_ns = [k * self._period_ns for k in range(first, last)]
-        for each, own_y, own_u in zip(self._aircraft, y, u, strict=True):
+        for each, its_y, its_u in zip(self._aircraft, y, u, strict=True):
             if each.left_loop:
                 continue
-            each.watch(own_y - segments.sampled_y_m[ticks], segments.dt[ticks].tolist())
-            each.take(stamp_ns, own_y, own_u)
+            each.watch(its_y - segments.sampled_y_m[ticks], segments.dt[ticks].tolist())
+            each.take(stamp_ns, its_y, its_u)
             if each.learning.ticked(each.controller, stamp_ns[-1]) and not each.left_loop:
                 each.propose(stamp_ns[-1])
 
@@ -268,19 +271,19 @@ class LearningFleet:
         laws = []
         models = []
         for number, each in enumerate(self._aircraft):
-            own = ControllerState(
+            after = ControllerState(
                 mode=Mode.ENGAGED,
                 law=_of_aircraft(law, number),
                 feedforward=_of_aircraft(model, number),
                 **self._last_ticks(_of_aircraft(recent, number), k),
             )
             if not each.left_loop:
-                each.controller.resume(own)
+                each.controller.resume(after)
                 each.learning.step(each.controller, k * self._period_ns)
                 each.left_loop = each.law is not self._law
-                own = own if each.left_loop else each.controller.state
-            laws.append(own.law)
-            models.append(own.feedforward)
+                after = after if each.left_loop else each.controller.state
+            laws.append(after.law)
+            models.append(after.feedforward)
         loop = state.loop._replace(law=_stacked(laws))
         return FleetState(loop, _stacked(models), state.ticks)
 

@@ -29,6 +29,7 @@ from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
 
 if TYPE_CHECKING:
     from flight_campaign.campaign import Definition
+    from flight_campaign.learning_fleet import LearningFleet
 
 MakeLearner = Callable[[Scenario], Learn | None]
 """Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises
@@ -132,6 +133,30 @@ def _learners(scenarios: Sequence[Scenario], learner: MakeLearner) -> list[Learn
     return learn
 
 
+def side_by_side(
+    definition: "Definition",
+    case: int,
+    first: int,
+    learn: Sequence[Learn],
+    windows: tuple[int, ...] = (),
+) -> "LearningFleet | None":
+    """The aircraft from number `first` with their learners; None for a scenario beyond the compiled
+    loop. `windows` as for `batch.fly`.
+    """
+    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
+    from flight_campaign.learning_fleet import LearningFleet, flies_side_by_side  # noqa: PLC0415 - as above
+
+    scenario = definition.scenario(case)
+    controller = scenario.rise_di()
+    course = build_course(scenario, learns=True)
+    if not flies_side_by_side(controller, course):
+        return None
+    vehicle = batch.vehicle(scenario)
+    drawn = drawn_fleet(definition, scenario, course, vehicle, first, len(learn))
+    return LearningFleet(drawn.fleet, drawn.vehicle, course, controller, learn, windows)
+
+
 def _fly_side_by_side(
     definition: "Definition", case: int, first: int, count: int, learner: MakeLearner
 ) -> list[Flight]:
@@ -139,19 +164,11 @@ def _fly_side_by_side(
 
     A flight that leaves the compiled loop, as one that falls back, flies again by itself.
     """
-    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
-    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
-    from flight_campaign.learning_fleet import LearningFleet, flies_side_by_side  # noqa: PLC0415 - as above
-
-    scenario = definition.scenario(case)
     scenarios = [definition.aircraft_scenario(first + k, case) for k in range(count)]
-    course = build_course(scenario, learns=True)
-    controller = scenario.rise_di()
-    if not flies_side_by_side(controller, course):
+    controller = definition.scenario(case).rise_di()
+    fleet = side_by_side(definition, case, first, _learners(scenarios, learner))
+    if fleet is None:
         return [fly(each, learner) for each in scenarios]
-    drawn = drawn_fleet(definition, scenario, course, batch.vehicle(scenario), first, count)
-    learn = _learners(scenarios, learner)
-    fleet = LearningFleet(drawn.fleet, drawn.vehicle, course, controller, learn)
     result, outcomes = fleet.fly()
     flights = []
     for k, outcome in enumerate(outcomes):
