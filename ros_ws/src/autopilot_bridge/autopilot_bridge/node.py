@@ -61,9 +61,8 @@ LEFT = (
     "itself: start its agent again"
 )
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
-RELEASES_AT_SHUTDOWN = (
-    5  # messages with release values at the end of the node; a single one may be lost
-)
+# messages with release values at the end of the node; a single one may be lost
+RELEASES_AT_SHUTDOWN = 5
 
 ACTIVATION_TIMEOUT_NS = (
     NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
@@ -111,17 +110,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             max_age_ns=self._bridge.max_u_age_ns,
             lock=None,
         )
-        self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
-        self._y_encoder = self.encoder(self._bridge.outputs)
-        self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        self._pose_encoders: dict[
-            tuple[str, ...], Encoder
-        ] = {}  # by the names of the fresh channels
-        names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
-        self._would_send_encoder = self.encoder(names)
-        self.create_service(SetBool, "~/engage", self._engage)
-        self.create_service(Trigger, "~/engage_blind", self._engage_blind)
-        self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
+        self._advertise_all()
         self._first_y = False
         self._start_ns = 0
         self._report_ns = 0  # of the last report on the engagement
@@ -134,14 +123,24 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._awaits_controller = False  # engaged before the service of the controller was found
         if self._link is not None:
             self._link.start()
-        self.get_logger().info(
-            f"map {self._map.name}: "
-            + (
-                "dry run, nothing is sent"
-                if dry_run
-                else f"disengaged, waiting for {self.get_name()}/engage"
-            )
-        )
+        waits = f"disengaged, waiting for {self.get_name()}/engage"
+        state = "dry run, nothing is sent" if dry_run else waits
+        self.get_logger().info(f"map {self._map.name}: {state}")
+
+    def _advertise_all(self) -> None:
+        """Create the publishers, with their encoders, and the services."""
+        self._publish_y = self.advertise(Y)
+        self._publish_would_send = self.advertise(WOULD_SEND)
+        self._y_encoder = self.encoder(self._bridge.outputs)
+        self._publish_pose = self.advertise(POSE) if self._map.pose else None
+        self._pose_encoders: dict[
+            tuple[str, ...], Encoder
+        ] = {}  # by the names of the fresh channels
+        names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
+        self._would_send_encoder = self.encoder(names)
+        self.create_service(SetBool, "~/engage", self._engage)
+        self.create_service(Trigger, "~/engage_blind", self._engage_blind)
+        self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
 
     def _open_link(self) -> mavlink_link.Link | None:
         """The MAVLink link of the map; None without one."""

@@ -357,18 +357,16 @@ def tune(
             params = [
                 spread_over(law.params(part, benchmark.model), single, each) for part in parts
             ]
-            weighted = np.array(list(pool.map(costs, product(params, flights)))).reshape(
-                PARTS, len(flights), together
-            )
-            by_search = (weighted.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(
-                len(seeds), POPULATION
-            )
+            weighted = np.array(list(pool.map(costs, product(params, flights))))
+            by_part = weighted.reshape(PARTS, len(flights), together).sum(axis=1)
+            by_part += np.array(list(pool.map(lacking, parts)))
+            by_search = by_part.reshape(len(seeds), POPULATION)
             best = [_after(*each) for each in zip(searches, asked, by_search, best, strict=True)]
             if progress is not None:
                 progress(generation + 1, min(value for value, _ in best))
-    lowest = [round(value, 4) for value, _ in best]
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
+    lowest = [round(value, 4) for value, _ in best]
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
 
 
