@@ -67,7 +67,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     covers = [cover(part, LEAST_LEVEL) for part in parts_of(whole)]
     limit = max(covers, key=lambda covered: covered.level, default=Cover(LEAST_LEVEL, 0.0, 0))
     found = none._replace(
-        stable=min(largest / limit.level, 1.0),
+        stable=min(float(largest / limit.level), 1.0),
         frequency=limit.peak,
         unstable=_first_unstable(linear, late, [covered.peak for covered in covers]),
     )
