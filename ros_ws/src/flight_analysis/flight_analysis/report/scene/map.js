@@ -9,6 +9,7 @@ const SCALE_BAR = 120; // px, longest
 const BESIDE = 12; // px, of the number of a leg beside its place
 const ARROW = 26; // px, of the wind
 const MARGIN = 16; // px, of the marks in the corners
+const WIND = 230; // px, width of the wind with its text
 const TEXT = 14; // px, height of a label with its space
 const FAR = 3; // times BESIDE, the farthest that a label lies from its place, and
 const FARTHEST = 10; // that of one that has to be drawn
@@ -176,7 +177,7 @@ export function drawOrbit(ctx, see, {scale}, north, east, radius, colour) {
 
 // Keep labels off the marks in the corners.
 export function takeMarks(labels, width, height) {
-  labels.take(0, 0, MARGIN + 190, MARGIN + 40);
+  labels.take(0, 0, MARGIN + WIND, MARGIN + 40);
   labels.take(width - MARGIN - SCALE_BAR, height - MARGIN - 22, MARGIN + SCALE_BAR, MARGIN + 22);
 }
 
