@@ -26,17 +26,19 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
     """
     batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
     F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
-    eye = np.eye(F.shape[-1])
+    s = F.shape[-1]
+    eye = np.eye(s)
     transition = F
     gramian = G @ np.linalg.solve(R, transpose(G))
     for _ in range(MAX_DOUBLINGS):
         solved = np.linalg.solve(eye + gramian @ P, np.concatenate([transition, gramian], axis=-1))
-        moved, reached = np.split(solved, 2, axis=-1)
+        moved = solved[..., :s]
+        reached = solved[..., s:]
         more = transpose(transition) @ P @ moved
         gramian = gramian + transition @ reached @ transpose(transition)
         transition = transition @ moved
         P = P + (more + transpose(more)) / 2.0
-        if np.all(np.abs(more) <= 1e-13 * np.max(np.abs(P), axis=(-1, -2), keepdims=True)):
+        if (np.abs(more) <= 1e-13 * np.abs(P).max(axis=(-1, -2), keepdims=True)).all():
             break
     return np.asarray(P)
 
