@@ -6,6 +6,7 @@ margins remain.
 The deviations are constant in time and the loop is linear: no saturation, no rate limit.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -64,12 +65,15 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     if not is_stable(linear.nominal, linear.law, linear.loop, np.full(m, late / 2.0)):
         return none
     whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
-    covers = [cover(part, LEAST_LEVEL) for part in parts_of(whole)]
-    limit = max(covers, key=lambda covered: covered.level, default=Cover(LEAST_LEVEL, 0.0, 0))
+    parts = parts_of(whole)
+    covers = [cover(part, LEAST_LEVEL) for part in parts]
+    none_coupled = Cover(LEAST_LEVEL, 0.0, 0)
+    limit = max(covers, key=lambda covered: covered.level, default=none_coupled)
+    by_entries = {part.entries: covered for part, covered in zip(parts, covers, strict=True)}
     found = none._replace(
         stable=min(float(largest / limit.level), 1.0),
         frequency=limit.peak,
-        unstable=_first_unstable(linear, late, [covered.peak for covered in covers]),
+        unstable=_first_unstable(linear, late, by_entries),
     )
     if not found.holds:
         return found
@@ -79,8 +83,13 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     return found._replace(disk=np.array(each), disk_all=disk_all)
 
 
-def _first_unstable(linear: LinearLoop, late: float, peaks: list[float]) -> Unstable | None:
-    """The first unstable aircraft found, u in time or late by the whole time."""
+def _first_unstable(
+    linear: LinearLoop, late: float, covers: Mapping[tuple[int, ...], Cover]
+) -> Unstable | None:
+    """The first unstable aircraft found, u in time or late by the whole time, near the peaks of
+    the covers of its entries.
+    """
+    every_peak = [covered.peak for covered in covers.values()]
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     candidates = []
@@ -89,6 +98,8 @@ def _first_unstable(linear: LinearLoop, late: float, peaks: list[float]) -> Unst
         delayed = linear._replace(loop=loop)
         whole = uncertain_loop(linear.nominal, linear.law, loop, box)
         for part in parts_of(whole):
+            cover_of_part = covers.get(part.entries)
+            peaks = every_peak if cover_of_part is None else [cover_of_part.peak]
             for w in sorted({*peaks, 0.0}):  # a slow divergence hides beside a peak
                 reached = first_unstable(part, w, len(box.names), LARGEST / float(box.part.max()))
                 confirmed = None if reached is None else _confirmed(delayed, reached[1])
