@@ -32,12 +32,18 @@ from tests.nodes.world import INPUTS, OUTPUTS, World, parameters, world_of
 from tests.ros.autopilot import Autopilot
 from typer.testing import CliRunner
 
-from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.channel_map import (
+    message_type,
+    no_publisher,
+    read_raw,
+    set_field,
+    to_channel,
+    to_raw,
+)
 from autopilot_bridge.node import (
     ACTIVATION_TIMEOUT_NS,
     RELEASES_AT_SHUTDOWN,
     BridgeNode,
-    no_publisher,
 )
 from autopilot_bridge.params import LIBRARY
 from flight_cli.cli import COMMANDS, application

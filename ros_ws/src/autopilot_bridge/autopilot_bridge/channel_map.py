@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_core.environment import PROFILE_VARIABLE
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
@@ -253,3 +254,18 @@ def version_faults(
         with suppress(ParameterError):
             faults.append(version_fault(topic, message_type(kind, load)))
     return [fault for fault in faults if fault]
+
+
+def no_publisher(environment: Mapping[str, str]) -> str:
+    """Why a topic of an autopilot has no publisher, as a sentence."""
+    domain = environment.get("ROS_DOMAIN_ID") or "0"
+    if domain != "0":
+        return (
+            f"no publisher in domain {domain}. The autopilot's agent is in domain 0 unless "
+            "DDS_DOMAIN_ID (ArduPilot) or UXRCE_DDS_DOM_ID (PX4) has another: unset ROS_DOMAIN_ID"
+        )
+    return (
+        "no publisher. The autopilot's agent needs the same DDS profile, "
+        f"{PROFILE_VARIABLE}={environment.get(PROFILE_VARIABLE, '')}, and DDS_DOMAIN_ID "
+        "(ArduPilot) or UXRCE_DDS_DOM_ID (PX4) 0"
+    )

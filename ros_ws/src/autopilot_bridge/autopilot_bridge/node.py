@@ -7,7 +7,7 @@ a channel map.
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
-from autopilot_bridge.channel_map import get_field, read_raw, version_fault
+from autopilot_bridge.channel_map import get_field, no_publisher, read_raw, version_fault
 from autopilot_bridge.map_rows import (
     MAVLINK,
     ConditionRow,
@@ -43,7 +43,6 @@ from autopilot_bridge.outgoing import (
     require_field,
 )
 from autopilot_bridge.params import BridgeConfig, load_map
-from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
@@ -574,21 +573,6 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 time.sleep(0.01)
         if self._link is not None:
             self._link.close()
-
-
-def no_publisher(environment: Mapping[str, str]) -> str:
-    """Why a topic of an autopilot has no publisher, as a sentence."""
-    domain = environment.get("ROS_DOMAIN_ID") or "0"
-    if domain != "0":
-        return (
-            f"no publisher in domain {domain}. The autopilot's agent is in domain 0 unless "
-            "DDS_DOMAIN_ID (ArduPilot) or UXRCE_DDS_DOM_ID (PX4) has another: unset ROS_DOMAIN_ID"
-        )
-    return (
-        "no publisher. The autopilot's agent needs the same DDS profile, "
-        f"{PROFILE_VARIABLE}={environment.get(PROFILE_VARIABLE, '')}, and DDS_DOMAIN_ID "
-        "(ArduPilot) or UXRCE_DDS_DOM_ID (PX4) 0"
-    )
 
 
 def _qos(row: QosRow) -> QoSProfile:

@@ -258,9 +258,7 @@ def _with_sample(
     shortest, longest = (factor * period for factor in DT_RANGE)
     dt = min(max(seconds(y.stamp_ns - last.stamp_ns), shortest), longest)
     law_state = state.law
-    u_trim = state.u_trim
-    if guard.probe is not None:
-        u_trim = u_trim + guard.probe.at(y.stamp_ns)
+    u_trim = _probed_trim(state, y.stamp_ns, guard)
     u_ff = state.u_ff
     ff_state = state.feedforward
     missed = max(round(dt / period) - 1, 0)
@@ -299,6 +297,11 @@ def _with_sample(
     if guard.history:
         stepped = _with_history(state, stepped, inputs, missed, guard)
     return stepped, inputs
+
+
+def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> FloatArray:
+    """The trim of an engagement, with the probe at the stamp of y, (m,)."""
+    return state.u_trim if guard.probe is None else state.u_trim + guard.probe.at(stamp_ns)
 
 
 def _fresh_reference(
