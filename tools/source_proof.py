@@ -31,6 +31,7 @@ EXPORTS: Mapping[str, int] = MappingProxyType(
         "osprey_observer": 2,
         "osprey_vtail": 2,
         str(REPOSITORY / "examples/px4_airplane/rates.yaml"): 2,
+        str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"): 2,
     }
 )
 """Scenarios and the ticks that Eva follows: engagement is the first, the law steps from the second
