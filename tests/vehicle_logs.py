@@ -113,9 +113,8 @@ def write_ulog(
         for k, (_, _, rows) in enumerate(series)
         for stamp, values in rows
     ]
-    samples += [
-        (stamp, len(series), parameter(name, value)) for stamp, name, value in changes
-    ]  # after samples of its stamp
+    # after samples of its stamp
+    samples += [(stamp, len(series), parameter(name, value)) for stamp, name, value in changes]
     path.write_bytes(
         b"".join(
             [*parts, *(packet for _, _, packet in sorted(samples, key=lambda sample: sample[:2]))]

@@ -88,12 +88,8 @@ def python(words: list[str]) -> None:
         assert all(Path(word).exists() for word in words[2:] if word.startswith("tests/"))
 
 
-QUICK = {
-    "airframes",
-    "layouts",
-    "replay",
-    "report",
-}  # a second or two each on a short run, and without ROS
+# a second or two each on a short run, and without ROS
+QUICK = {"airframes", "layouts", "replay", "report"}
 CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "python3": python}
 
 

@@ -339,9 +339,8 @@ async def _exchange(server: Server, data: bytes) -> None:
     reader, writer = await asyncio.open_connection(ADDRESS, server.port)
     writer.write(data)
     with suppress(TimeoutError, ConnectionError):
-        await asyncio.wait_for(
-            reader.read(1 << 16), 0.02
-        )  # the answer to a whole request takes 2 ms
+        # the answer to a whole request takes 2 ms
+        await asyncio.wait_for(reader.read(1 << 16), 0.02)
     writer.close()
     with suppress(ConnectionError):
         await writer.wait_closed()
@@ -349,9 +348,8 @@ async def _exchange(server: Server, data: bytes) -> None:
 
 KEY, TOKEN = "ABCD-EFGH", "a-token"
 GUIDED_NUMBERS = len(POSE) + 6
-MODES = [
-    name for name in MODE_TARGETS if name not in {"north", "east", "radius"}
-]  # an orbit takes three together
+# an orbit takes three together
+MODES = [name for name in MODE_TARGETS if name not in {"north", "east", "radius"}]
 
 
 @lru_cache(maxsize=1)
@@ -373,9 +371,8 @@ def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
     flight = Flight(run)
     flight.update()
     nodes = NodesInMemory(scenario, "aircraft", "controller", "guidance", dry_run=True)
-    desk = Control(
-        flight, nodes, KEY, now=lambda: 10.0 * next(times)
-    )  # each request has its allowance, and a new lease
+    # each request has its allowance, and a new lease
+    desk = Control(flight, nodes, KEY, now=lambda: 10.0 * next(times))
     failed: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: failed.append(record.getMessage())  # type: ignore[method-assign]

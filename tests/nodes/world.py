@@ -263,17 +263,15 @@ class World:
         self.clock = clock
         self.graph: list[Endpoint] = []
         self.subscriptions: list[Subscription] = []
-        self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(
-            list
-        )  # by the full name of the topic
+        # by the full name of the topic
+        self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(list)
         self.answers: dict[
             str, Callable[[Any], Any]
         ] = {}  # services of the test, by their full names
         self.loops: dict[AnyNode, RealTime] = {}
         self.nodes: list[AnyNode] = []
-        self.listeners: dict[str, list[Callable[[Any], object]]] = defaultdict(
-            list
-        )  # of the test, by full topic
+        # of the test, by full topic
+        self.listeners: dict[str, list[Callable[[Any], object]]] = defaultdict(list)
         self._own: dict[tuple[str, type], Publisher] = {}  # publishers of the test
 
     # Nodes

@@ -240,10 +240,8 @@ def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
     """
     sine, cosine = np.sin(alpha), np.cos(alpha)
     turn = np.eye(4)
-    turn[:2, :2] = [
-        [cosine, -sine],
-        [sine, cosine],
-    ]  # u, w of body axes from those of stability axes
+    # u, w of body axes from those of stability axes
+    turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
     values = NAVION | {
         "states": {"u": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
         "A": (turn @ NAVION["A"] @ turn.T).tolist(),

@@ -108,13 +108,11 @@ def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
     frame, _ = import_airframe(system, thrust=True, **NAMES)
     library = load_airframe("navion_longitudinal")
     assert_allclose(frame.matrix_a(), library.matrix_a(), rtol=1e-12, atol=0.0)
-    assert_allclose(
-        frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0
-    )  # g of 32.2 ft/s^2 in the thrust
+    # g of 32.2 ft/s^2 in the thrust
+    assert_allclose(frame.matrix_b(), library.matrix_b(), rtol=1e-3, atol=0.0)
     assert frame.speed == approx(library.speed)
-    assert_allclose(
-        frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12
-    )  # alpha_0 is 0 in stability axes
+    # alpha_0 is 0 in stability axes
+    assert_allclose(frame.matrix_c(), np.eye(4)[[2, 0]], atol=1e-12)
     assert frame.outputs == ("q", "V")
 
 
@@ -210,9 +208,8 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
     assert entry["alpha", "alpha"] == approx(-2.02, rel=0.02)
     assert entry["q", "alpha"] == approx(-8.8, rel=0.02)  # M_alpha, p. 153
     assert entry["q", "q"] == approx(-2.05, rel=0.03)
-    assert_allclose(
-        frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005
-    )  # by hand: q S c C_m / I_y
+    # by hand: q S c C_m / I_y
+    assert_allclose(frame.matrix_b()[x.index("q"), 0], -11.88, rtol=0.005)
     assert frame.inputs["elevator"].unit == "deg"
     assert [given.positive for given in frame.inputs.values()][:3] == [
         "nose down",

@@ -167,11 +167,8 @@ def test_units_import_what_the_table_says() -> None:
 
 
 def test_every_source_file_belongs_to_unit_of_table() -> None:
-    packages = {
-        "flight_analysis",
-        "flight_design",
-        "flight_design.main",
-    }  # their units are their subpackages, and metrics
+    # their units are their subpackages, and metrics
+    packages = {"flight_analysis", "flight_design", "flight_design.main"}
     strays = [
         path for path in FILES if "launch" not in path.parts and unit_of(module_of(path)) is None
     ]

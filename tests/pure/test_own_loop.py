@@ -182,9 +182,8 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(Simulator, "sample", diverge)
     _, reward, terminated, truncated, info = env.step(u)
     assert (terminated, truncated, info) == (True, False, {"outcome": "diverged at t = 0.02 s"})
-    assert reward == approx(
-        -10.0 * (3.0 - 0.01)
-    )  # the score of a loss of track for the seconds from the last tick on
+    # the score of a loss of track for the seconds from the last tick on
+    assert reward == approx(-10.0 * (3.0 - 0.01))
     with pytest.raises(rise_di.ParameterError, match="expected reset"):
         env.step(u)
 
@@ -228,9 +227,8 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
     assert flights.observation_space.contains(observed)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        assert observed == approx(
-            np.tile(expected, (3, 1)), abs=1e-6
-        )  # rad/s and m/s; y is of the order of 1e-2
+        # rad/s and m/s; y is of the order of 1e-2
+        assert observed == approx(np.tile(expected, (3, 1)), abs=1e-6)
         u = 0.01 * generator.standard_normal(M)
         observed, rewards, terminated, truncated, _ = flights.step(np.tile(u, (3, 1)))
         expected, reward, *_ = alone.step(u)
@@ -241,9 +239,8 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
 
 
 def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() -> None:
-    flights = rise_di.FlightVectorEnv(
-        rise_di.find_scenario("osprey_gust", 3.0), 2
-    )  # without end stops
+    # without end stops
+    flights = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_gust", 3.0), 2)
     first, _ = flights.reset(seed=3)
     u, terminations, still = np.zeros((2, M)), 0, None
     u[1] = (

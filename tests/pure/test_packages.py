@@ -31,9 +31,8 @@ TEST_DEPENDENCIES = {"python3-hypothesis", "python3-pytest", "python3-pytest-tim
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
 PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "rich", "scipy", "tornado", "typer", "yaml")
-KEYS = {name: f"python3-{name}" for name in PYTHON3} | {
-    "markupsafe": "python3-jinja2"
-}  # which depends on it
+# which depends on it
+KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}
 # Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",

@@ -33,9 +33,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.processes import end_with_parent
 from flight_log.scan import Scan
 
-_numbers = itertools.count(
-    os.getpid()
-)  # a domain is used again late: processes may take a while to leave it
+# a domain is used again late: processes may take a while to leave it
+_numbers = itertools.count(os.getpid())
 
 DEFAULT_SIGHUP = ("env", "--default-signal=HUP")
 """Prefix of a command under test: nohup ignores SIGHUP for all processes of the tests."""
@@ -296,9 +295,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
             for child in process.children():
                 child.kill()
             process.popen.kill()
-        print(
-            *process.arguments, "ended with status", process.end()
-        )  # pytest shows it where the test failed
+        # pytest shows it where the test failed
+        print(*process.arguments, "ended with status", process.end())
         print(*process.lines[-30:], sep="\n")
 
 

@@ -41,10 +41,8 @@ from flight_log.tape_reader import read_run
 KIT = Path(os.environ.get("RISE_DI_SITL", REPOSITORY.parent / "shared" / "sitl"))
 PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
-OWN_MAP, OWN_SCENARIO = (
-    os.environ.get("RISE_DI_MAP"),
-    os.environ.get("RISE_DI_SCENARIO"),
-)  # of a rehearsal
+# of a rehearsal
+OWN_MAP, OWN_SCENARIO = (os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO"))
 POLL = 0.1  # s, between two questions to the autopilot
 ENGAGEMENTS = 4  # attempts: some seconds of level flight end the climb that a fault before has left
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
@@ -60,26 +58,16 @@ OWN_SIGNALS = {
 }
 """Message and field of the autopilot's log for each channel of y."""
 
-SAFE_STICKS = (
-    1500,
-    1500,
-    1000,
-    1500,
-    1800,
-    1500,
-    1500,
-)  # us, as the kit begins; the throttle is closed
-CRUISE = (
-    25.0,
-    65.0,
-)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
+# us, as the kit begins; the throttle is closed
+SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)
+# %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
+CRUISE = (25.0, 65.0)
 Program = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Commands of guidance by channel: times, s, and values."""
 
 TURN = 0.7  # rad, 40 deg
-ALTITUDE = (
-    300.0  # m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
-)
+# m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
+ALTITUDE = 300.0
 
 
 def missing() -> str:
@@ -558,9 +546,8 @@ class ArduPlane(Autopilot):
             own = values[:, 0]
             if name == "V":
                 own = ratio * (own - np.interp(span.start_ns / 1e9, t, own))
-            pulse = (
-                pulses.get(name, pulses["p"]) if name == "r" else pulses[name]
-            )  # r follows p in coordinated turns
+            # r follows p in coordinated turns
+            pulse = pulses.get(name, pulses["p"]) if name == "r" else pulses[name]
             edges = zip(pulse.start, pulse.stop, strict=True)
             begin = log.tape.start_ns / 1e9
             commanded = in_spans(t, [(begin + start, begin + stop + 1.0) for start, stop in edges])
@@ -685,9 +672,8 @@ class Px4(Autopilot):
         """Fly straight ahead in Hold, towards a place 20 km to the north, 150 m above the
         ground.
         """
-        self.until(
-            lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0
-        )  # not before its agent is connected
+        # not before its agent is connected
+        self.until(lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0)
         self.until(
             lambda state: (
                 state["nav_state"] == HOLD and state["alt"] > 100.0 and abs(state["climb"]) < 0.5
@@ -729,9 +715,8 @@ class Px4(Autopilot):
                 answer = subprocess.run(
                     command, capture_output=True, text=True, timeout=30.0, check=False
                 ).stdout
-                now = (
-                    time.time()
-                )  # the client ends with the answer; most of its time goes by before the question
+                # the client ends with the answer; most of its time goes by before the question
+                now = time.time()
                 found = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
                 if found is not None:
                     asked.append(

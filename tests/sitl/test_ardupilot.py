@@ -35,9 +35,8 @@ SCENARIO = find_scenario(
 # us, where the stick of the rudder is during an engagement, so that its return to the pilot shows
 MARK = 1550
 RC_PERIOD = 0.1  # s, of RC_CHANNELS in the autopilot's log
-LATE = (
-    0.4  # s, for a busy host: commands of the pilot and of the log pass through several processes
-)
+# s, for a busy host: commands of the pilot and of the log pass through several processes
+LATE = 0.4
 RC_OVERRIDE_TIME = 3.0  # s, the autopilot's default: without a new Joy the last one acts so long
 
 
@@ -84,15 +83,12 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     assert {name: fit.slope for name, fit in compared.items()} == pytest.approx(
         dict.fromkeys(compared, 1.0), abs=0.01
     )
-    assert (
-        max(abs(compared[name].offset) for name in ("p", "q", "r", "phi", "theta", "psi")) < 0.01
-    )  # rad/s, rad
-    assert (
-        max(abs(compared[name].offset) for name in ("north", "east", "altitude")) < 2.0
-    )  # m: home and the estimator's origin
-    assert row.captured or airspeed == pytest.approx(
-        1.0, abs=0.05
-    )  # a captured V is 0 in a dry run
+    # rad/s, rad
+    assert max(abs(compared[name].offset) for name in ("p", "q", "r", "phi", "theta", "psi")) < 0.01
+    # m: home and the estimator's origin
+    assert max(abs(compared[name].offset) for name in ("north", "east", "altitude")) < 2.0
+    # a captured V is 0 in a dry run
+    assert row.captured or airspeed == pytest.approx(1.0, abs=0.05)
     assert "sample refused" not in (plane.run / "log" / "bridge.log").read_text()
     assert "/ap/joy" not in {message.topic for message in messages}, "a dry run sends nothing"
 
@@ -118,9 +114,8 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
     figures = {}
     for name in pulses.keys() & set("qp"):
         edges = zip(pulses[name].start, pulses[name].stop, strict=True)
-        commanded = in_spans(
-            t, [(start, stop + 1.0) for start, stop in edges]
-        )  # elsewhere y_m is 0, and e is noise
+        # elsewhere y_m is 0, and e is noise
+        commanded = in_spans(t, [(start, stop + 1.0) for start, stop in edges])
         reference = np.interp(y.stamp_ns[commanded], y_m.stamp_ns, y_m[name])
         figures[name] = float(np.std(y[name][commanded] - reference) / np.std(reference))
     assert max(figures.values()) < 0.75
@@ -242,10 +237,8 @@ def kill_agent(plane: ArduPlane, _: Process) -> Callable[[], object]:
 AT_ONCE = (-RC_PERIOD, RC_PERIOD + LATE)
 AFTER_STATUS = (-RC_PERIOD, 1.5 + RC_PERIOD + LATE)  # a message of /ap/status every 0.5 s
 AFTER_TIMEOUT = (0.0, MAX_AGE + RC_PERIOD + LATE)  # of u, by `silence.max_age`
-AFTER_OVERRIDE_TIME = (
-    RC_OVERRIDE_TIME - 0.5,
-    RC_OVERRIDE_TIME + RC_PERIOD + LATE,
-)  # no release reaches the autopilot
+# no release reaches the autopilot
+AFTER_OVERRIDE_TIME = (RC_OVERRIDE_TIME - 0.5, RC_OVERRIDE_TIME + RC_PERIOD + LATE)
 
 EVENTS = {
     "override by a switch": Event(override, "pilot override by switch", AT_ONCE),

@@ -52,9 +52,8 @@ def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> No
     (engagement,) = plane.summary()["engagements"]
     assert engagement["stop"] is None, engagement["reason"]
     errors = plane.own_errors()
-    assert (
-        max(errors[name][0] / errors[name][1] for name in "qp") < 0.75
-    )  # an aircraft that does not follow has 1 or more
+    # an aircraft that does not follow has 1 or more
+    assert max(errors[name][0] / errors[name][1] for name in "qp") < 0.75
     plane.start("replay", str(plane.run)).succeed(60.0)
 
 
@@ -296,9 +295,8 @@ def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: A
         assert re.search(r"RELEASE: .* old \(mavlink/", flight.output)
         t, pulses = plane.log("RC_CHANNELS", "chan4_raw")
         acted = t[(t > cut) & (pulses[:, 0] == 1550.0)][0] - cut
-        assert (
-            OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE
-        )  # RC_CHANNELS comes each 0.1 s
+        # RC_CHANNELS comes each 0.1 s
+        assert OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE
         assert modes == {"MANUAL"}
 
 

@@ -174,12 +174,10 @@ def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
         world.start(BridgeNode)
         px4 = Px4(world)
         world.run(1.0, px4.publish)
-        assert world.last("/y") == approx(
-            {**MOTION, "V": 0.0}, abs=1e-6
-        )  # V is captured: 0 until the engagement
-        assert not any(
-            px4.received.values()
-        )  # a heartbeat before the request would keep PX4 in offboard
+        # V is captured: 0 until the engagement
+        assert world.last("/y") == approx({**MOTION, "V": 0.0}, abs=1e-6)
+        # a heartbeat before the request would keep PX4 in offboard
+        assert not any(px4.received.values())
         assert world.call("/bridge/engage", SetBool.Request(data=True)).success
         world.run(1.0, px4.publish)
         assert px4.mode == Px4.OFFBOARD

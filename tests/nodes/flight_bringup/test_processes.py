@@ -18,6 +18,7 @@ from flight_bringup import processes
 from flight_bringup.graph import NodeSpec
 from flight_bringup.processes import FlightProcesses, NotReadyError
 
+# in place of a FlightMonitor
 SILENT_MONITOR: Any = SimpleNamespace(
     is_ready=lambda *_: False,
     is_matched=lambda *_: False,
@@ -26,7 +27,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
     clock=time,
     by_clock=False,
     clock_ended=lambda: "",
-)  # in place of a FlightMonitor
+)
 
 
 @pytest.fixture

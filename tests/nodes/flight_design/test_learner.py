@@ -62,9 +62,8 @@ class Proposer:
 @pytest.fixture
 def proposer(tmp_path: Path) -> Iterator[Proposer]:
     shipped = find_scenario("osprey_learn")
-    model = shipped.rise_di().model_dump()["feedforward"] | {
-        "gravity": None
-    }  # a parameter that only the proposal has
+    # a parameter that only the proposal has
+    model = shipped.rise_di().model_dump()["feedforward"] | {"gravity": None}
     varied = written(shipped.vary(controller={"feedforward": model}), tmp_path / "learn.yaml")
     with world_of("--params-file", str(varied.path)) as world:
         flight = Flight(world)
@@ -88,9 +87,8 @@ def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_mod
     flight.run(0.1)
     assert flight.values("observer.part") == [0.6]  # its bound
     flown = dict(zip(flight.at().tolist(), flight.column("parameters").tolist(), strict=True))
-    assert (
-        flown[flies.stamp_ns] == proposer.start.digest()
-    )  # u of a tick does not wait for its certificate
+    # u of a tick does not wait for its certificate
+    assert flown[flies.stamp_ns] == proposer.start.digest()
     assert flight.column("parameters")[-1] != proposer.start.digest()
 
 
@@ -103,9 +101,8 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
         proposer.propose(change={"start": 1})
 
     refused = "found a proposal for the parameters 1"
-    assert (
-        refused in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence
-    )  # the publisher that is locked
+    # the publisher that is locked
+    assert refused in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence
     proposer.propose(change={"flown": None})
     for _ in range(20):
         proposer.propose(change={"start": 1})

@@ -131,9 +131,8 @@ def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:
     }.items():
         flight.target(**values)
         assert flight.refused(f"target: {reason}") == 1
-    flight.world.send(
-        "/target", {"heading": 0.5}, "/operator#1", age=MAX_AGE + 0.05
-    )  # of before a stop of guidance
+    # of before a stop of guidance
+    flight.world.send("/target", {"heading": 0.5}, "/operator#1", age=MAX_AGE + 0.05)
     flight.run()
     assert flight.refused("target: old") == 1
     assert flight.last("target.heading") == 1.0
@@ -181,9 +180,8 @@ def test_controller_that_was_inactive_holds_what_is_measured_and_one_in_failsafe
         flight.run(0.1)
         silent = len(flight.world.sent["/u_m"])
         flight.run(0.5)
-        assert (
-            len(flight.world.sent["/u_m"]) == silent
-        )  # no command to a controller that does not fly
+        # no command to a controller that does not fly
+        assert len(flight.world.sent["/u_m"]) == silent
         flight.mode = ControllerMode.ENGAGED
         flight.run()
         assert (flight.last("target.heading") == 1.0) is kept
@@ -270,9 +268,8 @@ def test_route_flown_when_it_arrives(flight: Flight) -> None:
     # 0.8 of a bank of 30 deg
     radius = math.ceil((25.0 + 3.0) ** 2 / (9.80665 * math.tan(0.8 * math.radians(30.0))))
     assert flight.last("to_go") == pytest.approx(math.sqrt(900.0**2 - radius**2))
-    assert flight.last("target.altitude") == pytest.approx(
-        50.0, abs=0.1
-    )  # at the begin of the slope
+    # at the begin of the slope
+    assert flight.last("target.altitude") == pytest.approx(50.0, abs=0.1)
     assert flight.call(Trigger, "hold") == (True, "")
     flight.run()
     assert flight.call(Trigger, "resume") == (True, "")

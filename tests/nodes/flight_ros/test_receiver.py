@@ -126,9 +126,10 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
     assert setup.receiver.receive() == [None]  # in lockstep
     assert setup.decoded == []
     assert setup.refusals.counts == {"y: size": 2}
+    # one line, for it is the same topic and reason
     assert setup.topic.lines == [
         ("warning", f"/y: sample refused: a message of {size} bytes, expected at most {MAX_SIZE}")
-    ]  # one line, for it is the same topic and reason
+    ]
 
 
 def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
@@ -203,9 +204,8 @@ def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
     assert setup.topic.lines == [("error", f"/y: sample refused: {sentence}")]
     assert setup.refusals.last["/y"][1] == sentence
     assert [setup.refusals.conflict(), setup.refusals.conflict()] == [f"/y: {sentence}", ""]
-    assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [
-        True
-    ]  # the first one has timed out
+    # the first one has timed out
+    assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [True]
 
 
 def test_big_endian_publisher_is_taken() -> None:

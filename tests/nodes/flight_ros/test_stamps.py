@@ -57,10 +57,8 @@ LIMITS = {
     "guidance": dict.fromkeys(("y", "pose", "target", "internals", "authority"), GUIDANCE_AGE),
 }
 """Age limits, s, by node and topic."""
-LOCKSTEP_UNBOUNDED = {
-    "target",
-    "authority",
-}  # an operator has the system clock; the last `authority` before a step is awaited
+# an operator has the system clock; the last `authority` before a step is awaited
+LOCKSTEP_UNBOUNDED = {"target", "authority"}
 WITHOUT_STAMP = {"clock", "recorded", "route"}  # the flight time, the end of the log, a plan
 NAMES = {
     "y": SCENARIO.controller.outputs,

@@ -57,9 +57,8 @@ def printed(folder: Path, pause: float) -> str:
 
 def test_failure_beside_a_pause_is_run_again_at_most_twice(tmp_path: Path) -> None:
     shown = printed(tmp_path, pause=0.3)
-    assert (
-        "2 failed, 3 passed, 1 skipped" in shown
-    )  # the one that bears more, and the one that fails alike three times
+    # the one that bears more, and the one that fails alike three times
+    assert "2 failed, 3 passed, 1 skipped" in shown
     sentence = (
         "test_it.py::test_passes_at[{}]: the host paused for 0.30 s, the test bears 0.1 "
         "s, in attempt"

@@ -145,9 +145,8 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenari
         flight.run(0.1)
         mode, at, u = flight.column("mode", begin), flight.at(begin), flight.u(begin)
         failsafe = int(np.flatnonzero(mode == Mode.HOLD)[0])
-        assert (
-            0 < at[failsafe] - last - nanoseconds(MAX_AGE) <= nanoseconds(PERIOD)
-        )  # the first tick at which y is stale
+        # the first tick at which y is stale
+        assert 0 < at[failsafe] - last - nanoseconds(MAX_AGE) <= nanoseconds(PERIOD)
         during = slice(failsafe, resumed - begin)
         scale = np.clip(1.0 - ((at[during] - at[failsafe]) / NANOSECONDS - hold) / ramp, 0.0, 1.0)
         assert (
@@ -217,9 +216,8 @@ def test_overrun_of_controller_does_not_free_publisher_lock(osprey_gust: Scenari
         flight.engage()
         with flight.world.stopped(flight.node):
             flight.run(0.6, silent=True)  # beyond age limit, hold and ramp
-        flight.world.send(
-            "/y", dict.fromkeys(OUTPUTS, 1.0), "/foreign"
-        )  # the first sample that the controller takes
+        # the first sample that the controller takes
+        flight.world.send("/y", dict.fromkeys(OUTPUTS, 1.0), "/foreign")
         flight.run(0.1)
         assert flight.node.refusals.counts["y: sender"] == 1
         assert set(flight.column("y.q")) == {0.01}
@@ -512,9 +510,8 @@ def test_waiting_for_y_is_told_with_its_cause(
     assert len(waits) == 1
     assert cause in waits[0]
     flight.world.run(2.0, meanwhile)
-    assert (
-        sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2
-    )  # every 2 s
+    # every 2 s
+    assert sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2
 
 
 @pytest.mark.parametrize("rate, named", [(9.0, True), (20.0, True), (50.0, False), (200.0, False)])

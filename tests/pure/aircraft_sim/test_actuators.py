@@ -163,9 +163,8 @@ def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
     )
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
     assert lost[:, 3].tolist() == [0.2] * 6 + [0.0] * 2
-    assert (
-        lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8
-    )  # one healthy, one stuck where it was commanded
+    # one healthy, one stuck where it was commanded
+    assert lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8
 
 
 def test_fault_within_step_acts_from_next_step_on() -> None:
@@ -271,9 +270,8 @@ def test_drift_ends_as_the_drifted_aircraft() -> None:
             (first + last) / 2.0
         )
         assert (getattr(plant.aircraft_at(1000 * MS, ice.plant()), matrix) == first).all()
-    assert not np.allclose(
-        after.gust_direction, before.gust_direction
-    )  # wind acts by the aircraft's own A
+    # wind acts by the aircraft's own A
+    assert not np.allclose(after.gust_direction, before.gust_direction)
 
 
 @given(
@@ -311,9 +309,8 @@ def test_late_command_acts_as_that_command_given_later(every: int) -> None:
         Simulator(scenario.vary(aircraft=late).aircraft),
         Simulator(scenario.aircraft),
     )
-    held = np.repeat(
-        0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0
-    )  # over the periods 0 and 1, 2 and 3, ...
+    # over the periods 0 and 1, 2 and 3, ...
+    held = np.repeat(0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0)
     shifted = np.vstack([np.zeros((periods, 4)), held])
     y = {k: at_once.sample(k, shifted[k - 1])[0].value for k in range(1, 41)}
     for k in range(every, 41, every):
@@ -376,9 +373,8 @@ def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: floa
     # which limits begin and cease to act fall anywhere in their steps, so that each halving alone
     # scatters.
     assert errors[1] < errors[0] / 16.0
-    assert (
-        errors[1] < 5e-6
-    )  # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
+    # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
+    assert errors[1] < 5e-6
 
 
 def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:

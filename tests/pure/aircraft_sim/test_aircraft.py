@@ -127,9 +127,8 @@ def test_truth_holds_state_disturbance_and_actuators() -> None:
     )
     assert true["x.phi"] == 0.07
     assert true["gust.vertical"] == approx(2.0)  # s = 25 0.4 = H
-    assert (
-        true["gust.lateral"] == true["gust.longitudinal"] == 0.0
-    )  # every axis of the airframe's gusts
+    # every axis of the airframe's gusts
+    assert true["gust.lateral"] == true["gust.longitudinal"] == 0.0
     assert true["actuator.thrust"] == 0.2
     assert true["f.V"] == approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
 

@@ -54,9 +54,8 @@ def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
         level_flight(OSPREY, ratio, "thrust") for ratio in (0.8, 1.25)
     )
     alpha, V0 = OSPREY.index("alpha"), OSPREY.speed
-    lift = (
-        -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
-    )  # that of the trim, of rad
+    # that of the trim, of rad
+    lift = -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
     for x, ratio in ((slow, 0.8), (fast, 1.25)):
         assert x[alpha] == approx(lift * (ratio**-2.0 - 1.0), rel=0.1)  # the elevator has lift too
     thrust = list(OSPREY.inputs).index("thrust")
@@ -76,9 +75,8 @@ def test_flight_to_another_speed_ends_in_its_trim() -> None:
     }
     x, _ = level_flight(OSPREY, 1.16, "thrust")
     assert last["x.V"] == approx(4.0, abs=0.02)
-    assert last["x.alpha"] == approx(
-        x[OSPREY.index("alpha")], abs=2e-3
-    )  # q is held at 0, and theta where it is
+    # q is held at 0, and theta where it is
+    assert last["x.alpha"] == approx(x[OSPREY.index("alpha")], abs=2e-3)
     assert last["actuator.thrust"] > 0.1
 
 

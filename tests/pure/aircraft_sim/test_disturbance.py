@@ -58,9 +58,8 @@ def test_gust_comes_again_after_its_time() -> None:
     np.testing.assert_array_equal(
         one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0))
     )
-    later = one_minus_cosine(t + 21.0, again, np.array(V0))[
-        t > 2.0
-    ]  # before the first entry there was none
+    # before the first entry there was none
+    later = one_minus_cosine(t + 21.0, again, np.array(V0))[t > 2.0]
     assert later == approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
 
 
@@ -192,9 +191,8 @@ def test_outside_assumption_2_shorter_period_does_not_help(
     assert coarse / fine < 1.2
 
 
-INERTIA = np.array(
-    [[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]]
-)  # Aerosonde, kg m^2
+# Aerosonde, kg m^2
+INERTIA = np.array([[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]])
 PQR = [5, 2, 6]  # indices of p, q, r in the state of the osprey
 
 
@@ -219,9 +217,8 @@ def test_the_coupling_is_that_of_eulers_equations() -> None:
 def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
     # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation and
     # the conserved quantities.
-    w = np.array(
-        [0.3, 2.0, -0.4]
-    )  # about the intermediate axis, which is unstable: the body turns over
+    # about the intermediate axis, which is unstable: the body turns over
+    w = np.array([0.3, 2.0, -0.4])
     x: FloatArray = np.zeros(8)
     x[PQR] = w
     free = aircraft_parameters().plant()._replace(aircraft=coupled(1.0))

@@ -81,9 +81,8 @@ def test_fault_that_begins_now_is_one_that_was_scheduled(
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
     whole = flown(varied(scenario, **scheduled), varied(scenario, **scheduled))
-    assert np.array_equal(
-        changed, whole, equal_nan=True
-    )  # no bytes: a lag of 0 s gives -0.0 for a command of 0
+    # no bytes: a lag of 0 s gives -0.0 for a command of 0
+    assert np.array_equal(changed, whole, equal_nan=True)
     assert not np.array_equal(changed, flown(still, still), equal_nan=True)
 
 

@@ -43,9 +43,8 @@ def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_do
     body = speed * np.array(
         [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
     )
-    north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(
-        body
-    )  # scipy's intrinsic rotations
+    # scipy's intrinsic rotations
+    north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(body)
     assert pose.velocity(speed, alpha, beta, phi, theta, psi) == approx(
         (north, east, -down), rel=1e-14
     )
@@ -151,9 +150,8 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     }
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
-        assert found[name] == approx(value, abs=2e-3), (
-            name
-        )  # m and rad: the trapezoidal rule at 100 Hz
+        # m and rad: the trapezoidal rule at 100 Hz
+        assert found[name] == approx(value, abs=2e-3), name
 
 
 def guided(signal: Signal) -> dict[str, Any]:

@@ -29,9 +29,8 @@ pytestmark = pytest.mark.slow
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
 SPAN = 3.0  # m
-SMALL = Dryden(
-    np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8])
-)  # about 60 ft above the ground in 15 kt
+# about 60 ft above the ground in 15 kt
+SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))
 ALL = (0, 1, 2)
 TURBULENCE = {"altitude": 30.0, "wind": 7.7}
 
@@ -170,9 +169,8 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> N
         * SMALL.length
         / (1e-3 * V0)
     )
-    assert mean == approx(
-        [2.0, 3.0, 3.0], rel=0.1
-    )  # 6300 nearly independent increments: 1.8 % standard deviation
+    # 6300 nearly independent increments: 1.8 % standard deviation
+    assert mean == approx([2.0, 3.0, 3.0], rel=0.1)
 
 
 def test_numbers_of_step_k_do_not_depend_on_range() -> None:

@@ -89,9 +89,8 @@ def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
         )
         assert by_wind == approx(-by_state, rel=5e-3, abs=0.0), axis
         published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
-        assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), (
-            axis
-        )  # what it would feel otherwise
+        # what it would feel otherwise
+        assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis
 
 
 def test_effect_of_wind_of_published_airframe_is_published_one_to_last_bit() -> None:
@@ -109,9 +108,8 @@ def test_a_seed_determines_the_aircraft() -> None:
     sampled, again, other = (sample_airframe(OSPREY, 0.3, 0.3, seed) for seed in (7, 7, 8))
     assert sampled == again != other
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    assert sampled.matrix_a() == approx(
-        A[1], rel=1e-15
-    )  # rounding of the conversion to the file's units
+    # rounding of the conversion to the file's units
+    assert sampled.matrix_a() == approx(A[1], rel=1e-15)
     assert sampled.matrix_b() == approx(B[1], rel=1e-15)
 
 

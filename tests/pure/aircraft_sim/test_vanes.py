@@ -37,11 +37,12 @@ from rise_di_controller.control_law import Measurements
 from rise_di_controller.observer import VaneObserverState, correct, without_frozen
 
 SHIPPED = find_scenario("osprey_vanes")
+# y at the rate of the law: a third of the time of the shipped one
 SHORT = SHIPPED.vary(
     flight={"duration": 12.0},
     aircraft={"rate": 100.0, "step": 0.005},
     reference_model={"rate": 100.0},
-)  # y at the rate of the law: a third of the time of the shipped one
+)
 
 
 def with_vanes(**values: Any) -> Scenario:

@@ -24,13 +24,8 @@ OF_PX4 = ("px4_airplane", "px4_quadrotor")
 EXAMPLES = {"arduplane": "ardupilot"} | {
     name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4
 }
-LARGEST = {
-    "q": 0.1,
-    "V": 1.0,
-    "p": 0.2,
-    "r": 0.2,
-    "vertical_speed": 1.0,
-}  # an aircraft that is lost leaves them at once
+# an aircraft that is lost leaves them at once
+LARGEST = {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2, "vertical_speed": 1.0}
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

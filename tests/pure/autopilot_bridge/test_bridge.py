@@ -279,9 +279,8 @@ def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -
         receive_outputs(bridge, t, raw=1.0)
         sample = bridge.y(at(t))
         assert sample is not None
-        step = np.abs(
-            sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]]
-        )  # the row of q has sign -1, that of p no filter
+        # the row of q has sign -1, that of p no filter
+        step = np.abs(sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]])
         assert step == approx([1.0 - np.exp(-t / 0.05), 1.0])
 
 
@@ -314,11 +313,8 @@ def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-PX4_STATUS = {
-    "armed": 2.0,
-    "offboard": 4.0,
-    "transmitter": 1.0,
-}  # armed, in Hold, with a transmitter
+# armed, in Hold, with a transmitter
+PX4_STATUS = {"armed": 2.0, "offboard": 4.0, "transmitter": 1.0}
 
 
 def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
@@ -360,9 +356,8 @@ def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: s
 
 def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
     bridge = px4_bridge()
-    assert (
-        sent(bridge, 0.0) == set()
-    )  # no heartbeat before the request: without it PX4 leaves offboard
+    # no heartbeat before the request: without it PX4 leaves offboard
+    assert sent(bridge, 0.0) == set()
     engage(bridge)
     assert bridge.phase is Phase.ENGAGING
     assert bridge.reason == "the mode is not offboard (nav_state is 4)"
@@ -469,9 +464,8 @@ def test_blind_engagement_ignores_the_transmitter() -> None:
         "effect then; released by a lost condition (armed, offboard), rise-di engage --off"
     )
     bridge.disengage("disengaged by request", at(3.0))
-    assert (
-        bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"
-    )  # blind for one engagement
+    # blind for one engagement
+    assert bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"
 
 
 def test_unwatched_transmitter_needs_a_bound() -> None:
@@ -541,9 +535,8 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
     bridge = ardupilot_bridge()
     engage(bridge)
     for name in STICKS:
-        receive_outputs(
-            bridge, 0.05, (trim_key(name),), 1900.0
-        )  # while overridden, ArduPilot reports what it is sent
+        # while overridden, ArduPilot reports what it is sent
+        receive_outputs(bridge, 0.05, (trim_key(name),), 1900.0)
     assert bridge.raw() == approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
     assert [bridge.trim(name) for name in STICKS] == approx(
         [-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6
@@ -756,9 +749,8 @@ def test_engagement_needs_sources_of_trims() -> None:
 
 
 def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
-    bridge = ardupilot_bridge(
-        sticks=STICKS | {"thrust": 1900.0}
-    )  # 90 % of throttle, upper limit 30 % above
+    # 90 % of throttle, upper limit 30 % above
+    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})
     assert (
         bridge.engage(at(0.0))
         == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
@@ -858,9 +850,8 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     engage(bridge, 0.01)
     receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
     assert bridge.step(at(0.02)) is Phase.ENGAGED
-    receive_outputs(
-        bridge, 0.03, ("climb",), raw=-8.4
-    )  # the sink of ArduPlane with a jammed elevator
+    # the sink of ArduPlane with a jammed elevator
+    receive_outputs(bridge, 0.03, ("climb",), raw=-8.4)
     assert bridge.step(at(0.03)) is Phase.RELEASE
     assert bridge.reason == "climb is -8.4, outside the envelope [-8, 8]"
 

@@ -100,9 +100,8 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
     row = named_map(name).outputs[channel]
     message = AIRSPEED[name] if channel == "V" else RATES[name]
     value = to_channel(read_raw(message, row.field, row.function), row.line)
-    assert value == approx(
-        2.0 if channel == "V" else MOTION[channel], abs=1e-6
-    )  # float32 in a message of PX4
+    # float32 in a message of PX4
+    assert value == approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -111,9 +110,8 @@ def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
         SENT[name].items(), named_map(name).inputs.values(), strict=True
     ):
         assert path in (row.field, f"{row.message}.{row.field}")
-        assert to_raw(row.trim + 0.1, row.line) == approx(
-            expected, abs=1e-3
-        )  # the fields in us are integers
+        # the fields in us are integers
+        assert to_raw(row.trim + 0.1, row.line) == approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
@@ -312,9 +310,8 @@ def test_service_is_requested_and_does_not_fly() -> None:
 
 shipped = cache(named_map)  # parsed once, not for each example
 ANGLE = st.floats(-math.pi, math.pi)
-TURN_NED_ENU = Rotation.from_matrix(
-    [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
-)  # x east, y north, z up
+# x east, y north, z up
+TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 

@@ -216,12 +216,8 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
     until(lambda: taken, take)
     sent = taken[0]
     assert (sent.get_srcSystem(), sent.target_system, sent.target_component) == (255, 1, 1)
-    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [
-        0,
-        1612,
-        65535,
-        0,
-    ]  # released, set, as is, as is
+    # released, set, as is, as is
+    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]
 
 
 def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
@@ -319,9 +315,8 @@ def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) ->
         routed = mavlink.MAVLink(autopilot.connection, srcSystem=1, srcComponent=component)
         routed.attitude_send(50_000, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
         ends.peer(port, component=component).attitude(0.9, since_boot=50.0)
-    autopilot.attitude(
-        0.1, since_boot=50.1
-    )  # of the packets to one socket the last one is read last
+    # of the packets to one socket the last one is read last
+    autopilot.attitude(0.1, since_boot=50.1)
     until(lambda: len(queue) == 2, autopilot.received)
     assert [received.message.pitchspeed for received in queue] == [approx(0.1)] * 2
     assert made.conflict == ""
@@ -367,9 +362,8 @@ def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(
         SENDER,
         0,
     )
-    assert (
-        made.conflict == ""
-    )  # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    assert made.conflict == ""
     sticks = {
         "RC_CHANNELS_OVERRIDE": mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
         "MANUAL_CONTROL": mavlink.MAVLink_manual_control_message(1, 0, 0, 0, 0, 0),

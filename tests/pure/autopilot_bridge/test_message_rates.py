@@ -9,10 +9,8 @@ import pytest
 
 from autopilot_bridge.message_rates import MessageRates
 
-REQUESTED = {
-    "ATTITUDE": 40.0,
-    "EXTENDED_SYS_STATE": 2.0,
-}  # the highest and the lowest rate of the map ardupilot_mavlink
+# the highest and the lowest rate of the map ardupilot_mavlink
+REQUESTED = {"ATTITUDE": 40.0, "EXTENDED_SYS_STATE": 2.0}
 
 
 class Stream:
@@ -55,9 +53,8 @@ def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagem
     stream = Stream().run(10.0)
     stream.run(10.8, ATTITUDE=4.0)
     ((instant, requested),) = stream.again
-    assert instant == pytest.approx(
-        10.67, abs=0.15
-    )  # a message of the 4 Hz is 0.25 s, a judgement 0.1 s
+    # a message of the 4 Hz is 0.25 s, a judgement 0.1 s
+    assert instant == pytest.approx(10.67, abs=0.15)
     assert requested == {"ATTITUDE": 40.0}
     assert stream.rates.slow(10.8) == {"ATTITUDE": "ATTITUDE comes at 4 Hz, requested are 40 Hz"}
     for end in np.arange(10.9, 20.0, 0.1).tolist():
@@ -65,9 +62,8 @@ def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagem
     assert len(stream.again) <= 2
     came = {"ATTITUDE": "ATTITUDE came at 4 Hz, requested are 40 Hz, less than 20 s ago"}
     assert stream.rates.slow(20.0) == came
-    assert (
-        stream.run(30.0).rates.slow(30.0) == came
-    )  # longer than the 15 s after which MAVProxy takes it again
+    # longer than the 15 s after which MAVProxy takes it again
+    assert stream.run(30.0).rates.slow(30.0) == came
     assert stream.run(33.0).rates.slow(33.0) == {}
 
 

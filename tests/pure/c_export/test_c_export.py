@@ -207,9 +207,8 @@ def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
 def test_bits_do_not_depend_on_optimisation(
     flags: tuple[str, ...], case: Case, tmp_path: Path
 ) -> None:
-    build(
-        ["gcc", *FLAGS, *flags, "-c", "-o", str(tmp_path / "rise_di.o"), "rise_di.c"], case.code
-    )  # without a warning
+    # without a warning
+    build(["gcc", *FLAGS, *flags, "-c", "-o", str(tmp_path / "rise_di.o"), "rise_di.c"], case.code)
     program = Program(
         case.code, ["gcc"], case.sets, tmp_path / "program", flags=[*FLAGS, *flags, "-Wno-error"]
     )
@@ -521,9 +520,8 @@ def test_command_proves_with_a_recorded_run(
     with pytest.raises(typer.Exit) as status:
         export("osprey_gust", tmp_path / "c", run=run, compiler=["gcc"])
     assert status.value.exit_code == 0
-    assert (
-        "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out
-    )  # the ticks of the log
+    # the ticks of the log
+    assert "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out
     with refusing("run: found a flight with other parameters, expected those of osprey_servo"):
         export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 

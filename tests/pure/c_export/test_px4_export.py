@@ -172,9 +172,8 @@ def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
     shell.fly(500, enabled=False)
     assert shell.run() == FLIES
     assert shell.torque == approx(shell.spare, abs=0.02)
-    assert shell.values[3:6] == approx(
-        0.261799 * shell.torque[[1, 0, 2]], rel=1e-6
-    )  # u in rad, q p r
+    # u in rad, q p r
+    assert shell.values[3:6] == approx(0.261799 * shell.torque[[1, 0, 2]], rel=1e-6)
 
 
 @pytest.mark.parametrize(

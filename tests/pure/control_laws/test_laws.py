@@ -217,9 +217,8 @@ def test_limits_hold_for_any_error(name: str) -> None:
     u = np.array(us)
     assert u.min() >= -0.02
     assert u.max() <= 0.01
-    assert np.abs(np.diff(u, axis=0)).max() == pytest.approx(
-        0.05 * DT, rel=1e-12
-    )  # reached, and kept
+    # reached, and kept
+    assert np.abs(np.diff(u, axis=0)).max() == pytest.approx(0.05 * DT, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -362,9 +361,8 @@ def responses(name: str, parameters: Any, z: complex) -> FloatArray:
             np.reshape(parameters.Omega, (4, 4)),
             1.0 - np.exp(-np.array(parameters.bandwidth) * T),
         )
-        low_pass = np.diag(
-            passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0)
-        )  # and a pole of 1 1/s in the adaptation
+        # and a pole of 1 1/s in the adaptation
+        low_pass = np.diag(passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0))
         # u = -Omega^-1 (K y + F ((1 - 1/z) y - T / z Omega u))
         return np.asarray(
             -np.linalg.solve(
@@ -377,9 +375,8 @@ def responses(name: str, parameters: Any, z: complex) -> FloatArray:
         series = series + np.array(parameters.lead) * share / T * (z - 1.0) / (z - 1.0 + share)
     if name == "rise_di":
         lag = np.array(parameters.lag) + 1.5 * T + parameters.delay
-        series = series + T / (parameters.softening * lag) * z / (
-            z - 1.0
-        )  # beta / (eps K) is 1 / (softening lag)
+        # beta / (eps K) is 1 / (softening lag)
+        series = series + T / (parameters.softening * lag) * z / (z - 1.0)
     return np.diag(-np.array(parameters.input_scale) * np.array(parameters.D) * K * series)
 
 

@@ -202,9 +202,10 @@ def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
 
 def test_the_acceleration_based_law_by_hand() -> None:
     model = integrator(Omega=2.0, period=0.1)
+    # eps = 5 / 3 0.24 = 0.4
     control_law, params = law_of(
         "mackunis_ideal", model, K=3.0, Lambda=2.0, beta=5.0, softening=0.24
-    )  # eps = 5 / 3 0.24 = 0.4
+    )
     state = control_law.engage(at(0.0), params)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
     # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2
@@ -388,9 +389,8 @@ def test_indi_needs_no_model_except_input_gain() -> None:
             model,
             Omega=Omega,
         )
-        assert abs(flight.y[-1]) < 1e-6, (
-            Omega
-        )  # exp(-2 15) of the start and the disturbance, were it first order
+        # exp(-2 15) of the start and the disturbance, were it first order
+        assert abs(flight.y[-1]) < 1e-6, Omega
         assert flight.u[-1] == approx(-0.7 / Omega, rel=1e-5)
 
 
@@ -411,18 +411,17 @@ def test_super_twisting_reaching_time() -> None:
 
 def test_super_twisting_rejects_a_ramp_disturbance() -> None:
     model = integrator(period=2e-4)
+    # d_dot = 2 < 3
     flight = fly(
         *law_of("twisting", model, root=4.0, beta=3.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
-    )  # d_dot = 2 < 3
-    assert (
-        np.abs(flight.y[15_000:]).max() < 3e-6
-    )  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
+    )
+    # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
+    assert np.abs(flight.y[15_000:]).max() < 3e-6
     linear = fly(
         *law_of("di_pi", model, K=8.0, Lambda=2.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
     )
-    assert (
-        np.abs(linear.y[15_000:]).min() > 0.1
-    )  # d_dot / (K Lambda) = 0.125: an integral alone follows late
+    # d_dot / (K Lambda) = 0.125: an integral alone follows late
+    assert np.abs(linear.y[15_000:]).min() > 0.1
 
 
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
@@ -440,9 +439,8 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 
 def test_observer_converges(osprey: NominalModel) -> None:
     """The estimates converge to states, wind and disturbance of the model."""
-    values = initial_gains(LAWS["lqg"], osprey) | {
-        "wind_time": np.full((3, 1), 0.6)
-    }  # s: faster than the 30 s below
+    # s: faster than the 30 s below
+    values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}
     _, params = law_of("lqg", osprey, **values)
     Phi, Gamma, H, correction = params.Phi[..., 0], params.Gamma, params.H, params.L[..., 0]
     Gamma = Gamma[..., 0] if Gamma.ndim > 2 else Gamma
@@ -471,17 +469,8 @@ def test_anti_windup_stops_and_releases_integral() -> None:
 def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
     """A law gives the same under NumPy and JAX, and over a fleet."""
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
-    shapes = (
-        (4, 3),
-        (4, 1),
-        (4, 1),
-        (4, 1),
-        (4, 3),
-        (4, 3),
-        (8, 3),
-        (8, 3),
-        (4, 3),
-    )  # all but the vanes
+    # all but the vanes
+    shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
     looks = [
         Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes))
         for _ in range(4)

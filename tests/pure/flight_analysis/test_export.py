@@ -57,13 +57,14 @@ def test_csv_and_parquet_hold_every_sample_to_last_bit(
         column, expected = f"{topic}.{name}", flight.tape[topic][name].tolist()
         assert [float(row[column]) for row in rows if row[column]] == expected
         assert read[column].drop_nulls().to_list() == expected
+    # 100 Hz of 500
     assert [row["u.thrust"] != "" for row in rows[:11]] == [
         True,
         *[False] * 4,
         True,
         *[False] * 4,
         True,
-    ]  # 100 Hz of 500
+    ]
 
 
 def test_table_of_several_flights_has_column_run(flight: RecordedFlight, tmp_path: Path) -> None:

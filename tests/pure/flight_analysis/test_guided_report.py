@@ -149,9 +149,10 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     assert isinstance(route.legs[1], Arc)
     bounds = guided_figures.bounds_of(flight.scenario)
     assert bounds["V"] == (0.8 * 25.0, 1.4 * 25.0)  # by rule, without a stall speed and a limit
+    # less turbulence
     assert guided_figures.mean_wind(flight.tape, 25.0) == approx(
         np.array([[3.0, 0.0]] * 8), abs=1.0
-    )  # less turbulence
+    )
 
 
 def test_report_opens_with_track_of_numbered_legs_and_fence(

@@ -33,14 +33,8 @@ CURVES = {
     *(f"internals {name}" for name in ("mode", "late", "age", "dt")),
     *(f"truth gust.{axis}" for axis in ("longitudinal", "lateral", "vertical")),
 }
-TABS = {
-    "tracking": 4,
-    "error": 4,
-    "input": 4,
-    "integrals": 8,
-    "controller": 4,
-    "wind": 3,
-}  # title: number of plots
+# title: number of plots
+TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}
 """The fixed part of a Plot panel of Foxglove."""
 
 

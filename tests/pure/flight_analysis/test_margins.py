@@ -78,9 +78,8 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
     plant, k = LinearPlant(np.eye(1), np.eye(1), np.eye(1)), 4.0
     found = loop_margins(plant, proportional(np.array([[k]])), NO_LAG)
-    assert found.gain_decrease[0] == approx(
-        1.0 / k, rel=1e-3
-    )  # at w = 0, seen at the lowest frequency
+    # at w = 0, seen at the lowest frequency
+    assert found.gain_decrease[0] == approx(1.0 / k, rel=1e-3)
     growth = math.exp(NO_LAG.period)
     assert found.gain_increase[0] == approx((growth + 1.0) / (growth - 1.0) / k)
     assert found.gain[0] == approx(k, rel=1e-3)
@@ -124,9 +123,8 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
     assert expected == approx(0.0997, abs=1e-4)
-    assert found.disk_all == approx(
-        expected, rel=0.02
-    )  # the hold, and frequencies from 1e-5 pi / T on
+    # the hold, and frequencies from 1e-5 pi / T on
+    assert found.disk_all == approx(expected, rel=0.02)
     assert found.disk == approx([2.0, 2.0], rel=0.02)
     assert math.degrees(disk_phase(found.disk_all)) == approx(5.7, abs=0.1)  # 2 atan(alpha / 2)
     assert disk_gain(np.array(1.0)) == 3.0
@@ -203,9 +201,8 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
         gain, phase, sensitivity, _, crossover, _ = control.stability_margins(
             control.frd(L, w, smooth=True)
         )
-        assert math.degrees(found.phase[i]) == approx(
-            phase, abs=0.1
-        )  # they agree far below 1 deg and 2 %
+        # they agree far below 1 deg and 2 %
+        assert math.degrees(found.phase[i]) == approx(phase, abs=0.1)
         assert found.crossover[i] == approx(crossover, rel=1e-3)
         assert found.gain_increase[i] == approx(gain, rel=1e-3)
         assert found.sensitivity[i] == approx(1.0 / sensitivity, rel=5e-3)

@@ -220,9 +220,8 @@ def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
         replay(tape, scenario.controller, vary(scenario.controller, {"Lambda": gains})),
     ):
         assert not result.equal()
-        assert (
-            result.other_parameters.all()
-        )  # from the first tick on, even where rounding hides the bit in all of u
+        # from the first tick on, even where rounding hides the bit in all of u
+        assert result.other_parameters.all()
         first = result.first()
         if scenario.controller.outputs[channel] == "V":
             continue  # Lambda e is 1e-3 of u there, and its last bit may change no u

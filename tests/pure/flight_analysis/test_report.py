@@ -32,10 +32,8 @@ from rise_di_controller.internals import Saturation
 pytestmark = pytest.mark.slow
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
-OF_LOOP = (
-    "Bode plot of the loop",
-    "Nyquist plot of the loop",
-)  # headings on every page with a linear loop
+# headings on every page with a linear loop
+OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")
 DEG = np.pi / 180.0
 
 
@@ -132,9 +130,8 @@ def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> Non
     one = flight(
         1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0)
     )
-    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(
-        OF_LOOP
-    )  # y, e, u, states, integrals: no wind, no late tick
+    # y, e, u, states, integrals: no wind, no late tick
+    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(OF_LOOP)
 
 
 def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
@@ -235,10 +232,11 @@ def test_spectrum_of_commanded_sine_has_peak_there() -> None:
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     elevator = drawn(figure).data[0]
     assert elevator.x[np.argmax(elevator.y)] == pytest.approx(5.0, abs=0.2)
+    # eleven samples
     assert (
         figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {})
         is None
-    )  # eleven samples
+    )
 
 
 @pytest.fixture(scope="module")

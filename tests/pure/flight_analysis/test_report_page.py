@@ -116,9 +116,8 @@ def test_zoom_shows_every_sample_in_all_figures(
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
     t = servo.tape.time("y")
     x, values = curve(browser, 0, "y", row=2)
-    assert values == pytest.approx(
-        np.interp(x, t, y["V"]), rel=2.0**-15.9
-    )  # plotting.MANTISSA, and float32
+    # plotting.MANTISSA, and float32
+    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=2.0**-15.9)
     assert (
         browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)")
         == [[2.0, 2.1]] * 3
@@ -153,9 +152,8 @@ def test_replay_shows_pose_and_surfaces_of_flight(
     ).values()
     assert info["positive"]["rudder"] == "nose right"
     figures = stored.partition('id="replay-data">')[0] + stored.partition("replay-code")[2]
-    assert all(
-        f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values()
-    )  # stored once, for the figure
+    # stored once, for the figure
+    assert all(f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values())
     browser.run("void document.getElementById('replay-play').click()")
     browser.wait_for("Number(document.getElementById('replay').dataset.drawn) > 5.2")
     assert browser.console == []

@@ -22,15 +22,13 @@ from flight_analysis.metrics import error_metrics
 
 pytestmark = pytest.mark.slow
 
-NO_SIGN = {
-    "beta": [1e-9 * beta for beta in PROTOTYPE_SERVO.rise_di().beta]
-}  # the law is then a PI controller
+# the law is then a PI controller
+NO_SIGN = {"beta": [1e-9 * beta for beta in PROTOTYPE_SERVO.rise_di().beta]}
 LITERAL = {"sign": "literal"}
 CALM: dict[str, Any] = {"gusts": {}}
 GYRO = {"sensors": {"noise": [0.02, 0.0, 0.02, 0.02]}}  # rad/s rms per sample
-FINE = {
-    "step": 0.0005
-}  # actuators lead by half an integration step, which changes the size of a limit cycle
+# actuators lead by half an integration step, which changes the size of a limit cycle
+FINE = {"step": 0.0005}
 
 
 def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scenario:

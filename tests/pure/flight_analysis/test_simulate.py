@@ -23,12 +23,8 @@ from flight_log.tape_writer import TapeWriter, write_run
 pytestmark = pytest.mark.slow
 
 DISPLAY_FACTORS = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
-ABOVE_SLEW = [
-    29.4,
-    22.5,
-    10.2,
-    7.8,
-]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
+# 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
+ABOVE_SLEW = [29.4, 22.5, 10.2, 7.8]
 BELOW_SLEW = [14.7, 22.5, 6.8, 3.6]  # 15 deg/s, 15, 40, 60 %/s: below it
 Rms = Callable[..., FloatArray]
 

@@ -148,9 +148,8 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
-    assert worst.score == approx(
-        score(rms, unit)[0], rel=1e-3
-    )  # as of single flights: tests of fleets
+    # as of single flights: tests of fleets
+    assert worst.score == approx(score(rms, unit)[0], rel=1e-3)
 
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
@@ -183,10 +182,8 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
         assert np.abs(rows[name].to_numpy() / published - 1.0) == approx(part)
     worst = campaign.tally(0).worst[0]
     again = campaign.definition.aircraft_scenario(worst.number)
-    assert set(rows["delay"].to_list()) == {
-        0.0,
-        0.03,
-    }  # whole periods; +100 % of the reference is the largest
+    # whole periods; +100 % of the reference is the largest
+    assert set(rows["delay"].to_list()) == {0.0, 0.03}
     assert 2.0 * equipment.references(SHORT, of.entries)["delay"] == 0.03
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
     assert again.aircraft.actuators.delay == rows["delay"][worst.number] == 0.03
@@ -487,16 +484,14 @@ def test_rank_correlations_are_those_of_scipy() -> None:
         name: spearmanr(size, score).statistic
         for name, size in (("A[q,alpha]", strong), ("A[q,q]", weak))
     }
-    assert list(correlations) == list(
-        expected
-    )  # the strongest first, without the one that is not uncertain
+    # the strongest first, without the one that is not uncertain
+    assert list(correlations) == list(expected)
     assert correlations == approx(expected, rel=1e-12)
     lost = table.with_columns(
         pl.when(pl.col("score") < score.max()).then(pl.col("score")).alias("score")
     )
-    assert (
-        rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations
-    )  # a diverged aircraft is the worst
+    # a diverged aircraft is the worst
+    assert rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations
     assert rank_correlations(table.head(5), {}) == {}
 
 

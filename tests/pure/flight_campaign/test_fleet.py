@@ -80,9 +80,8 @@ def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     true, period = error(tape), round(1e9 / scenario.controller.rate)
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
     u = np.array([tape["u"][name] for name in scenario.controller.effectors])
-    moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(
-        axis=1
-    )  # a tick without a new y publishes no u
+    # a tick without a new y publishes no u
+    moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(axis=1)
     slew = moved / scenario.flight.duration
     return {"rms": np.sqrt((e**2).mean(axis=1)), "max": np.abs(e).max(axis=1), "slew": slew}
 

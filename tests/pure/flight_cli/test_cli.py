@@ -152,9 +152,8 @@ def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diver
 
 def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
     (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')")
-    shown = rise_di(
-        "campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path
-    )  # -m puts the working folder first
+    # -m puts the working folder first
+    shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)
     assert shown.returncode == 2
     sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
     assert shown.stderr.splitlines()[-1] == sentence

@@ -183,9 +183,8 @@ def test_scenario_parsed_before_any_file_written(
     other = shutil.copy(log, run.parent / "log")
     content = Path(other).read_bytes()
     assert content.count(b"/**/controller:") > 0
-    log.write_bytes(
-        content.replace(b"/**/controller:", b"/**/controllex:")
-    )  # in its attachments, which are not compressed
+    # in its attachments, which are not compressed
+    log.write_bytes(content.replace(b"/**/controller:", b"/**/controllex:"))
     before = set(files_in(run))
     with pytest.raises(ParameterError):
         write_report(run)

@@ -59,9 +59,10 @@ def test_float_functions_equal_array_functions() -> None:
     """The functions of a Python float give the values of the array functions."""
     xp = array_namespace(0.5)
     for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
+        # JAX in 32 bit
         assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), (
             name
-        )  # JAX in 32 bit
+        )
     for name in ("atan2", "hypot", "copysign", "minimum", "maximum"):
         assert getattr(xp, name)(0.5, -2.0) == pytest.approx(
             float(getattr(jnp, name)(0.5, -2.0)), rel=1e-6

@@ -170,9 +170,8 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
     controller, k = flying.controller, list(MAP.outputs).index("q")
     params, i = controller.law_params(), controller.outputs.index("q")
     gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
-    integral = params.Lambda[i] + params.beta[i] / (
-        params.K[i] * params.eps[i]
-    )  # the softened sign is one too
+    # the softened sign is one too
+    integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])
     s = 1j * gain
     loop = (
         gain
@@ -239,9 +238,8 @@ def test_model_of_channel_is_that_of_own_simulation_from_any_start(
     # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20
     # 1/s.
     monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag, 5.0, 30.0, 6.0),))
-    model = fit_channel(
-        *Known().measured(noise=0.002), "q", "elevator", 1.0
-    )  # rad/s, as of a gyroscope
+    # rad/s, as of a gyroscope
+    model = fit_channel(*Known().measured(noise=0.002), "q", "elevator", 1.0)
     assert model is not None
     assert model.usable
     assert model.stiffness == 0.0
@@ -313,9 +311,8 @@ def test_thrust_told_from_phugoid_by_climb() -> None:
     assert model is not None
     assert model.usable
     assert_allclose([model.Omega, model.damping], [14.0, 0.5], rtol=0.05)
-    assert model.lag + model.delay == approx(
-        0.1, abs=0.03
-    )  # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
+    # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
+    assert model.lag + model.delay == approx(0.1, abs=0.03)
     of_log_alone = fit_channel(tape["y"], tape["u"], "V", "thrust", 1.0)
     assert of_log_alone is not None
     assert of_log_alone.Omega > 1.5 * 14.0, "the phugoid is large enough to matter"
@@ -394,9 +391,8 @@ def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path:
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
     channels = join(HOVER_MAP, response, channel_models(HOVER_MAP, tape, [(0, 10**18)], None))
     known = load_airframe(frame)
-    assert_allclose(
-        np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1
-    )  # q, p, r by a noise of 20 mrad/s
+    # q, p, r by a noise of 20 mrad/s
+    assert_allclose(np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1)
     found = flying_scenario(HOVER_MAP, channels, None, str(tmp_path / "flight_airframe.yaml"))
     assert "speed" not in yaml.safe_load(found.airframe)
     _, error = best_error(flown("flight", found.airframe, found.scenario))

@@ -105,9 +105,8 @@ def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
         tmp_path / "ardupilot.yaml",
         changed(load_map("ardupilot"), "inputs", "elevator", sign=-1),
     )
-    content = json.loads(
-        json.dumps(flipped.model_dump(exclude_none=True))
-    )  # lists in place of tuples, for YAML
+    # lists in place of tuples, for YAML
+    content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))
     path.write_text(yaml.safe_dump(content, sort_keys=False))
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 1
@@ -122,9 +121,8 @@ def test_channels_of_quadrotor_go_by_their_motions() -> None:
     folder = REPOSITORY / "examples" / "px4_quadrotor"
     hover, frame = load_map(str(folder / "map.yaml")), load_airframe(str(folder / "airframe.yaml"))
     Omega = frame.matrix_b()
-    np.testing.assert_array_equal(
-        through(hover, Omega), Omega
-    )  # outputs are the states, in one order
+    # outputs are the states, in one order
+    np.testing.assert_array_equal(through(hover, Omega), Omega)
     climbs = changed(hover, "inputs", "thrust", positive="climbs")  # of a raw value that sinks
     np.testing.assert_array_equal(through(climbs, Omega), Omega * [1.0, -1.0, 1.0, 1.0])
     with refusing(r"outputs\.p\.positive: found 'climbs', expected a motion to which p responds"):

@@ -106,13 +106,11 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
 def test_gains_of_theorem_1_meet_conditions() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert not gain_conditions.failing(conditions)
-    assert [condition.margin for condition in conditions[:3]] == approx(
-        [1.0, 1.0, 1.0]
-    )  # the least beta
+    # the least beta
+    assert [condition.margin for condition in conditions[:3]] == approx([1.0, 1.0, 1.0])
     assert conditions[3].margin == approx(1.5)
-    assert (conditions[4].value, conditions[4].bound) == approx(
-        (0.3, 1.0 / 3.0)
-    )  # 2 rows of 0.15; 1 - 2/3
+    # 2 rows of 0.15; 1 - 2/3
+    assert (conditions[4].value, conditions[4].bound) == approx((0.3, 1.0 / 3.0))
 
 
 @pytest.mark.equation(29, 30, "Step 2")
@@ -128,11 +126,8 @@ def test_a_condition_that_fails_is_named(
 ) -> None:
     bounds = HAND._replace(gamma_2=np.array([1.0, 1.0, 0.0]))
     good = gain_conditions.theorem_gains(bounds, np.ones(3))
-    assert good.beta.tolist() == [
-        36.0,
-        7.0,
-        3.0,
-    ]  # with Lambda = 1 the gamma_2 of the second channel is 1
+    # with Lambda = 1 the gamma_2 of the second channel is 1
+    assert good.beta.tolist() == [36.0, 7.0, 3.0]
     conditions = gain_conditions.failing(gain_conditions.check(good._replace(**change), bounds))  # type: ignore[arg-type]
     assert names(conditions, ("a", "b", "c")) == failing
 
@@ -151,9 +146,8 @@ def test_gain_that_22_does_not_allow_refused() -> None:
 def test_bounds_of_U_are_those_of_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
     places = np.array(list(product((0.0, 0.5, 1.0), repeat=4))).reshape(-1, 2, 2)
-    samples = lower + places * (
-        upper - lower
-    )  # the corners of the interval, and points between them
+    # the corners of the interval, and points between them
+    samples = lower + places * (upper - lower)
     # U_12 = W_12 - L_21 with D = I: largest with W_12 = 0.3 / 0.9, L_21 = 0, which is a corner
     assert gain_conditions.bound_U(samples)[0, 1] == approx(0.3 / 0.9)
 
@@ -168,9 +162,8 @@ def test_n_d_is_minus_D_U_v_dot() -> None:
 
 def test_airframe_with_unstable_zero_refused(osprey_gust: Scenario) -> None:
     rows = [list(row) for row in AIRFRAME.A]
-    rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = (
-        0.69  # the zero at -0.69 1/s is that entry
-    )
+    # the zero at -0.69 1/s is that entry
+    rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69
     with refusing(r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
         ideal_control.study_airframe(
             AIRFRAME.model_copy(update={"A": rows}), ideal_control.manoeuvre(osprey_gust, AIRFRAME)
@@ -186,16 +179,13 @@ def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(
     # Products of 0.63, 0.63, 0.46, 0.46 rad over total lags of 0.035 and 0.115 s. By hand in
     # flight, K of q and p were 18.
     assert_allclose(params.K, [18.0, 18.0, 0.46 / 0.035, 0.46 / 0.115])
-    assert_allclose(
-        params.Lambda[:2], [4.5, 4.5]
-    )  # a quarter of K: both have more than 45 deg of phase
-    widths = (
-        params.eps * params.K / params.beta / np.array([0.035, 0.035, 0.035, 0.115])
-    )  # T_eps in total lags
+    # a quarter of K: both have more than 45 deg of phase
+    assert_allclose(params.Lambda[:2], [4.5, 4.5])
+    # T_eps in total lags
+    widths = params.eps * params.K / params.beta / np.array([0.035, 0.035, 0.035, 0.115])
     assert_allclose(widths[:2], [2.75, 2.75])
-    assert_allclose(
-        widths[2:], 2.75 * params.K[2:] / 4.0 / params.Lambda[2:]
-    )  # both integrals slower alike
+    # both integrals slower alike
+    assert_allclose(widths[2:], 2.75 * params.K[2:] / 4.0 / params.Lambda[2:])
     slew = selected.study.slew[[0, 2, 3, 1]] / params.input_scale
     assert_allclose(params.beta, 1.25 * slew)
     assert not gain_conditions.failing(selected.engineering.loop)
@@ -222,9 +212,8 @@ def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
         osprey, SERVOS._replace(rate_limit={"thrust": 1.2})
     ).engineering
     params = limited.controller.law_params()
-    assert params.beta[3] * params.input_scale[3] == approx(
-        0.7 * 1.2
-    )  # the slew of the ideal thrust is 1.14 1/s
+    # the slew of the ideal thrust is 1.14 1/s
+    assert params.beta[3] * params.input_scale[3] == approx(0.7 * 1.2)
     assert failing_in_loop(limited) == ["beta above slew of V"]
 
 
@@ -473,6 +462,5 @@ def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
     (shown,) = json.loads(rise_di("airframes", str(own), "--json").stdout)
     assert shown["name"] == "mine"
     poles = sorted((real, abs(imaginary)) for real, imaginary in shown["poles"])
-    assert_allclose(
-        poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021
-    )  # A is printed to 3 digits
+    # A is printed to 3 digits
+    assert_allclose(poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021)

@@ -185,9 +185,8 @@ def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: flo
     assert steepest == approx(
         min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02
     )
-    assert max(params.pulses["q"].value) * speed <= GRAVITY * (
-        1.0 + 1e-9
-    )  # at most 1 g in addition to gravity
+    # at most 1 g in addition to gravity
+    assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +251,8 @@ def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
         cessna.condition, cessna.trim, cessna.responses, commands, cessna.selection, stall=30.0
     )
     log = simulate(step_identification._load(text).vary(aircraft={"gusts": {}}))["guidance"]
-    assert log["pose.psi"][-1] == approx(
-        math.pi / 2.0, abs=math.radians(2.0)
-    )  # the band of a settled heading
+    # the band of a settled heading
+    assert log["pose.psi"][-1] == approx(math.pi / 2.0, abs=math.radians(2.0))
     assert log["pose.altitude"][-1] == approx(1219.2 + 100.0, abs=5.0)  # that of a settled altitude
 
 

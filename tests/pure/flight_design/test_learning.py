@@ -231,16 +231,14 @@ def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     ticks, t = tape["internals"], tape.time("internals")
     changed = ticks.values.copy()
     changed[(t > 5.0) & (t < 6.0), ticks.names.index("mode")] = Mode.INACTIVE
-    changed[t > 2.0, ticks.names.index("age")] = (
-        0.02  # from there on y is two ticks late: an instant is that of the tick
-    )
+    # from there on y is two ticks late: an instant is that of the tick
+    changed[t > 2.0, ticks.names.index("age")] = 0.02
     cut = replace(
         tape, signals={"internals": Signal(ticks.stamp_ns[t < 9.5], ticks.names, changed[t < 9.5])}
     )
     steps = learn_again(cut, scenario(learn={"updates": [3.0]})).steps
-    assert [step.t for step in steps] == approx(
-        [3.0, 9.0], abs=0.021
-    )  # 3 s from the first tick of either engagement
+    # 3 s from the first tick of either engagement
+    assert [step.t for step in steps] == approx([3.0, 9.0], abs=0.021)
     assert [step.sentence for step in steps] == [
         f"record: found {length} s, expected 10 s" for length in (2.99, 3.01)
     ]
@@ -446,10 +444,8 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     )
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
-    learned._proposed, learned._last = (
-        0,
-        start,
-    )  # a later proposal, which lost the race with the fallback
+    # a later proposal, which lost the race with the fallback
+    learned._proposed, learned._last = (0, start)
     again = learned.propose(fallen.digest(), ["q", "V"]).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
@@ -606,9 +602,8 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
     flown: Any = late.rise_di()
     for change in tape.changes:
         flown = vary(flown, change)
-    assert flown.observer.margin == approx(
-        0.04 + 0.01, abs=0.01
-    )  # a delay within 5 ms, and its deviations
+    # a delay within 5 ms, and its deviations
+    assert flown.observer.margin == approx(0.04 + 0.01, abs=0.01)
     true, loop = late.aircraft.sampled_airframe(), Loop(np.array(flown.lag), 0.04, 0.01)
     assert is_stable(
         plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4)

@@ -117,9 +117,8 @@ def test_e_and_r_settle_on_band_of_second_order_where_conditions_hold() -> None:
 
 def test_r_is_the_error_filtered_by_Lambda() -> None:
     _, params, found = fly_example(0.0025, 6.0)
-    r = (
-        np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e
-    )  # (4), e_dot by another route than the evidence's
+    # (4), e_dot by another route than the evidence's
+    r = np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e
     settled = found.t > 0.1  # at engagement e_dot turns within a tick
     # second differences at 2.5 ms differ by less than 1 %; Lambda wrong by a tenth makes 5 % and
     # more
@@ -152,9 +151,8 @@ def test_constant_of_lemma_2_is_hand_worked_one() -> None:
 @pytest.mark.equation(3, 47)
 def test_P_stays_positive_with_constant_of_lemma_2() -> None:
     case, params, found = fly_example(0.005, 12.0)
-    assert (
-        np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9
-    )  # measured 0.93: steps 2 and 3 of the theorem hold
+    # measured 0.93: steps 2 and 3 of the theorem hold
+    assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9
     zeta_b = lemma_2(case.plant, found, params)
     flight = fly(case.plant, case.y_m, 0.005, params, case.x_0)
     P = evidence(case.plant, flight, params, zeta_b).P
@@ -168,13 +166,11 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
     _, weak, bad = fly_example(0.01, 60.0, beta=TOO_SMALL * params.beta)
     assert tail(good.e, good.t, 20.0) < 1e-3  # measured 3.3e-4
     assert tail(bad.e, bad.t, 20.0) > 0.25  # measured 0.31
-    assert bad.P[-1] < -lemma_2(
-        case.plant, good, params
-    )  # the constant that carries the good gains: -9.1 against 5.4
+    # the constant that carries the good gains: -9.1 against 5.4
+    assert bad.P[-1] < -lemma_2(case.plant, good, params)
     half = len(bad.t) // 2
-    assert bad.P[-1] - bad.P[half] < 0.5 * (
-        bad.P[half] - bad.P[0]
-    )  # and it keeps falling: -5.5, -9.1
+    # and it keeps falling: -5.5, -9.1
+    assert bad.P[-1] - bad.P[half] < 0.5 * (bad.P[half] - bad.P[0])
     with pytest.raises(ValueError, match=r"beta\[0\]: found 0.25, expected at least"):
         lemma_2(case.plant, bad, weak)
 
@@ -226,24 +222,21 @@ def test_along_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
         _, D, U = decompose(plant.C @ plant.B)
         needed = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, found.N_d.T)), axis=1)
         predicted = np.array(scenario.rise_di().omega) * needed / rate**2
-        assert np.max(np.abs(found.e), axis=0) == pytest.approx(
-            predicted, rel=0.05
-        )  # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
+        # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
+        assert np.max(np.abs(found.e), axis=0) == pytest.approx(predicted, rel=0.05)
 
 
 @pytest.mark.equation(16, 17, 18, 47)
 def test_along_osprey_P_needs_beta_above_largest_N_d() -> None:
     scenario, _, good = osprey(200.0)
     beta = np.array(scenario.rise_di().beta)
-    assert np.all(
-        np.max(np.abs(good.N_d), axis=0) < beta
-    )  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
+    # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
+    assert np.all(np.max(np.abs(good.N_d), axis=0) < beta)
     assert good.P.min() > -1e-6  # measured -3e-9 with zeta_b = beta e(0) = 0
     _, _, bad = osprey(200.0, beta_factor=0.1)
     assert bad.P[-1] < -10.0  # measured -12.3
-    assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(
-        np.abs(good.e[:, 0])
-    )  # pitch rate: 0.14 against 5.9e-4 rad/s
+    # pitch rate: 0.14 against 5.9e-4 rad/s
+    assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(np.abs(good.e[:, 0]))
 
 
 def test_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:

@@ -41,9 +41,8 @@ from flight_log.tape_writer import write_run
 pytestmark = pytest.mark.slow
 
 OSPREY = load_airframe("osprey")
-ACTUATORS = Actuation(
-    np.array([0.02, 0.1, 0.02, 0.02]), 0.0
-)  # those of osprey_servo; a flight in one process has no delay
+# those of osprey_servo; a flight in one process has no delay
+ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)
 DURATION = 36.0  # s: the commands of osprey_servo end at 33 s
 AIR: dict[str, dict[str, Any]] = {
     "calm": {"gusts": {}},

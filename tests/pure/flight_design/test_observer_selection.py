@@ -107,9 +107,8 @@ def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> No
         law = linear_law(controller.tuned_law(), 4, 0.01)
         assert selected.delay_margin >= margin
         assert is_stable(plant, law, loop, np.full(4, margin))
-        assert not is_stable(
-            plant, law, loop, np.full(4, selected.delay_margin + 0.001)
-        )  # the search ends within 0.1 ms
+        # the search ends within 0.1 ms
+        assert not is_stable(plant, law, loop, np.full(4, selected.delay_margin + 0.001))
     assert np.prod(by_rule(0.045).relaxation) > np.prod(by_rule(0.03).relaxation)
 
 
@@ -151,9 +150,8 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     )
     with refusing(r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
         with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
-    monkeypatch.setattr(
-        observer_search, "MAX_RELAXATION", 1.2
-    )  # the search up to 18 takes half a minute
+    # the search up to 18 takes half a minute
+    monkeypatch.setattr(observer_search, "MAX_RELAXATION", 1.2)
     with refusing(
         r"^--margin: delay margin \(ms\): .*, expected at least 500.*; give the loop less "
         r"delay"

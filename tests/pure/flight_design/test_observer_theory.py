@@ -583,9 +583,8 @@ def test_inside_softened_sign_error_is_N_d_over_integral_gain(seed: int) -> None
             for w in waves(seed)
         )
         predicted = N_d / (K * (1.0 + 1.0 / T_eps))
-        assert np.all(
-            np.abs(e - predicted) < 0.1 * np.abs(predicted).max()
-        )  # measured 0.06 to 0.09
+        # measured 0.06 to 0.09
+        assert np.all(np.abs(e - predicted) < 0.1 * np.abs(predicted).max())
 
 
 @pytest.fixture(scope="module")

@@ -91,9 +91,8 @@ def test_parameter_that_the_log_lacks_is_told_and_not_assumed() -> None:
         "with them yourself"
     )
     assert agreement(named_map("ardupilot"), values) == sentence
-    assert (
-        agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 0.0}) == sentence
-    )  # it may have been another one
+    # it may have been another one
+    assert agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 0.0}) == sentence
     with refusing("found RC1_REVERSED 1, expected RC1_REVERSED 0"):
         agreement(named_map("ardupilot"), values, {"RC1_REVERSED": 1.0})
 

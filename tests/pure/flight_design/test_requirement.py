@@ -201,9 +201,8 @@ def test_gains_of_osprey_meet_the_requirement() -> None:
     chosen = select_gains("osprey", "osprey_servo", samples=20).engineering
     assert not chosen.unmet
     assert {condition.name for condition in chosen.loop} >= set(NAMES)
-    of = margins(
-        SERVO.vary(controller=chosen.controller), aircraft=50, seed=9
-    )  # other aircraft than those of the selection
+    # other aircraft than those of the selection
+    of = margins(SERVO.vary(controller=chosen.controller), aircraft=50, seed=9)
     assert of.worst is not None
     assert math.degrees(of.nominal.phase.min()) >= 45.0 - 0.01
     assert math.degrees(of.worst.phase.min()) >= 30.0

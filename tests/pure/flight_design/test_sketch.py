@@ -38,9 +38,8 @@ def test_sketch_has_the_modes_of_an_aircraft(name: str) -> None:
     # phases
     assert len(oscillations) == 2
     assert 0.4 < oscillations[0] < oscillations[1] < 10.0
-    assert (
-        max(mode.real for mode in modes) < 0.1
-    )  # the spiral may grow slowly: 20 s to double are 0.035 1/s
+    # the spiral may grow slowly: 20 s to double are 0.035 1/s
+    assert max(mode.real for mode in modes) < 0.1
 
 
 def test_parts_of_sketch_do_not_couple() -> None:

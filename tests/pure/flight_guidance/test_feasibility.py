@@ -98,9 +98,8 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
     circles = [leg for leg in legs[:-1] if isinstance(leg, Arc) and leg.loiter]
     assert [circle.centre for circle in circles] == [route[0 if altitude > 1000.0 else 1].point]
     assert [waypoint.departure for waypoint in waypoints[:2]] == [max(altitude, 1000.0), altitude]
-    named = tuple(
-        waypoint._replace(leave=waypoint.altitude) for waypoint in route
-    )  # as a scenario writes each waypoint
+    # as a scenario writes each waypoint
+    named = tuple(waypoint._replace(leave=waypoint.altitude) for waypoint in route)
     assert flyable(named, RADIUS, PERIOD, CAN).legs == legs
     within = tuple(
         waypoint._replace(altitude=1000.0 + math.copysign(reach, altitude - 1000.0) * (k > 0))
@@ -124,9 +123,8 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
     match = re.search(r"route\[(\d)\]: corner cut, (\d+) m from the waypoint", note)
     assert match
     point = near[int(match[1])].point
-    drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[
-        :-38
-    ]  # without the last orbit
+    # without the last orbit
+    drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[:-38]
     between = [
         along(*ends, k / 500)
         for ends in pairwise([place[:2] for place in drawn])

@@ -123,9 +123,8 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     motion = Motion(
         np.float64(0.0), np.float64(0.0), phi, 0.0, speed, (0.0, side * wind), bank, 1e9, 0.0
     )
-    right, left = turn_clearance(
-        Fence((edge,), (-3000.0, -side * 5500.0)), motion
-    )  # home is beyond the nearest point
+    # home is beyond the nearest point
+    right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), motion)
     assert float(right if side > 0.0 else left) == approx(nearest, abs=0.5)
 
 
@@ -140,9 +139,8 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     """
     speed, bank, lag, roll_rate = 25.0, math.radians(30.0), 3.0, 0.35
     edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
-    bearing = (
-        math.radians(15.0) if phi == 0.0 else math.radians(4.0)
-    )  # the bank to the other side turns by 10 deg before
+    # the bank to the other side turns by 10 deg before
+    bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)
     home = (900.0, side * 900.0 * math.tan(bearing))
     motion = Motion(
         np.float64(0.0),
@@ -306,15 +304,13 @@ def test_outside_is_a_state_of_its_own() -> None:
         return last_safe_turn(fence, before, motion)
 
     assert (float(escape(1400.0, 0.0).action), bool(escape(1400.0, 0.0).begins)) == (BACK, True)
-    assert (
-        abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2
-    )  # south
+    # south
+    assert abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2
     assert float(escape(1400.0, HOME).action) == BACK
     assert float(escape(1290.0, BACK, math.pi).action) == BACK  # 10 m inside: less than 12.5 m
     assert float(escape(1280.0, BACK, math.pi).action) == HOME
-    assert (
-        float(escape(1290.0, HOME, math.pi).action) == HOME
-    )  # on the way home the clearance of now is enough
+    # on the way home the clearance of now is enough
+    assert float(escape(1290.0, HOME, math.pi).action) == HOME
 
 
 def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
@@ -348,9 +344,8 @@ def test_way_home_leads_round_a_zone() -> None:
         )
         place, length = place + step, length + 20.0
         least = min(least, float(clearance(fence.zones, *place)))
-        assert (
-            length < 3000.0
-        )  # the corners at 1600 m, past which the way is 3000 m at least in right angles
+        # the corners at 1600 m, past which the way is 3000 m at least in right angles
+        assert length < 3000.0
     assert least > 75.0  # half of a radius
 
 
@@ -486,9 +481,8 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)
     assert tape["guidance"]["fence.action"][-1] != 0.0
     bank = float(np.abs(tape["guidance"]["pose.phi"]).max())
-    assert float(result.mission["max.phi"][1]) == approx(
-        bank, abs=1e-3
-    )  # the turn may begin a step apart
+    # the turn may begin a step apart
+    assert float(result.mission["max.phi"][1]) == approx(bank, abs=1e-3)
     assert tape["guidance"]["fence.clearance"].min() > 0.0
     assert np.asarray(result.mission["max.breach"]).tolist() == [0.0, 0.0]
 

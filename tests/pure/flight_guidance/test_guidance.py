@@ -126,9 +126,8 @@ def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
     lag, time = path_lag(stall_speed, 154.0), loop.alpha_time
     poles = Polynomial([1.0, time, lag * time]).roots()
     assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
-    assert (
-        np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0
-    )  # a gain margin of 2.5
+    # a gain margin of 2.5
+    assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0
 
 
 def test_pitch_settles_where_angle_of_attack_estimated() -> None:
@@ -142,9 +141,8 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
 
 def test_course_approached_on_shorter_side() -> None:
     """Beyond 90 degrees the turn is the largest turn."""
-    assert (
-        course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
-    )  # to the right, over south
+    # to the right, over south
+    assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
     assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == approx(0.2 * SPEED)
     assert bank_for(GRAVITY, 0.0, 1.0) == approx(math.pi / 4.0)
@@ -183,9 +181,8 @@ def test_line_captured_from_far_at_capture_angle() -> None:
     e = cross_track(2000.0, times)
     assert np.diff(e)[100] / 0.5 == approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
     assert abs(e[-1]) < 0.01
-    assert (
-        e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping
-    )  # no limit cycle, small overshoot
+    # no limit cycle, small overshoot
+    assert e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping
 
 
 @pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
@@ -193,18 +190,16 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
     """An aircraft on the course opposite to a line turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
-    assert turn == approx(
-        math.copysign(full, -away), rel=1e-9
-    )  # a sine would leave 0.2 % of it at 179.9 deg
+    # a sine would leave 0.2 % of it at 179.9 deg
+    assert turn == approx(math.copysign(full, -away), rel=1e-9)
 
 
 @pytest.mark.parametrize("radius", [300.0, -300.0])
 def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
     """On a circle the acceleration is centripetal, and drives an offset back."""
     orbit = Arc((0.0, 0.0), radius)
-    on = path.error(
-        orbit, (300.0, 0.0)
-    )  # to the north of the centre: east on a right turn, west on a left one
+    # to the north of the centre: east on a right turn, west on a left one
+    on = path.error(orbit, (300.0, 0.0))
     assert on == approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
     assert path_acceleration(on, on.track, SPEED, FOLLOW) == approx(SPEED**2 / radius)
     outside = path.error(orbit, (320.0, 0.0))
@@ -237,9 +232,8 @@ def test_aircraft_that_slips_flies_on_circle() -> None:
     assert offset_from_a_circle(estimated=False) == approx(
         0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15
     )
-    assert (
-        abs(offset_from_a_circle(estimated=True)) < 0.01
-    )  # m, of the integration in steps of 50 ms
+    # m, of the integration in steps of 50 ms
+    assert abs(offset_from_a_circle(estimated=True)) < 0.01
 
 
 def test_roll_is_no_sideslip() -> None:
@@ -258,9 +252,8 @@ def test_gyro_bias_is_no_sideslip() -> None:
     for _ in range(1000):
         slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
     assert slip == 0.0
-    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == approx(
-        0.4
-    )  # a fifth of the turn of a bank to the left
+    # a fifth of the turn of a bank to the left
+    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == approx(0.4)
 
 
 def test_heading_is_smoothed_without_lag_across_180_deg() -> None:

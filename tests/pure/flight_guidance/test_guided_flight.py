@@ -44,18 +44,8 @@ SECTION: dict[str, Any] = {
     "throttle_authority": [3.0, 3.0],
 }
 MS = 1_000_000  # ns
-BANKED = (
-    0.1,
-    0.05,
-    0.3,
-    0.0,
-    0.0,
-    100.0,
-    25.0 * math.cos(0.3),
-    25.0 * math.sin(0.3),
-    0.0,
-    0.0,
-)  # a bank of 0.1 rad
+# a bank of 0.1 rad
+BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)
 
 
 def calm(duration: float, **section: Any) -> Scenario:
@@ -111,9 +101,8 @@ def test_route_flown_and_ends_in_orbit() -> None:
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
     assert np.unique(leg).tolist() == [0.0, 1.0, 2.0, 3.0]
     assert (np.diff(leg) >= 0.0).all()
-    assert (
-        np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0
-    )  # 0.35 s of flight, the acceptance of a route in calm air
+    # 0.35 s of flight, the acceptance of a route in calm air
+    assert np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0
     assert altitude[-1] == approx(10.0, abs=1.0)
 
 
@@ -127,9 +116,8 @@ def test_small_corner_flown_with_small_bank() -> None:
         "altitude": [0.0] * 4,
     }
     phi, xtrack = channels(simulate(calm(22.0, route=points))["guidance"], "pose.phi", "xtrack")
-    assert (
-        np.degrees(np.abs(phi).max()) < 2.0
-    )  # 0.8 deg; half a degree in the 1.1 s asks for 1.2 deg at most
+    # 0.8 deg; half a degree in the 1.1 s asks for 1.2 deg at most
+    assert np.degrees(np.abs(phi).max()) < 2.0
     assert np.abs(xtrack).max() < 1.0  # 0.4 m, in place of 6.9 m
 
 
@@ -203,9 +191,8 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
 @pytest.mark.parametrize("leg", [2.0, 0.5])
 def test_leg_that_route_does_not_have_refused(leg: float) -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
-    made.take_route(
-        section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)])
-    )  # a line and the orbit
+    # a line and the orbit
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     with pytest.raises(
         ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"
     ):
@@ -220,9 +207,8 @@ def test_new_route_voids_legs_of_program() -> None:
         flying(route=route, program=steps),
         GuidanceConfig.validate_mapping(SECTION, "guidance"),
     )
-    made.take_route(
-        section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)])
-    )  # a line and the orbit
+    # a line and the orbit
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     signal = run(made, 1, 5)
     assert signal["leg"].tolist() == [0.0] * 4
     assert signal["target.V"][-1] == 26.0
@@ -250,10 +236,8 @@ def test_route_waits_for_engagement(by: str) -> None:
     switch(on=True)
     signal = run(made, 3, 4)
     assert (signal["mode.lateral"][0], signal["leg"][0]) == (guidance_state.Lateral.ROUTE, 0.0)
-    assert (signal["target.altitude"][0], signal["target.V"][0]) == (
-        100.0,
-        25.0,
-    )  # at the begin of the leg
+    # at the begin of the leg
+    assert (signal["target.altitude"][0], signal["target.V"][0]) == (100.0, 25.0)
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
@@ -307,9 +291,8 @@ def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
     after_pause = run(made, number, number + 1, np.zeros(4))
     assert after_pause["target.phi"][0] == 0.5
     jump = abs(after_pause["u_m.p"][0] - before["u_m.p"][-1])
-    assert (
-        bool(jump <= 0.02 * 5.0 * 0.35 * (1.0 + 1e-9)) is continues
-    )  # a step of the slew limit; otherwise it starts from zero
+    # a step of the slew limit; otherwise it starts from zero
+    assert bool(jump <= 0.02 * 5.0 * 0.35 * (1.0 + 1e-9)) is continues
 
 
 def test_new_command_bounds_slew() -> None:
@@ -389,9 +372,8 @@ def test_omitted_numbers_follow_from_sections() -> None:
     section = ROUTE.guidance
     assert section is not None
     assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
-    assert section.throttle_authority == approx(
-        (3.0, 3.0), rel=1e-3
-    )  # 6 m/s^2 a unit of thrust, +-0.5
+    # 6 m/s^2 a unit of thrust, +-0.5
+    assert section.throttle_authority == approx((3.0, 3.0), rel=1e-3)
     params = section.params()
     assert (params.attitude.k_phi, params.attitude.k_theta, params.limits.floor) == (
         1.25,
@@ -497,9 +479,8 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
         simulate(ROUTE.vary(aircraft={"kinematics": "linear"}))
     with refusing("kinematics: found 'linear' beside guidance"):
         second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}))
-    assert GUIDANCE in second_stage(
-        ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True
-    )  # the autopilot flies
+    # the autopilot flies
+    assert GUIDANCE in second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True)
 
 
 @pytest.mark.parametrize(
@@ -547,6 +528,5 @@ def test_airspeed_error_limits_climb_and_sink(
     shortfall: float, expected: tuple[float, float]
 ) -> None:
     """The limits of climb and sink fall with the error of the airspeed."""
-    assert climb_range(2.0, 3.0, shortfall, 25.0) == approx(
-        expected, abs=5e-3
-    )  # d = 9.81 x 2 / (0.4 x 25) = 1.96
+    # d = 9.81 x 2 / (0.4 x 25) = 1.96
+    assert climb_range(2.0, 3.0, shortfall, 25.0) == approx(expected, abs=5e-3)

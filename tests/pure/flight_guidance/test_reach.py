@@ -92,9 +92,8 @@ def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
     bank = math.radians(10.0)
     assert u_m["r"] == approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
     held, _ = flown({"phi": 0.3}, Authority(p=0.0), phi=bank)
-    assert held.u_m[OWN.outputs.index("r")] == approx(
-        GRAVITY * math.tan(bank) / SPEED
-    )  # of a turn at this bank
+    # of a turn at this bank
+    assert held.u_m[OWN.outputs.index("r")] == approx(GRAVITY * math.tan(bank) / SPEED)
     # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank
     # of 30 deg need not.
     assert [
@@ -114,9 +113,8 @@ def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
     assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == approx(0.4 * 1.0)
     climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
     assert climbs.V_c - SPEED == approx(SPEED - sinks.V_c)
-    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == approx(
-        1.2
-    )  # m/s^2, of 1.2 rad/s
+    # m/s^2, of 1.2 rad/s
+    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == approx(1.2)
 
 
 def test_limits_are_said_once_and_end_with_the_model() -> None:

@@ -29,14 +29,10 @@ from flight_guidance.route_file import (
 )
 
 ZURICH = Origin(47.4, 8.5)
-SQUARE = [
-    (8.5, 47.4, 500.0),
-    (8.52, 47.4, 550.0),
-    (8.52, 47.42, 600.5),
-]  # longitude, latitude, altitude
-PLACES = [
-    pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE
-]  # north, east
+# longitude, latitude, altitude
+SQUARE = [(8.5, 47.4, 500.0), (8.52, 47.4, 550.0), (8.52, 47.42, 600.5)]
+# north, east
+PLACES = [pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE]
 ROUTE = [
     approx((*place, altitude), abs=1e-6)
     for place, (_, _, altitude) in zip(PLACES, SQUARE, strict=True)
@@ -430,12 +426,8 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     path.write_text(
         "route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]",
     )
-    assert [waypoint.speed for waypoint in read_route(path)] == [
-        None,
-        26.0,
-        27.0,
-        None,
-    ]  # as on the leg before
+    # as on the leg before
+    assert [waypoint.speed for waypoint in read_route(path)] == [None, 26.0, 27.0, None]
     circle = "{{north: 900, east: 0, altitude: 0, turns: {}}}"
     path.write_text(
         f"route: [[0, 0, 0], {circle.format(2)}, {circle.format(3)}, [900, 900, 0]]",
@@ -709,10 +701,8 @@ def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
         json.dumps({"type": "MultiLineString", "coordinates": parts})
     )
     waypoints = read_route(tmp_path / "r.geojson", Origin(0.0, 180.0))
-    assert [round(waypoint.east) for waypoint in waypoints] == [
-        -1113,
-        1113,
-    ]  # 0.01 deg of the equator
+    # 0.01 deg of the equator
+    assert [round(waypoint.east) for waypoint in waypoints] == [-1113, 1113]
 
 
 def test_track_is_thinned_within_tolerance(tmp_path: Path) -> None:

@@ -86,9 +86,8 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     assert isinstance(line, Line)
     assert isinstance(orbit, Arc)
     error = path.error(line, orbit.centre)
-    assert error.e == approx(
-        200.0
-    )  # the centre is one radius to the right of the line: a clockwise orbit
+    # the centre is one radius to the right of the line: a clockwise orbit
+    assert error.e == approx(200.0)
     touching = path.error(orbit, line.end)
     assert touching.e == approx(0.0, abs=1e-9)
     assert math.cos(touching.track - error.track) == approx(1.0)
@@ -289,9 +288,8 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
     assert flown.made.hold()
     assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
     flown.made.take_target({"leg": 0.0, "altitude": 120.0})
-    assert (
-        flown.at(540.0, 5.0)["target.altitude"] == 120.0
-    )  # a command of the user holds on the leg
+    # a command of the user holds on the leg
+    assert flown.at(540.0, 5.0)["target.altitude"] == 120.0
     assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
 
 
@@ -322,9 +320,8 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     route = flown.made.route
     assert route is not None
     circle = route.legs[1]
-    assert circle.end == approx(
-        (2000.0, -R), abs=10.0
-    )  # the last line touches the orbit round the last waypoint
+    # the last line touches the orbit round the last waypoint
+    assert circle.end == approx((2000.0, -R), abs=10.0)
     end = route.legs[0].end
     assert end is not None
     assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0

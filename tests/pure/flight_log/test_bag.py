@@ -55,9 +55,8 @@ def test_written_tape_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
 def test_log_has_bytes_that_library_writes_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    messages = [
-        (k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)
-    ]  # not in order of time
+    # not in order of time
+    messages = [(k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)]
     logs = []
     for name in ("ours", "library"):
         if name == "library":
@@ -207,9 +206,8 @@ def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -
     finally:
         tracemalloc.stop()
     assert messages == count
-    assert (
-        peak < 12 * size
-    )  # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
+    # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
+    assert peak < 12 * size
 
 
 def test_two_bags_in_a_folder_are_rejected(run: Path) -> None:
@@ -494,10 +492,11 @@ def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_pat
         bag.write(channel, number, 10 * number, number, data)
         bag.write(of_another, number, 10 * number + 5, number, data)
     bag.close()
+    # when they were sent
     assert read_run(tmp_path / "run").engagements == [
         Engagement(10, 30, "lost"),
         Engagement(60, None, ""),
-    ]  # when they were sent
+    ]
 
 
 def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) -> None:
@@ -543,10 +542,11 @@ def test_lost_messages_are_known_of_one_publisher_alone(
 
 def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
+    # a second one, a restarted one
     spans = {
         "/y": ("/aircraft#1", "/aircraft#2"),
         "/y_m": ("/reference_model#3", "/reference_model#9"),
-    }  # a second one, a restarted one
+    }
     for topic, (first, second) in spans.items():
         channel = bag.add_topic(topic, JOINT_STATE, "")
         later = 4 if topic == "/y" else 10

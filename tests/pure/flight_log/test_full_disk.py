@@ -106,9 +106,8 @@ def test_log_closes_where_last_chunk_would_need_larger_reserve(
 def test_end_of_file_has_reserve_until_it_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES
-    assert (
-        SIZE - free_bytes(disk) < 50_000
-    )  # freed; a file without messages and metadata.yaml remain
+    # freed; a file without messages and metadata.yaml remain
+    assert SIZE - free_bytes(disk) < 50_000
 
 
 def test_log_finished_when_another_process_fills_disk(disk: Path) -> None:

@@ -195,9 +195,8 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
     recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, indexed: bool
 ) -> None:
     log = next(Path(str(recorded.path)).glob("*.mcap")).read_bytes()
-    (tmp_path / "log.mcap").write_bytes(
-        log if indexed else log[: -len(log) // 20]
-    )  # cut: without the number of samples
+    # cut: without the number of samples
+    (tmp_path / "log.mcap").write_bytes(log if indexed else log[: -len(log) // 20])
     plain = read_run(tmp_path / "log.mcap").tape
     monkeypatch.setattr(columns, "IN_MEMORY", 1000)
     tape = read_run(tmp_path / "log.mcap").tape

@@ -93,9 +93,8 @@ def test_whole_flight_is_read_replayed_shown_and_played(
         m.data for m in messages if m.topic == "/y"
     ]
     assert all(message.stamped for message in playback.messages)
-    assert {path.name for path in whole.parent.rglob("*.yaml")} <= {
-        "metadata.yaml"
-    }  # nothing is written
+    # nothing is written
+    assert {path.name for path in whole.parent.rglob("*.yaml")} <= {"metadata.yaml"}
 
 
 COMMANDS = {

@@ -53,10 +53,8 @@ def test_step_waits_for_second_signal_of_instant_and_other_instants_do_not() -> 
     assert flight.inputs.has_y
     flight.others += [sample(STEP_NS), sample(STEP_NS + 1)]
     (instant,) = flight.instants()
-    assert (instant.now_ns, [sample.stamp_ns for sample in instant.others]) == (
-        STEP_NS,
-        [STEP_NS],
-    )  # the later one stays
+    # the later one stays
+    assert (instant.now_ns, [sample.stamp_ns for sample in instant.others]) == (STEP_NS, [STEP_NS])
     assert not flight.inputs.has_y
 
 

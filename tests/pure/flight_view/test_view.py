@@ -52,9 +52,8 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
-INTACT = {
-    "zstd_of_fifty_thousand_messages"
-}  # valid, and too large for a reader that allocates as it is told
+# valid, and too large for a reader that allocates as it is told
+INTACT = {"zstd_of_fifty_thousand_messages"}
 
 
 def decoded(
@@ -198,10 +197,8 @@ def test_late_row_kept_and_old_row_refused() -> None:
 
 def test_long_flight_becomes_coarser_in_place() -> None:
     """A flight of any length needs no large temporary arrays."""
-    rows, channels = (
-        100_000,
-        30,
-    )  # 12 MB: tracemalloc counts what threads of other tests allocate meanwhile, up to 1 MB
+    # 12 MB: tracemalloc counts what threads of other tests allocate meanwhile, up to 1 MB
+    rows, channels = (100_000, 30)
     samples, values = (
         Series(tuple(map(str, range(channels))), max_rows=rows),
         np.random.default_rng(1).normal(size=(rows, channels)),
@@ -211,9 +208,8 @@ def test_long_flight_becomes_coarser_in_place() -> None:
     samples.append(np.arange(rows, rows + 4), values[:4])
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert (
-        peak < values.astype(np.float32).nbytes / 2
-    )  # of all rows at once it would be 1.5 times that
+    # of all rows at once it would be 1.5 times that
+    assert peak < values.astype(np.float32).nbytes / 2
     groups = values.astype(np.float32).reshape(-1, 4, channels)
     assert (samples.values[: rows // 2 : 2] == groups.min(axis=1)).all()
     assert (samples.values[1 : rows // 2 : 2] == groups.max(axis=1)).all()
@@ -407,9 +403,8 @@ async def get(
 async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     """The page asks no other host."""
     async with serving(recorded) as server:
-        page = await get(
-            server, "/", token=""
-        )  # a browser sends no header with the address of a page
+        # a browser sends no header with the address of a page
+        page = await get(server, "/", token="")
         assert (page.code, page.body) == (200, FILES["index.html"].read_bytes())
         assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
         assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
@@ -422,9 +417,8 @@ async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None
         head, _ = decoded((await get(server, "/data/0")).body)
         assert (head["flight"]["name"], head["ghost"]) == ("run", False)
         assert (await get(server, "/data/1")).code == 404
-        long = await get(
-            server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}"
-        )  # more digits than Python converts
+        # more digits than Python converts
+        long = await get(server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}")
         assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
     for file in FILES.values():
@@ -683,9 +677,8 @@ async def test_websocket_without_reader_gets_few_answers(
             ).encode()
         )
         browser.sendall(bytes([0x81, 0x80 | len(TOKEN), 0, 0, 0, 0]) + TOKEN.encode())
-        browser.sendall(
-            bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000
-        )  # empty texts with a mask, RFC 6455, 5.2
+        # empty texts with a mask, RFC 6455, 5.2
+        browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)
         while not made:
             await asyncio.sleep(0.01)
         before = -1
@@ -778,9 +771,10 @@ def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> Non
         port = address.split(":")[2].partition("/")[0]
         assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel
         sockets = psutil.Process(process.pid).net_connections()
+        # no UDP: no ROS
         assert [(connection.type, connection.laddr.ip) for connection in sockets] == [
             (socket.SOCK_STREAM, "127.0.0.1")
-        ]  # no UDP: no ROS
+        ]
         process.send_signal(signal.SIGINT)
         assert process.wait(20.0) == 0
         assert process.stderr.read() == ""

@@ -102,9 +102,8 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
         assert (
             browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
         )
-        assert (
-            browser.run("location.href") == f"{address.partition('#')[0]}#"
-        )  # the token is not in the history
+        # the token is not in the history
+        assert browser.run("location.href") == f"{address.partition('#')[0]}#"
         assert browser.run("document.cookie") == ""
         browser.run("location.reload()")
         browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")  # the tab has the token
@@ -236,9 +235,8 @@ def test_surfaces_deflect_in_sense_of_input(page: Browser) -> None:
     up = np.array(seen(page, edges % "elevator: 0.3")) - still
     assert up[right_elevator, 2] < 0 > up[left_elevator, 2]  # nose up: both go up
     roll = np.array(seen(page, edges % "aileron: 0.3")) - still
-    assert (
-        roll[right_aileron, 2] < 0 < roll[left_aileron, 2]
-    )  # roll right: the right one goes up, the left one down
+    # roll right: the right one goes up, the left one down
+    assert roll[right_aileron, 2] < 0 < roll[left_aileron, 2]
     yaw = np.array(seen(page, edges % "rudder: 0.3")) - still
     assert yaw[rudder, 1] > 0  # nose right: it goes to the right
 
@@ -268,10 +266,8 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
     )
     assert (sky(level, -0.6, -0.1), sky(level, -0.6, 0.1)) == (True, False)
     assert sky(up, -0.6, 0.1)
-    assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [
-        True,
-        True,
-    ]  # the horizon falls on the left and rises on the right
+    # the horizon falls on the left and rises on the right
+    assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [True, True]
     assert [sky(roll, 0.6, y) for y in (-0.1, 0.1)] == [False, False]
 
 
@@ -311,9 +307,8 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
             "30.0 m",
         ):  # 100 m at 25 m/s
             assert text in readouts
-        assert (
-            browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"
-        )  # a guided flight shows its map
+        # a guided flight shows its map
+        assert browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"
         browser.run(SAID)
         set_camera(browser, "map")
         said = set(browser.run("said"))
@@ -334,9 +329,8 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
             "000",
         } <= said  # 3: the timeline
         browser.run("void (units.value = 'ft, kt', units.dispatchEvent(new Event('change')))")
-        browser.wait_for(
-            "['V (kt)', '48.6', '98'].every(text => said.includes(text))"
-        )  # 25 m/s and 30 m
+        # 25 m/s and 30 m
+        browser.wait_for("['V (kt)', '48.6', '98'].every(text => said.includes(text))")
         assert "98.4 ft" in browser.run("document.getElementById('readouts').innerText")
         browser.run("void (units.value = 'm, m/s', units.dispatchEvent(new Event('change')))")
         titles = browser.run(
@@ -356,9 +350,8 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
         assert browser.console == []
     with shown(browser, tmp_path / "other"):
         set_camera(browser, "map")
-        assert (
-            pixels_of(browser, "#scene", "--reference") == 0
-        )  # nothing but a route has its colour
+        # nothing but a route has its colour
+        assert pixels_of(browser, "#scene", "--reference") == 0
 
 
 SAID = """(() => {
@@ -407,9 +400,8 @@ def test_gains_are_pending_until_applied(
         assert browser.run("document.getElementById('control-desk').hidden")
         take(browser, "abcd-efgx")
         browser.wait_for(said("the control key is wrong"))
-        browser.wait_for(
-            "new Promise(resume => setTimeout(() => resume(true), 1000))"
-        )  # as long as the next key is refused
+        # as long as the next key is refused
+        browser.wait_for("new Promise(resume => setTimeout(() => resume(true), 1000))")
         take(browser)
         browser.wait_for("document.querySelectorAll('#control-gains tr').length > 10")
         slider = "document.querySelector('#control-gains [data-gain=k_g]')"
@@ -424,12 +416,12 @@ def test_gains_are_pending_until_applied(
         assert nodes.values["controller"]["k_g"] == before  # a slider sends nothing
         browser.run("void document.getElementById('control-apply').click()")
         browser.wait_for(said("applied"))
-        assert nodes.values["controller"]["k_g"] == pytest.approx(
-            1.5 * before, rel=0.01
-        )  # three digits
+        # three digits
+        assert nodes.values["controller"]["k_g"] == pytest.approx(1.5 * before, rel=0.01)
+        # a recorded one
         browser.wait_for(
             "document.getElementById('control-logged').textContent === 'not in the log yet'"
-        )  # a recorded one
+        )
         browser.run("void document.getElementById('control-undo').click()")
         browser.wait_for(said("undone"))
         assert nodes.values["controller"]["k_g"] == before

@@ -226,9 +226,8 @@ def test_charts_are_chosen_ordered_and_added(browser: Browser, routed: Path) -> 
         added = "pose/altitude, guidance/xtrack"
         browser.wait_for(f"{TITLES}.includes('{added}')")
         browser.run("window.before = true; location.reload()")
-        browser.wait_for(
-            f"!window.before && {DRAWN} > 1 && {TITLES}.includes('{added}')"
-        )  # the browser keeps it
+        # the browser keeps it
+        browser.wait_for(f"!window.before && {DRAWN} > 1 && {TITLES}.includes('{added}')")
         assert browser.run(TITLES) == [first, *rest, added]
         browser.run("void document.getElementById('choice-reset').click()")
         browser.wait_for(f"{TITLES}[0] === '{first}' && {TITLES}[1] === '{second}'")

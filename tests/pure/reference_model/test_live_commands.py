@@ -62,9 +62,8 @@ def test_command_acts_from_step_after_it_and_no_earlier() -> None:
     model = reference()
     before = model.sample(10)
     model.take(10 * 5 * MS, np.array([0.1, 0.0, 0.0, 0.0]))
-    assert np.array_equal(
-        model.sample(10), before
-    )  # y_m of the same instant has no knowledge of it
+    # y_m of the same instant has no knowledge of it
+    assert np.array_equal(model.sample(10), before)
     assert model.sample(11)[0] > 0.0
 
 
@@ -77,9 +76,8 @@ def test_bank_is_dead_reckoned_by_y_m_that_was_published_where_samples_skipped()
     for number in [*range(1, 91), *range(150, 2000)]:
         bank += (number - flown) / RATE * p
         p, flown = model.sample(number)[2], number
-    assert (
-        abs(math.degrees(bank)) < 1.0
-    )  # of an aircraft that tracks; 6 deg by the rates of the skipped samples
+    # of an aircraft that tracks; 6 deg by the rates of the skipped samples
+    assert abs(math.degrees(bank)) < 1.0
 
 
 def test_without_attitude_command_that_times_out_becomes_zero() -> None:
@@ -90,9 +88,8 @@ def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     held = model.sample(41)[2]
     assert model.source() == "ending"
     assert held > 0.05  # rad/s: 0.2 s of a reference of 5 rad/s and a command of 0.2 rad/s
-    assert (
-        np.abs(model.sample(8000)).max() < 1e-6
-    )  # 40 s: the slowest channel has a time constant of 2 s
+    # 40 s: the slowest channel has a time constant of 2 s
+    assert np.abs(model.sample(8000)).max() < 1e-6
 
 
 @pytest.mark.parametrize("outputs", [["q", "V", "p"], ["pitch", "V", "p", "r"]])

@@ -12,6 +12,7 @@ from scipy.signal import StateSpace
 
 from rise_di import own_airframe
 
+# of beta, r, p, phi in rad and s
 A = np.array(
     [
         [-0.0558, -0.9968, 0.0802, 0.0415],
@@ -19,7 +20,7 @@ A = np.array(
         [-3.05, 0.388, -0.465, 0.0],
         [0.0, 0.0805, 1.0, 0.0],
     ]
-)  # of beta, r, p, phi in rad and s
+)
 B = np.array([[0.00729, 0.0], [-0.475, 0.00775], [0.153, 0.143], [0.0, 0.0]])  # rudder, aileron
 
 

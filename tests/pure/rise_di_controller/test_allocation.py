@@ -111,9 +111,10 @@ def full_mixing(**changes: Any) -> dict[str, Any]:
     """A section controller of osprey_servo with inputs v = C B u, the inverse found here by NumPy
     alone.
     """
+    # per deg and %
     Omega = np.array(
         [[0.98, 0, 0, 0], [0.003, 0.06, 0, 0], [0, 0, 1.5, -0.02], [0, 0, -0.09, 0.17]]
-    )  # per deg and %
+    )
     unit = np.array([np.pi / 180.0, 0.01, np.pi / 180.0, np.pi / 180.0])
     Omega[[0, 2, 3]] /= unit  # q, p, r: rad/s^2 per unit, SI
     Omega[1] /= unit

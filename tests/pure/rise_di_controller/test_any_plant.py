@@ -27,10 +27,8 @@ from rise_di_controller.law import LawParams, Sign, gain
 pytestmark = pytest.mark.slow
 
 MIN_DAMPING = 0.5  # 1/s, of the aircraft and of its zero dynamics
-DURATION, SETTLED = (
-    8.0,
-    5.0,
-)  # s, length of a flight and the time at which e has settled: ten time constants of Lambda
+# s, length of a flight and the time at which e has settled: ten time constants of Lambda
+DURATION, SETTLED = (8.0, 5.0)
 DT = 0.008  # s; the tests also use half of it
 
 

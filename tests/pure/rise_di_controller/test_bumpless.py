@@ -50,10 +50,8 @@ class Loop:
         self._now_ns, self._last_ns = nanoseconds(1.0), 0
         self._active, self._has_y, self._has_y_m, self._offset = True, True, True, 0.0
         self._u, self._u_ns, self._e, self._beyond = np.zeros(4), 0, np.zeros(4), np.zeros(4)
-        self._ramp = (
-            np.zeros(4),
-            0.0,
-        )  # of the present failsafe: the largest abs(u), and the time to trim, s
+        # of the present failsafe: the largest abs(u), and the time to trim, s
+        self._ramp = (np.zeros(4), 0.0)
         self._was_active = True  # at the last tick
         self._silent_ns = 0  # time without u
         self._dt = 0.0
@@ -269,9 +267,8 @@ HELD, RAMP = 0.25, 0.4  # s, of the failsafe of the aircraft; HELD includes the 
 STEP = 0.005  # s, of the aircraft
 PUBLISHED = {"first": 0.1, "restarted": -0.1, "standby": 0.05}  # u, constant, by publisher
 LARGEST = 0.1
-FADING = (
-    (LARGEST + 2.0 * LARGEST) * STEP / RAMP
-)  # largest step of u: the ramp to trim, and the fading offset of a transfer
+# largest step of u: the ramp to trim, and the fading offset of a transfer
+FADING = (LARGEST + 2.0 * LARGEST) * STEP / RAMP
 
 
 class Applied:
@@ -365,13 +362,10 @@ class Engagement:
         self.bridge = Bridge(self._map, dry_run=False)
         self.receives = {"y": True, "u": True, "conflicting u": False}
         self._t = 0.0
-        self._u, self._received_t = (
-            0.0,
-            0.0,
-        )  # of the controller, and the instant of the last u that the bridge took
-        self._sent: tuple[FloatArray, float] | None = (
-            None  # the last u sent while ENGAGED, and the instant of receipt
-        )
+        # of the controller, and the instant of the last u that the bridge took
+        self._u, self._received_t = (0.0, 0.0)
+        # the last u sent while ENGAGED, and the instant of receipt
+        self._sent: tuple[FloatArray, float] | None = None
 
     def ticks(self, count: int) -> None:
         """Run ticks."""

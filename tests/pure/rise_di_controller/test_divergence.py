@@ -69,9 +69,8 @@ def flown(
 @pytest.mark.parametrize("frequency", [0.5, 1.7, 4.6])
 def test_limit_cycle_is_found_with_its_period(frequency: float) -> None:
     e = 0.06 * np.sqrt(2.0) * np.sin(2.0 * np.pi * frequency * T) + 0.015 * noise(1.0, 0.5)
-    assert flown(e).periods == pytest.approx(
-        1.0 / frequency, rel=0.1
-    )  # samples of 20 ms, and noise
+    # samples of 20 ms, and noise
+    assert flown(e).periods == pytest.approx(1.0 / frequency, rel=0.1)
 
 
 def test_limit_cycle_is_found_within_the_record_and_forgotten_by_the_law_of_the_start() -> None:

@@ -41,15 +41,13 @@ SERVO = CALM_SERVO.vary(
     reference_model={"pulses": {}, "coordinated_turn": None, "sines": SINES},
 )
 AIRFRAME, _ = SERVO.aircraft.load()
-OUTPUTS = [
-    AIRFRAME.outputs.index(name) for name in SERVO.controller.outputs
-]  # from the airframe's order to the law's
+# from the airframe's order to the law's
+OUTPUTS = [AIRFRAME.outputs.index(name) for name in SERVO.controller.outputs]
 INPUTS = [SERVO.controller.inputs.index(name) for name in AIRFRAME.inputs]  # and back
 LIMITS = SERVO.controller.guard().limits
 RANGE = LIMITS.upper - LIMITS.lower  # 60 deg and 100 %
-ROUNDING = (
-    1e-12 * RANGE
-)  # u is a sum of about ten terms within its range, each with a rounding error of 1e-16 of it
+# u is a sum of about ten terms within its range, each with a rounding error of 1e-16 of it
+ROUNDING = 1e-12 * RANGE
 
 
 class Conditions(NamedTuple):

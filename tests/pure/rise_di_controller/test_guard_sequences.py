@@ -36,9 +36,8 @@ LAW = CONFIG.tuned_law()
 AGE = CONFIG.guard().max_age_ns
 EXACT = 1e-12  # u is below 1: rounding is some 1e-16
 
-STAMPS = st.sampled_from(
-    [0, 0, 0, -AGE, AGE, -AGE - 1, AGE + 1, -MS, MS, -1000 * MS, 1000 * MS]
-)  # ns from the clock
+# ns from the clock
+STAMPS = st.sampled_from([0, 0, 0, -AGE, AGE, -AGE - 1, AGE + 1, -MS, MS, -1000 * MS, 1000 * MS])
 VALUES = st.sampled_from([-0.3, 0.0, 0.05, 1.0, 1e9])  # rad/s and m/s
 
 

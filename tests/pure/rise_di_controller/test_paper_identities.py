@@ -36,9 +36,8 @@ from rise_di_controller.law import LawParams, Sign, engage, gain, step
 pytestmark = pytest.mark.slow
 
 EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
-DIFFERENCED = (
-    1e-5  # central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
-)
+# central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
+DIFFERENCED = 1e-5
 
 
 class Problem(NamedTuple):
@@ -517,9 +516,8 @@ def test_beta_from_row_j_fails() -> None:
 
 @pytest.mark.equation(30)
 def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
-    assert (
-        coupled_flight(np.array([2.1 + 3.0 * 2.1, 2.1])) < 1e-3
-    )  # measured 2.4e-4, falling with dt^2
+    # measured 2.4e-4, falling with dt^2
+    assert coupled_flight(np.array([2.1 + 3.0 * 2.1, 2.1])) < 1e-3
 
 
 def lemma_1_ratio(T: float) -> float:
@@ -643,9 +641,8 @@ def test_invertible_matrix_may_lack_decomposition() -> None:
     # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
-    S, D, U = decompose(
-        np.array([[1.0, 0.0], [0.0, 1.0]])
-    )  # the same channels with the other pairing
+    # the same channels with the other pairing
+    S, D, U = decompose(np.array([[1.0, 0.0], [0.0, 1.0]]))
     assert np.array_equal([S, np.diag(D), U], [np.eye(2)] * 3)
 
 

@@ -95,9 +95,8 @@ class Flight:
 def test_proposal_flies_after_certificate_in_parts() -> None:
     flight = Flight()
     flight.receive()
-    assert (
-        flight.step() == 11
-    )  # fields, relations, zeros, filter and feedback, three delays, law, limits, names, the switch
+    # fields, relations, zeros, filter and feedback, three delays, law, limits, names, the switch
+    assert flight.step() == 11
     assert flight.sentences == ["flies model"]
     expected = RiseDiConfig.validate_mapping(START.changed(CHANGE), "expected")
     assert flight.controller.digest == expected.digest()
@@ -141,9 +140,10 @@ def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
     np.testing.assert_array_equal(
         flight.learning.authority(flight.controller), authority(flown, START)
     )
+    # of aileron, rudder
     without = with_channels_of(
         START, flown, [False, True, True, False], [False, True, False, False]
-    )  # of aileron, rudder
+    )
     assert [of(without)[name] for name in ("down.p", "up.p", "up.r")] == [0.0, 0.0, UNKNOWN]
     assert of(without)["up.q"] == of(flown)["up.q"]
 
@@ -242,9 +242,8 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
     flight.step()
     assert flight.sentences[-1] == "flies model"
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
-    assert (
-        flight.controller.parameters.input_scale[START.inputs.index("elevator")] < 1e-6
-    )  # the law moves it no more
+    # the law moves it no more
+    assert flight.controller.parameters.input_scale[START.inputs.index("elevator")] < 1e-6
 
 
 def test_second_and_late_proposals_are_refused() -> None:
@@ -306,9 +305,8 @@ def test_simulated_time_waits_for_no_proposal_of_a_deactivated_law() -> None:
 
 def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None:
     updates = Updates(LearnConfig(window=30.0, updates=(10.0, 15.0), check=12.0))
-    ticks = [
-        7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)
-    ]  # 55 s of late ticks from 7 s on
+    # 55 s of late ticks from 7 s on
+    ticks = [7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)]
     begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
     assert begins == approx([0.0, 10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
 
@@ -393,9 +391,8 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert changes(fallen, fallen_back(START, whole, longitudinal)) == {"learn.without": None}
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive(
-        CHANGE | {"observer.fade": 0.5}
-    )  # all parts, as of a learner that was started again
+    # all parts, as of a learner that was started again
+    flight.receive(CHANGE | {"observer.fade": 0.5})
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     flight.now_ns += 10 * NANOSECONDS

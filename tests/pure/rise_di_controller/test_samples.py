@@ -238,9 +238,8 @@ def test_loop_warns_of_a_lost_sample_and_of_a_new_engagement() -> None:
         RuntimeWarning, match="sample lost at t = 1.22 s: a jump of y in 0.01 s: q from 0 to 3"
     ):
         loop.step(1.22, y=jumped, y_m=zero)
-    loop.step(
-        1.23, y=jumped, y_m=zero
-    )  # the second of a row: no further warning, which a test makes an error
+    # the second of a row: no further warning, which a test makes an error
+    loop.step(1.23, y=jumped, y_m=zero)
     with pytest.warns(RuntimeWarning, match="the law engages again at t = 1.24 s: a jump of y"):
         loop.step(1.24, y=jumped, y_m=zero)
 
@@ -302,9 +301,8 @@ def test_u_is_a_number_within_its_limits_whatever_comes(
     controller, law, limits = Controller(config), config.tuned_law(), config.guard()
     state, now_ns = guard.initial_state(4), 0
     for k, (y, y_m, periods) in enumerate(rows):
-        ready = (
-            np.zeros((2, 4)) if k % 3 == 0 else np.array([y, y_m])
-        )  # zeros engage between what comes
+        # zeros engage between what comes
+        ready = np.zeros((2, 4)) if k % 3 == 0 else np.array([y, y_m])
         now_ns += periods * PERIOD_NS
         samples = [StampedVector(now_ns, value) for value in ready]
         controller.take_y(samples[0], now_ns)

@@ -37,9 +37,8 @@ def with_stops(name: str, stop: float, *, guarded: bool) -> Scenario:
     controller has these limits.
     """
     actuators = SERVO.aircraft.actuators.model_dump()
-    lower = dict(zip(INPUTS, actuators["lower"], strict=True)) | {
-        name: -stop
-    }  # all stops are symmetric
+    # all stops are symmetric
+    lower = dict(zip(INPUTS, actuators["lower"], strict=True)) | {name: -stop}
     limits = np.array([lower[key] for key in SERVO.controller.inputs])
     stops = {"lower": [*lower.values()], "upper": [-value for value in lower.values()]}
     return SERVO.vary(

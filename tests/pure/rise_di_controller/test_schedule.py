@@ -90,9 +90,8 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
         )
     instant, at_once = np.float64(1e-9), params._replace(time=np.float64(1e-9))
     y[3] += FASTER
-    moved = Measurements(
-        y, y_at(FASTER), zero, zero, zero
-    )  # the reference moved too: the same error
+    # the reference moved too: the same error
+    moved = Measurements(y, y_at(FASTER), zero, zero, zero)
     state, after = control_law.step(state, moved, instant, at_once)
     assert state.scale[0] == approx((SPEED / (SPEED + y[3])) ** 2)
     assert after == approx(u, rel=1e-6)

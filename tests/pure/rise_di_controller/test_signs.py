@@ -58,9 +58,8 @@ def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path
     right = trailing_edge_down(scenario, tmp_path).vary(
         controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0}
     )
-    sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(
-        30.0 / 60.0
-    )  # no events for q after 30 s
+    # no events for q after 30 s
+    sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(30.0 / 60.0)
     assert sixty_seconds <= 0.0022
 
 

@@ -317,9 +317,8 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
     made.propose(0)
     found, true, file = made.identification, scenario.aircraft.sampled_airframe(), OSPREY.matrix_b()
     assert found is not None
-    assert (
-        12.0 < len(found.recorded.t) * 0.01 < 18.5
-    )  # the seconds of the climb in speed are left out
+    # the seconds of the climb in speed are left out
+    assert 12.0 < len(found.recorded.t) * 0.01 < 18.5
     for entry in best_known(found.entries, true.outputs):
         place = true.index(entry.row), list(true.inputs).index(entry.column)
         assert entry.nominal == approx(file[place])

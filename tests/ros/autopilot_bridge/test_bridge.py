@@ -63,10 +63,8 @@ class BridgeSetup:
         for name in ("q", "V", "p", "r"):
             self.change_map(outputs={name: {"max_age": MAX_AGE}})
         self.peer = peer_node
-        self.sent, self.axes = (
-            0,
-            list[float](),
-        )  # messages to the autopilot, and the axes of the last one
+        # messages to the autopilot, and the axes of the last one
+        self.sent, self.axes = (0, list[float]())
         peer_node.node.create_subscription(Joy, "/ap/joy", self._take, BEST_EFFORT)
 
     def _take(self, joy: Joy) -> None:
@@ -221,9 +219,8 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
     log = read_run(run)
     assert {"y", "y_m", "u", "bridge/would_send"} <= log.tape.signals.keys()
     assert "truth" not in log.tape
-    assert (
-        "internals" not in log.tape
-    )  # the law is inactive from the start: its integrals would wind up
+    # the law is inactive from the start: its integrals would wind up
+    assert "internals" not in log.tape
     u = log.tape["u"].values
     assert not u.any()  # what is sent at an engagement: the trim
     assert len(u) > 100  # of 450
@@ -280,9 +277,8 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     tape = read_run(run).tape
     mode, t = tape["internals"]["mode"], tape.time("internals")
     delay, flies = host_delays.since(begin), t[mode == Mode.ENGAGED]
-    assert (
-        abs(engagement["start"] - flies[0]) < 1.0 + delay
-    )  # the timeout of an activation, reported when it has answered
+    # the timeout of an activation, reported when it has answered
+    assert abs(engagement["start"] - flies[0]) < 1.0 + delay
     assert engagement["stop"] - 0.1 - delay < flies[-1] < engagement["stop"] + LATE + delay
     u, t_u = tape["u"].values, tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
@@ -323,9 +319,8 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     airframe = load_airframe("osprey")
     p, aileron = list(airframe.states).index("p"), list(airframe.inputs).index("aileron")
     s = 0.5j / (channels["lag"] + channels["delay"])  # where a loop by the rules crosses 1
-    true = (
-        airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)
-    )  # lag of slow_autopilot.yaml
+    # lag of slow_autopilot.yaml
+    true = airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)
     gain = channels["Omega"] / (s + channels["damping"]) / (channels["lag"] * s + 1.0)
     # The gain of the loop, since Omega and damping alone take each other's place where messages of
     # 20 ms are late. 40 %: a loop with a phase margin of 54 degrees bears a factor of 2.

@@ -29,9 +29,8 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
     content = yaml.safe_load(MAP_FILES["ardupilot_mavlink"].read_text())
     content["link"]["url"] = f"udpin:127.0.0.1:{port}"
     for row in (content["silence"], *content["conditions"].values()):
-        row["max_age"] = (
-            5.0  # s: a release by the age of u, or by a condition, would hide that by the link
-        )
+        # s: a release by the age of u, or by a condition, would hide that by the link
+        row["max_age"] = 5.0
     for row in (*content["outputs"].values(), *content["pose"].values()):
         row["max_age"] = 2.0  # s: a host pauses for up to a second
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False))

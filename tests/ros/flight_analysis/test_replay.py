@@ -47,9 +47,8 @@ def receive_more(peer_node: Peer, count: int) -> None:
 def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    flight = start(
-        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust"))
-    )  # ended below
+    # ended below
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))
 
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
@@ -64,9 +63,8 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     peer_node.until(lambda: modes() == [Mode.INACTIVE], "the law inactive")
     receive_more(peer_node, 20)
     assert peer_node.transition(Transition.TRANSITION_CLEANUP)
-    assert peer_node.transition(
-        Transition.TRANSITION_CONFIGURE
-    )  # the law re-engages from its last u
+    # the law re-engages from its last u
+    assert peer_node.transition(Transition.TRANSITION_CONFIGURE)
     assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
     peer_node.until(lambda: modes() == [Mode.ENGAGED], "the law engaged again")
     receive_more(peer_node, 50)

@@ -176,9 +176,8 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
 
 def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:
     wrong = {"D": [-1, 1, 1, 1]}
-    scenario = scenario_file(
-        tmp_path, 60.0, "osprey_gust", controller=wrong
-    )  # no saturation limits the wrong input
+    # no saturation limits the wrong input
+    scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", "runs=runs")
     assert command.end() == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())

@@ -44,10 +44,8 @@ def test_state_of_each_process_for_late_subscriber_and_monitor_and_aircraft_that
     with peer(topics=("/one/y",)) as peer_node:
         states = received_states(peer_node, "/one/node_state")
         send = peer_node.node.create_publisher(START.type, f"/one/{START.name}", STATE)
-        expected = {
-            "controller": "ready",
-            "aircraft": "matched",
-        }  # the controller lacks the publisher of y_m
+        # the controller lacks the publisher of y_m
+        expected = {"controller": "ready", "aircraft": "matched"}
         peer_node.until(
             lambda: (
                 states

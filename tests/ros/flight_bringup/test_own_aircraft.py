@@ -105,9 +105,8 @@ def test_shells_of_page_run_to_the_last_command(
     until(follows, "a log with a command that y follows")
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(timeout=60) == 0
-    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(
-        encoding="utf-8"
-    )  # of the recorder
+    # of the recorder
+    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")
     for command in after:
         done = subprocess.run(
             ["/bin/bash", "-c", "\n".join([*common, command])],
@@ -117,9 +116,8 @@ def test_shells_of_page_run_to_the_last_command(
             timeout=120,
             check=False,
         )
-        assert done.returncode in {0, 4}, (
-            done.stdout + done.stderr
-        )  # 4: the recorder began after the controller
+        # 4: the recorder began after the controller
+        assert done.returncode in {0, 4}, done.stdout + done.stderr
     samples, q, reference = largest()
     assert samples > SAMPLES
     assert q > 0.5 * reference > 0.0  # without control q of the page's aircraft would stay 0

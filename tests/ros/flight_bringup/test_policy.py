@@ -100,10 +100,8 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
-FURTHER = {
-    "guidance": (GUIDANCE, "osprey_route"),
-    "learner": (LEARNER, "osprey_learn"),
-}  # nodes that few scenarios have
+# nodes that few scenarios have
+FURTHER = {"guidance": (GUIDANCE, "osprey_route"), "learner": (LEARNER, "osprey_learn")}
 
 
 def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
@@ -161,9 +159,8 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
     start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
     start_further(start, tmp_path, lockstep=True)
     lockstep = discovered(peer_node, (*ROLES, *FURTHER))
-    further = {
-        "guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)
-    }  # where tf2_msgs is installed
+    # where tf2_msgs is installed
+    further = {"guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)}
     empty = frozenset[str]()
     by_clock = Access(empty, frozenset({"/clock"}), empty, empty)  # by use_sim_time
     for role in lockstep:

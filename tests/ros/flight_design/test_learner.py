@@ -82,9 +82,8 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     learning = command.child("flight_design.main")
     learning.suspend()
     logged = sum(path.stat().st_size for path in (tmp_path / "runs").rglob("*.mcap"))
-    command.wait_for_log(
-        tmp_path / "runs", logged + 100_000
-    )  # the flight goes on beside the stopped learner: half a second
+    # the flight goes on beside the stopped learner: half a second
+    command.wait_for_log(tmp_path / "runs", logged + 100_000)
     learning.kill()
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")

@@ -66,9 +66,10 @@ def tools_read(run: Path, logged: Signal) -> None:
             [each for each in reader.connections if each.topic in messages]
         ):
             messages[connection.topic].append(reader.deserialize(data, connection.msgtype))
+    # 2 s at 10 Hz
     assert {topic: len(received) for topic, received in messages.items()} == dict.fromkeys(
         messages, 20
-    )  # 2 s at 10 Hz
+    )
     for odometry, imu, fix, wind in zip(*messages.values(), strict=True):
         stamp = odometry.header.stamp
         k = logged.stamp_ns.tolist().index(stamp.sec * NANOSECONDS + stamp.nanosec)
@@ -92,9 +93,8 @@ def tools_read(run: Path, logged: Signal) -> None:
         velocity = [logged[f"pose.{name}"][k] for name in ("v_east", "v_north", "climb")]
         linear = odometry.twist.twist.linear
         assert flu_in_enu @ [linear.x, linear.y, linear.z] == pytest.approx(velocity, abs=1e-9)
-        east, north, _ = pymap3d.geodetic2enu(
-            fix.latitude, fix.longitude, 0.0, *ORIGIN[:2], 0.0
-        )  # on the ellipsoid
+        # on the ellipsoid
+        east, north, _ = pymap3d.geodetic2enu(fix.latitude, fix.longitude, 0.0, *ORIGIN[:2], 0.0)
         assert (east, north, fix.altitude - ORIGIN[2]) == pytest.approx(place, abs=1e-6)
 
 
@@ -144,9 +144,8 @@ class Flight:
     def send(self) -> None:
         """One y, one pose and one sample of internals, stamped now."""
         now_ns, pose = time.time_ns(), np.array([LEVEL.get(name, 0.0) for name in POSE])
-        pose[POSE.index("v_east")] = self.rng.normal(
-            0.0, 0.01
-        )  # a pose that stands still is refused
+        # a pose that stands still is refused
+        pose[POSE.index("v_east")] = self.rng.normal(0.0, 0.01)
         self.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), "/aircraft#1"))
         self.peer.publish("pose", to_message(now_ns, POSE, pose, "/aircraft#1"))
         self.peer.publish(
@@ -215,9 +214,10 @@ def test_command_and_page_say_what_guidance_took_and_refused(
             == ""
         )
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, "a flown route")
+        # a later guidance receives no route of before
         flight.until(
             lambda: peer_node.node.count_publishers("route") == 0, "a route that is withdrawn"
-        )  # a later guidance receives no route of before
+        )
         leg = flight.last("leg")
         assert answer(client.guide, "skip") == ""
         flight.until(lambda: flight.last("leg") > leg, "the next leg")

@@ -95,9 +95,8 @@ def test_topics_of_ros_and_further_ones_recorded_with_any_offered_qos(
                 reader.deserialize(data, connection.msgtype)
             )
     assert {topic for topic, count in least.items() if len(by_topic[topic]) < count} == set()
-    assert [message.data for message in by_topic["/latched"]] == [
-        "before"
-    ]  # published before the recorder started
+    # published before the recorder started
+    assert [message.data for message in by_topic["/latched"]] == ["before"]
     assert sum(message.data == "before" for message in by_topic["/mixed"]) == 1
     texts = [message.msg for message in by_topic["/rosout"]]
     assert "logged before the recorder started" in texts
@@ -158,9 +157,8 @@ def forge_gap(domain: int, writer: bytes) -> None:
 
     DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5 with the sequence numbers from 1 on, ports 9.6.1.1.
     """
-    numbers = struct.pack(
-        "<iIiII", 0, 1, 0, 100_000, 0
-    )  # the first, the base of the set, and an empty set
+    # the first, the base of the set, and an empty set
+    numbers = struct.pack("<iIiII", 0, 1, 0, 100_000, 0)
     body = b"\0\0\0\0" + writer[12:16] + numbers
     packet = (
         b"RTPS\x02\x03\x01\x0f" + writer[:12] + struct.pack("<BBH", 0x08, 0x01, len(body)) + body

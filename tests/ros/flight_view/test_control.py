@@ -84,9 +84,8 @@ class Page:
 def test_flight_commanded_from_page_recorded_and_replayed(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    flight = start(
-        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust"))
-    )  # ended below
+    # ended below
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))
     flight.wait_for_log(tmp_path / "runs", 50_000)
     run = next(
         path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink()
@@ -113,9 +112,8 @@ def test_flight_commanded_from_page_recorded_and_replayed(
 
     assert page.post("fault", values={"sensors.bias": [0.01, 0.0, 0.0, 0.0]})[0] == 200
     assert page.post("fault", values={"actuators.faults": ["rudder stuck 0"]})[0] == 200
-    assert (
-        page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200
-    )  # 4 s: a pause of the host hides no gust
+    # 4 s: a pause of the host hides no gust
+    assert page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200
     truth = peer_node.received["truth"]
     peer_node.until(
         lambda: any(

@@ -89,9 +89,8 @@ class Law(NamedTuple):
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    initial: Gains | None = (
-        None  # of a search; None: by the lag of the loop and the constants above
-    )
+    # of a search; None: by the lag of the loop and the constants above
+    initial: Gains | None = None
     linear: bool = True  # near e = 0
 
 

@@ -66,9 +66,8 @@ class ObserverModel(NamedTuple):
     u_ff), e = H z.
     """
 
-    states: tuple[
-        str, ...
-    ]  # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
+    # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
+    states: tuple[str, ...]
     Phi: FloatArray  # (.., s, s)
     Gamma: FloatArray  # (.., s, m)
     H: FloatArray  # (m, s)

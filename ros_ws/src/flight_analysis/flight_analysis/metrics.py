@@ -32,9 +32,8 @@ MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal
 noise stay within 4 with a probability of 97 %."""
 
-MAX_DEVIATION = (
-    0.15  # of the value of an entry that the flight shows: half of the deviation before it
-)
+# of the value of an entry that the flight shows: half of the deviation before it
+MAX_DEVIATION = 0.15
 
 LONGEST_INTERVAL = 1.0
 """s. A sample stands for no longer time: a longer interval is a gap of the log, over which no
@@ -224,9 +223,8 @@ def live_commands(tape: Tape) -> list[Transient]:
     t = tape.time("u_m")
     u_m = tape["u_m"]
     commands: list[Transient] = []
-    attitude = (
-        () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)
-    )  # the attitude, which never rests
+    # the attitude, which never rests
+    attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)
     for name in [name for name in u_m.names if name not in attitude]:
         moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
         instants = t[moved]

@@ -29,9 +29,8 @@ from flight_ros.transport import DISCOVERY_VARIABLE
 
 POSE_TIMEOUT = 5.0  # s
 EXCHANGE_PERIOD = 0.1  # s
-SETTLE_TIME = (
-    1.0  # s, of exchanges after every host has been received: the least delay of many counts
-)
+# s, of exchanges after every host has been received: the least delay of many counts
+SETTLE_TIME = 1.0
 
 
 def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:

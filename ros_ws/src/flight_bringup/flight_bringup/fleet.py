@@ -118,9 +118,8 @@ class Fleet:
         """The DDS participants of a flight: the command, and the processes."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            return 1 + sum(
-                1 + scenario.learns() for scenario in scenarios
-            )  # a learner has a process of its own
+            # a learner has a process of its own
+            return 1 + sum(1 + scenario.learns() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
 

@@ -282,9 +282,8 @@ def _follow_lockstep(
     u, and a complete log.
     """
     scenario = processes.scenario
-    end = (
-        scenario.flight.duration - 1.0 / scenario.aircraft.rate
-    )  # the last instant is the aircraft's last whole period
+    # the last instant is the aircraft's last whole period
+    end = scenario.flight.duration - 1.0 / scenario.aircraft.rate
     t = 0.0
     last_change = time.monotonic()
     text = "lockstep, starting"

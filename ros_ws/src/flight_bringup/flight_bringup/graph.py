@@ -46,9 +46,8 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-NAME = re.compile(
-    r"[A-Za-z](_?[A-Za-z0-9])*"
-)  # of a namespace: stricter than ROS 2, which permits _ at the ends
+# of a namespace: stricter than ROS 2, which permits _ at the ends
+NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
 def absolute_namespace(namespace: str) -> str:
@@ -309,9 +308,8 @@ def replayed_topics(
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    published = {
-        prefix + name for name in names if not name.startswith("/")
-    }  # else others publish the topic, too
+    # else others publish the topic, too
+    published = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
         sent = (message.topic for message in autopilot.channel_map.messages.values())
         published |= {topic if topic.startswith("/") else prefix + topic for topic in sent}

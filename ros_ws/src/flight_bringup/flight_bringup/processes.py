@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
-CLOSE_TIMEOUT = (
-    30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
-)
+# s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
+CLOSE_TIMEOUT = 30.0
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
 NO_CLOCK = "/clock: no message of a simulator"
@@ -116,11 +115,8 @@ class NodeProcess:
     ) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
-        module = [
-            "-P",
-            "-m",
-            node.module,
-        ]  # -P: a package in the working folder must not replace a package of the stack
+        # -P: a package in the working folder must not replace a package of the stack
+        module = ["-P", "-m", node.module]
         command = [*end_with_parent(), sys.executable, *module]
         arguments = ["--ros-args", "--params-file", str(scenario_file)]
         if namespace:
@@ -140,10 +136,8 @@ class NodeProcess:
             arguments = [*sections, *arguments, "--params-file", str(file)]
             overrides = {}
         for name, value in overrides.items():
-            arguments += [
-                "-p",
-                f"{name}:={json.dumps(value)}",
-            ]  # JSON is YAML, and quotes what needs quotes
+            # JSON is YAML, and quotes what needs quotes
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]
         self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
             [*command, *arguments],
@@ -204,9 +198,8 @@ class FlightProcesses:
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        apart = (
-            (LEARNER,) if LEARNER in self._second and not lockstep else ()
-        )  # a search would delay ticks of its own process
+        # a search would delay ticks of its own process
+        apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()
         self._in_one_process = [
             spec.executable for spec in (*self._first, *self._second) if spec not in apart
         ]

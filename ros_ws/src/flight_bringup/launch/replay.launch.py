@@ -47,12 +47,8 @@ from flight_core.parameters import require
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
-OPTIONAL = (
-    RECORDER,
-    CONTROLLER,
-    REFERENCE_MODEL,
-    AIRCRAFT,
-)  # nodes that run when the argument of their name is true
+# nodes that run when the argument of their name is true
+OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
 
 
 def generate_launch_description() -> LaunchDescription:

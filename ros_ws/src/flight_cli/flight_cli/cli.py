@@ -29,9 +29,8 @@ FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 NICE = 10  # of a command that may run beside a flight
-GARBAGE_THRESHOLD = (
-    100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
-)
+# new objects before a collection, 700 by default: a flight keeps what it makes
+GARBAGE_THRESHOLD = 100_000
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
 GROUPS = MappingProxyType(
@@ -139,9 +138,8 @@ def main() -> None:
     if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
         with suppress(OSError):
             os.nice(NICE)
-            os.sched_setscheduler(
-                0, os.SCHED_BATCH, os.sched_param(0)
-            )  # it interrupts no node when it wakes up
+            # it interrupts no node when it wakes up
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     words = [
         *sys.argv[1:2],
         *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split(),

@@ -42,10 +42,11 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import ENDINGS, read_fence_file
 from flight_guidance.route_formats import FENCES
 
+# fields of a flight of one aircraft alone
 OF_AIRCRAFT = (
     *("settings", "in_process", "lockstep", "composed", "bridge"),
     *("send", "route", "fence", "namespace"),
-)  # fields of a flight of one aircraft alone
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -316,9 +316,8 @@ def _show_trade(console: Console, selection: Selection) -> None:
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
     shown = [display_unit(output_units[name]) for name in outputs]
-    counted = all(
-        quantity(unit).dimension in SCORE_UNIT for unit in output_units.values()
-    )  # no score of a height
+    # no score of a height
+    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
     units = score_units(outputs, output_units) if counted else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
     heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]

@@ -15,9 +15,8 @@ from flight_cli.output import new_table, say
 from flight_core.units import si_per_unit
 from flight_design.identification.step_identification import IdentifiedAircraft
 
-LINEAR = (
-    0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
-)
+# the ratio of smallest to largest slope below which an input is reported as not linear
+LINEAR = 0.8
 
 
 def show_identified(console: Console, identified: IdentifiedAircraft) -> None:

@@ -20,9 +20,8 @@ ARITHMETIC = "1"
 MAX_ANGLE = 1e6
 """Largest angle of `sine`, rad: a larger angle counts as MAX_ANGLE."""
 
-PI_HIGH = (
-    math.floor(math.pi * 2.0**28) / 2.0**28
-)  # 30 bits of pi: a product with an integer below 2^23 is exact
+# 30 bits of pi: a product with an integer below 2^23 is exact
+PI_HIGH = math.floor(math.pi * 2.0**28) / 2.0**28
 PI_LOW = 1.984187159361081e-09  # pi - PI_HIGH
 INVERSE_PI = 1.0 / math.pi
 SINE_COEFFICIENTS = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(9, 0, -1))

@@ -21,9 +21,8 @@ VERSION_FLAG = 1
 NO_NEW_PRIVS = 38  # of prctl(2)
 WRITE_FILE = 1 << 1
 TRUNCATE = 1 << 14
-CHANGES = WRITE_FILE | sum(
-    1 << bit for bit in range(4, 13)
-)  # write a file; remove and make files, folders, links, sockets
+# write a file; remove and make files, folders, links, sockets
+CHANGES = WRITE_FILE | sum(1 << bit for bit in range(4, 13))
 REFER_VERSION = 2  # of landlock
 TRUNCATE_VERSION = 3  # with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
 REFER = 1 << 13

@@ -18,10 +18,11 @@ from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
+# bytes; rclpy and a flight use 12 kB
 SHARED_MEMORY, LEAST_SHARED_MEMORY = (
     Path("/dev/shm"),  # noqa: S108
     1 << 16,
-)  # bytes; rclpy and a flight use 12 kB
+)
 LEAST_FILES = 128  # open at once in a process
 LAST_START = 2**31 - 86_400
 """s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19

@@ -59,9 +59,8 @@ class Kind(NamedTuple):
 
     expected: str  # for the sentence about a value of a different type
     takes: Callable[[Any], bool]  # whether a value has the type
-    content: Callable[
-        [Any, str, Problems], Any
-    ]  # (value of the type, key, problems) -> the value in the set
+    # (value of the type, key, problems) -> the value in the set
+    content: Callable[[Any, str, Problems], Any]
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
         """The value for the set. A value not permitted adds a sentence to `problems`."""
@@ -165,9 +164,8 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
         )
 
     def takes(value: object) -> bool:
-        return isinstance(value, Sequence) and not isinstance(
-            value, (str, bytes)
-        )  # YAML and ROS give no tuple
+        # YAML and ROS give no tuple
+        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
     return Kind("a list of values", takes, content)
 
@@ -180,11 +178,12 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
         for entered, item in value.items():
+            # a key of JSON
             is_number = (
                 parts[0] is int
                 and isinstance(entered, str)
                 and re.fullmatch(r"-?\d{1,18}", entered)
-            )  # a key of JSON
+            )
             name = int(entered) if is_number else entered
             if keys.takes(name):
                 table[keys.content(name, key, problems)] = values.read(

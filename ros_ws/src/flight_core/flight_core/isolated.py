@@ -26,9 +26,8 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 
 RESULT = "result"  # the file of the result in the working folder
-ERRORS = MappingProxyType(
-    {"ended": FlightEnded, "refused": ParameterError}
-)  # raised here as in the subprocess
+# raised here as in the subprocess
+ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})
 # times the processor time is waited for: so long may other work keep the processor from the
 # subprocess
 WAIT = 20.0
@@ -132,9 +131,8 @@ def main() -> None:
     RESULT.
     """
     timeout, memory, module, name, arguments = json.loads(sys.argv[1])
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[
-        1
-    ]  # that of the user, which no process may raise
+    # that of the user, which no process may raise
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     soft = math.ceil(float(timeout))
     resource.setrlimit(
         resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard)

@@ -10,9 +10,8 @@ INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the l
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
 LOOP_LOST = "loop lost"  # after an outcome and a comma, before the inputs and outputs
 OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how long and how far
-NOT_FLOWN = (
-    "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
-)
+# after an outcome, a comma and the legs of a route that were ahead at the end
+NOT_FLOWN = "not flown"
 NOT_JOINED = "the last orbit not joined"  # after an outcome and a comma, before how far away
 BESIDE = "outside of the touch-down zone"  # after a landing and a comma, before how far
 LANDED = " landed "  # in an outcome, between the aircraft and the time
@@ -25,9 +24,8 @@ STATUS_ENDED_EARLY = 3  # 0 completed or landed
 # completed with a loop lost, an incomplete log, a leg missed or not flown, an orbit not joined, or
 # outside of the fence, or landed outside of the touch-down zone
 STATUS_INCOMPLETE = 4
-LOST_CONTACT = (
-    "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
-)
+# before the name of the node lost: the end of a node that is not the cause
+LOST_CONTACT = "lost contact with"
 
 
 def ended_early(held: float, duration: float) -> str:

@@ -15,9 +15,8 @@ LARGEST_RATE = radians(2000.0)
 """rad/s, full scale of the gyros of autopilots: ICM-42688-P (TDK InvenSense, DS-000347), BMI088
 (Bosch, BST-BMI088-DS001)."""
 
-LARGEST_AIRSPEED = (
-    340.0  # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
-)
+# m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
+LARGEST_AIRSPEED = 340.0
 LARGEST = 1e6  # SI, of other outputs: no state of an aircraft in flight comes near
 
 BY_NAME = {"p": LARGEST_RATE, "q": LARGEST_RATE, "r": LARGEST_RATE, "V": LARGEST_AIRSPEED}

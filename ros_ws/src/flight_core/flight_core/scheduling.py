@@ -16,13 +16,10 @@ TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 THREADS = Path("/proc/self/task")
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 SLICE_NS = 100_000  # the shortest slice of Linux; by default 0.7 ms times 1 + log2 of the cores
-SCHED_SETATTR = {
-    "x86_64": 314,
-    "aarch64": 274,
-}  # numbers of the system call; glibc has no function for the call before 2.41
-ATTRIBUTES = (
-    "=IIQiIQQQ"  # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
-)
+# numbers of the system call; glibc has no function for the call before 2.41
+SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+# struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+ATTRIBUTES = "=IIQiIQQQ"
 
 
 def lower_real_time_priority(levels: int) -> None:

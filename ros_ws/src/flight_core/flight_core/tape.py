@@ -131,9 +131,8 @@ class Recording(NamedTuple):
     step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
     step_at_ns: int = 0  # the last stamp before the step
     left_out: int = 0  # messages after the step
-    lost: int | None = (
-        None  # messages that are missing by the numbers of the publisher; None without numbers
-    )
+    # messages that are missing by the numbers of the publisher; None without numbers
+    lost: int | None = None
 
 
 class Process(NamedTuple):

@@ -29,9 +29,8 @@ class Topic(NamedTuple):
 
     name: str
     message: str | type  # as "sensor_msgs/msg/JointState", or the class
-    ends: str = (
-        "->"  # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
-    )
+    # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
+    ends: str = "->"
     meaning: str = ""  # channels, units and use: Markdown
     keeps: str = HISTORY
     only_with: str = ""  # the node or section without which the topic is not recorded

@@ -53,9 +53,8 @@ INDEX_BYTES_BY_TOPIC = 10
 CHUNK_BUILDER = "_Writer__chunk_builder"
 CHUNK_INDEXES = "_Writer__chunk_indices"
 MESSAGE = int(Opcode.MESSAGE)
-MESSAGE_HEAD = struct.Struct(
-    "<BQHIQQ"
-)  # RECORD, then channel, sequence, log time and publish time (MCAP specification)
+# RECORD, then channel, sequence, log time and publish time (MCAP specification)
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
 
 
@@ -64,9 +63,8 @@ class LogAttachments(NamedTuple):
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
-    metadata: Path | None = (
-        None  # a YAML file: named sets of strings, each becomes a metadata record
-    )
+    # a YAML file: named sets of strings, each becomes a metadata record
+    metadata: Path | None = None
 
 
 @dataclass

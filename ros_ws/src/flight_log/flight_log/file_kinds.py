@@ -63,13 +63,10 @@ MAGICS = MappingProxyType(
 # POSIX.1-2017, pax, ustar Interchange Format
 TAR_PLACE = 257
 TAR = b"ustar"
-MAVLINK = (
-    b"\xfd",
-    b"\xfe",
-)  # first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
-TLOG_TIME = struct.Struct(
-    ">Q"
-)  # us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
+# first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
+MAVLINK = (b"\xfd", b"\xfe")
+# us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
+TLOG_TIME = struct.Struct(">Q")
 TLOG_YEARS = (2000, 2100)
 HEAD_BYTES = 4096
 

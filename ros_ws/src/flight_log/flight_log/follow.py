@@ -90,9 +90,8 @@ class Follower:
         self._identity = (0, 0)  # device and inode of the file, once something of it has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
-        self._finished: Iterator[object] | None = (
-            None  # records of a file of another storage, or of a packed file
-        )
+        # records of a file of another storage, or of a packed file
+        self._finished: Iterator[object] | None = None
 
     @property
     def path(self) -> Path | None:

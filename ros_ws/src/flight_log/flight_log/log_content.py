@@ -117,9 +117,8 @@ class TopicSamples:
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
-        self._restarted = self._restarted or bool(
-            np.any(steps < 0)
-        )  # another publisher, or a restarted one
+        # another publisher, or a restarted one
+        self._restarted = self._restarted or bool(np.any(steps < 0))
         fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not fits:
             self._decode_batch(more=fits)
@@ -157,9 +156,8 @@ class TopicSamples:
                     span.joined(self.spans[sender]) if sender in self.spans else span
                 )
                 if names not in self._samples:
-                    expected = (
-                        0 if self._samples else self._expected
-                    )  # other names are few, or those of a hostile log
+                    # other names are few, or those of a hostile log
+                    expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values)
             else:
@@ -207,9 +205,8 @@ class TopicSamples:
             order = np.argsort(signal.stamp_ns, kind="stable")
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
-            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(
-                axis=1
-            )  # of a part that is there twice
+            # of a part that is there twice
+            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
             keep = np.append(True, ~again)
             signal = Signal(stamps[keep], signal.names, values[keep])
         return signal

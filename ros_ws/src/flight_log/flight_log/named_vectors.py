@@ -183,9 +183,8 @@ class _JointStateDecoder:
         self._names: tuple[str, ...] = ()
         self._sender = ""
         self._template = np.zeros(0, dtype="<u4")  # the message that the layout was learnt from
-        self._constant = np.zeros(
-            0, dtype="<u4"
-        )  # 255 for the bytes that are equal in all messages of the layout, else 0
+        # 255 for the bytes that are equal in all messages of the layout, else 0
+        self._constant = np.zeros(0, dtype="<u4")
         self._values = slice(0, 0)
 
     def __call__(self, table: Table) -> Decoded:
@@ -254,9 +253,8 @@ class _JointStateDecoder:
         self._names = tuple(vector.name)
         self._values = values
         self._sender = vector.header.frame_id
-        self._template = np.frombuffer(
-            message, dtype="<u4"
-        )  # a message without velocity and effort ends with their lengths
+        # a message without velocity and effort ends with their lengths
+        self._template = np.frombuffer(message, dtype="<u4")
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = 0
         self._constant = constant.view("<u4")

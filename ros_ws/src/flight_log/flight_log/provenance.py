@@ -107,9 +107,8 @@ def revision(source: Path) -> dict[str, str]:
         ).stdout.strip()
 
     try:
-        output(
-            "ls-files", "--error-unmatch", source.name
-        )  # an installed copy may be inside another project's checkout
+        # an installed copy may be inside another project's checkout
+        output("ls-files", "--error-unmatch", source.name)
         commit = output("rev-parse", "HEAD")
         changed = output("status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):

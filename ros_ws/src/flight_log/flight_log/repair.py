@@ -187,9 +187,8 @@ class _FileScan:
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
-            os.fsync(
-                stream.fileno()
-            )  # a full disk shows here at the latest: the damaged file gets no second name then
+            # a full disk shows here at the latest: the damaged file gets no second name then
+            os.fsync(stream.fileno())
             damaged = _keep_damaged(self.path)
         return FileRepair(
             self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged

@@ -51,9 +51,8 @@ DECODE_ERRORS = (
 )
 
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
-MESSAGE = struct.Struct(
-    "<HIQQ"
-)  # channel, sequence, log time and publish time, before each message
+# channel, sequence, log time and publish time, before each message
+MESSAGE = struct.Struct("<HIQQ")
 HEAD = np.dtype(  # of RECORD and MESSAGE
     [
         ("opcode", "u1"),
@@ -64,19 +63,16 @@ HEAD = np.dtype(  # of RECORD and MESSAGE
         ("publish_ns", "<i8"),
     ]
 )
-MESSAGE_INDEX = struct.Struct(
-    "<HI"
-)  # channel and size, before the entries of a message index (MCAP specification, Message Index)
+# channel and size, before the entries of a message index (MCAP specification, Message Index)
+MESSAGE_INDEX = struct.Struct("<HI")
 INDEX_ENTRY = np.dtype([("log_ns", "<i8"), ("place", "<i8")])
 NO_PLACES = np.zeros(0, dtype=np.int64)
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
-CHUNK = struct.Struct(
-    "<QQQII"
-)  # these, size and checksum of the records, length of the compression's name before this name
+# these, size and checksum of the records, length of the compression's name before this name
+CHUNK = struct.Struct("<QQQII")
 LENGTH = struct.Struct("<Q")  # before the records of a chunk
-FOOTER = struct.Struct(
-    "<BQQQI"
-)  # opcode, length, offsets of the summary and of its offsets, checksum
+# opcode, length, offsets of the summary and of its offsets, checksum
+FOOTER = struct.Struct("<BQQQI")
 CRC = struct.Struct("<I")
 
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
@@ -132,9 +128,8 @@ class MessageBatch(NamedTuple):
     data: NDArray[np.uint8]  # (N, length)
     log_ns: NDArray[np.int64]  # (N,)
     publish_ns: NDArray[np.int64]  # (N,), 0 where the log has no time of sending
-    sequence: NDArray[
-        np.int64
-    ]  # (N,), number of the message by the publisher, 0 where the log has none
+    # (N,), number of the message by the publisher, 0 where the log has none
+    sequence: NDArray[np.int64]
 
     @property
     def sent_ns(self) -> NDArray[np.int64]:
@@ -158,9 +153,8 @@ class Scan:
         self.complete = False  # the file has its footer
         self.damaged = 0  # chunks and other parts that could not be read
         self.endless = 0  # bytes of a record that no file holds, at `position`
-        self.known_end_ns = (
-            0  # the latest log time in the index and the chunk headers, including lost messages
-        )
+        # the latest log time in the index and the chunk headers, including lost messages
+        self.known_end_ns = 0
         self.message_counts: dict[
             int, int
         ] = {}  # by channel, as the index has them; known from the first record on
@@ -323,9 +317,8 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
     chunks: list[Part] = []
     size = 0
     for part in parts:
-        is_chunk = (
-            part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size
-        )  # else it is damaged
+        # else it is damaged
+        is_chunk = part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size
         more = CHUNK.unpack_from(part.content)[2] if is_chunk else 0
         if chunks and (not is_chunk or size + more > most):
             yield chunks

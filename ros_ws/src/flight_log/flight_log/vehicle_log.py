@@ -55,9 +55,8 @@ class ParameterRecord(NamedTuple):
 Parameters = Mapping[str, tuple[ParameterRecord, ...]]
 """The records of the parameters by name, in the order of the log."""
 
-PARAMETER = (
-    "PARM"  # a message of DataFlash; the samples of each format have their parameters by this name
-)
+# a message of DataFlash; the samples of each format have their parameters by this name
+PARAMETER = "PARM"
 
 
 class Source(NamedTuple):
@@ -81,9 +80,8 @@ class Format(NamedTuple):
     sticks: Source  # its field has the number of the channel in place of {}
     servos: Source
     mode: tuple[Source, ...]
-    torques: Sources = MappingProxyType(
-        {}
-    )  # of a multicopter's rate controllers, normalised, by what responds to them
+    # of a multicopter's rate controllers, normalised, by what responds to them
+    torques: Sources = MappingProxyType({})
 
 
 def _sources(**places: tuple[Source, ...] | Source) -> Sources:
@@ -96,9 +94,8 @@ def _sources(**places: tuple[Source, ...] | Source) -> Sources:
 
 
 def _estimator(field: str, scale: float = 1.0) -> tuple[Source, ...]:
-    return tuple(
-        Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1")
-    )  # EKF3, EKF2, EKF2 of old releases
+    # EKF3, EKF2, EKF2 of old releases
+    return tuple(Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1"))
 
 
 DATAFLASH = Format(
@@ -154,9 +151,10 @@ TLOG = Format(
 
 
 def _rate(axis: int) -> tuple[Source, ...]:
+    # before 1.10
     return Source("vehicle_angular_velocity", f"xyz[{axis}]"), Source(
         "sensor_combined", f"gyro_rad[{axis}]"
-    )  # before 1.10
+    )
 
 
 ULOG_SOURCES = _sources(
@@ -197,9 +195,8 @@ class Choice(NamedTuple):
     """What a user takes of a log, and the kind of vehicle of the map."""
 
     system: int | None = None  # of a tlog; None: the system that flew
-    instances: Mapping[str, int] = MappingProxyType(
-        {}
-    )  # by message; else the sensor or the part that flew
+    # by message; else the sensor or the part that flew
+    instances: Mapping[str, int] = MappingProxyType({})
     vehicle: str = PLANE
 
 

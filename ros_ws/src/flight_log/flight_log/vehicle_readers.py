@@ -106,9 +106,8 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
                     message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us)
                 )
                 stamp_ns = min(round(1e3 * stamp_us), LARGEST)
-                number = int(
-                    getattr(message, "I", 0) or getattr(message, "C", 0)
-                )  # of the sensor or the core
+                # of the sensor or the core
+                number = int(getattr(message, "I", 0) or getattr(message, "C", 0))
                 if name == PARAMETER:
                     yield SETTING, stamp_ns, (message.Name, float(message.Value))
                 else:
@@ -232,9 +231,8 @@ def _dated(received: list[Received]) -> Iterator[Sample]:
     by_arrival = len(times) <= LEAST_TIMES * len(timed)
     offset_ns = 0 if not timed else timed[0].arrival_ns - 1_000_000 * timed[0].content.time_boot_ms
     newest_ns = timed[0].arrival_ns if timed else 0
-    recent = deque[tuple[int, int | None]](
-        maxlen=RECENT
-    )  # sequences and stamps; None of a message that came before
+    # sequences and stamps; None of a message that came before
+    recent = deque[tuple[int, int | None]](maxlen=RECENT)
     arrivals: dict[tuple[str, int], int] = {}  # by name and time
     for name, sequence, arrival_ns, content in received:
         stamp_ns: int | None

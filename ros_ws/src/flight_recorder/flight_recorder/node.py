@@ -59,23 +59,16 @@ from flight_ros.topics import (
     Y,
 )
 
-FLUSH_PERIOD_NS = nanoseconds(
-    0.1
-)  # the longest loss when the recorder is killed; also the period of the graph checks
+# the longest loss when the recorder is killed; also the period of the graph checks
+FLUSH_PERIOD_NS = nanoseconds(0.1)
 DISK_PERIOD_NS = NANOSECONDS
 MEGABYTE = 1e6
 
 LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
-STEADY = (
-    Y,
-    Y_M,
-    U,
-    INTERNALS,
-    TRUTH,
-    POSE,
-)  # topics that no mode of a flight stops while the publisher runs
+# topics that no mode of a flight stops while the publisher runs
+STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)
 # a topic is steady after so many messages at such intervals
 STEADY_MESSAGES = 20
 STEADY_INTERVAL_NS = NANOSECONDS // 5
@@ -122,9 +115,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._bag = self._open_bag()
         self._topics: list[_RecordedTopic] = []
         for topic in FLIGHT:
-            qos = (
-                RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
-            )  # ROS 2 keeps the lines of the log
+            # ROS 2 keeps the lines of the log
+            qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
             self._topics.append(self._record(self._poll(topic, qos), [PUBLISH]))
         recorded = {topic.name for topic in self._topics}
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]

@@ -26,9 +26,8 @@ def start_middleware() -> None:
     """
     transport.prepare()
     try:
-        rclpy.init(
-            signal_handler_options=SignalHandlerOptions.NO
-        )  # the command handles SIGINT, not rclpy
+        # the command handles SIGINT, not rclpy
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except ARGUMENT_ERRORS as error:
         raise ParameterError(
             f"ROS 2: does not start ({' '.join(str(error).split())}), expected its environment"
@@ -45,9 +44,8 @@ class Client:
     def __init__(
         self, name: str, namespace: str = "", parent: "Client | None" = None, *, rosout: bool = True
     ) -> None:
-        self._started = (
-            parent is None and not rclpy.ok()
-        )  # the first client of a process starts and ends the middleware
+        # the first client of a process starts and ends the middleware
+        self._started = parent is None and not rclpy.ok()
         if parent is None:
             if self._started:
                 start_middleware()

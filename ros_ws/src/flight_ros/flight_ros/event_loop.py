@@ -37,13 +37,11 @@ from flight_ros.simulated_time import ClockRestarted
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
-PEER_TIMEOUT_NS = (
-    30 * NANOSECONDS
-)  # of a lockstep flight that never begins, or that waits after a refused sample
+# of a lockstep flight that never begins, or that waits after a refused sample
+PEER_TIMEOUT_NS = 30 * NANOSECONDS
 
-SERVICE_POLL_PERIOD = (
-    0.1  # s, between two checks of liveliness and service calls in lockstep, and of several nodes
-)
+# s, between two checks of liveliness and service calls in lockstep, and of several nodes
+SERVICE_POLL_PERIOD = 0.1
 
 LATE_REQUEST_PAUSE = 10
 """Time without requests after one that delayed a tick, over its duration. The middleware blocks for
@@ -106,9 +104,8 @@ def _make_nodes(
         if early_participant is not None:
             destroy_participant(early_participant)
     except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
-        is_stack_error = isinstance(
-            error, ParameterError | FlightEnded
-        )  # one sentence; those of rclpy have several lines
+        # one sentence; those of rclpy have several lines
+        is_stack_error = isinstance(error, ParameterError | FlightEnded)
         print(
             f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr
         )

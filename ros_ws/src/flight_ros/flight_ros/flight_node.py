@@ -48,22 +48,19 @@ S = TypeVar("S", bound=Sample)
 
 NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one after another
 
-ACKNOWLEDGE_TIMEOUT = Duration(
-    seconds=0.5
-)  # at the end of a lockstep flight, for the last messages to arrive
+# at the end of a lockstep flight, for the last messages to arrive
+ACKNOWLEDGE_TIMEOUT = Duration(seconds=0.5)
 
 WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without samples
 
-MAX_START_AGE_NS = (
-    10 * NANOSECONDS
-)  # a late node catches up with its missed ticks, but not with hours
+# a late node catches up with its missed ticks, but not with hours
+MAX_START_AGE_NS = 10 * NANOSECONDS
 
 SIM_TIME = "use_sim_time"
 AT_START = "no change: a node chooses its clock when it starts"
 
-CLOCK_STEP_NS = (
-    NANOSECONDS // 20
-)  # slewing moves a clock by less than 0.01 s in the second between two checks
+# slewing moves a clock by less than 0.01 s in the second between two checks
+CLOCK_STEP_NS = NANOSECONDS // 20
 
 
 class FlightNode(Node, Generic[P]):

@@ -24,9 +24,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
-ENCAPSULATION = (
-    b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
-)
+# plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
+ENCAPSULATION = b"\x00\x01\x00\x00"
 BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
     {b"\x00\x00": "big", b"\x00\x01": "little"}
 )
@@ -82,9 +81,8 @@ class Encoder:
             self._align(8)
         self.place = len(self._bytes)  # offset of the values
         self._values = slice(self.place, self.place + 8 * len(names))
-        self._bytes += bytes(
-            8 * len(names) + 2 * COUNT.size
-        )  # an empty velocity and an empty effort follow
+        # an empty velocity and an empty effort follow
+        self._bytes += bytes(8 * len(names) + 2 * COUNT.size)
 
     def _align(self, size: int) -> None:
         self._bytes += bytes(-(len(self._bytes) - len(ENCAPSULATION)) % size)

@@ -47,7 +47,6 @@ def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
 
 
 def _duration(duration: Duration) -> dict[str, int]:
-    sec, nsec = divmod(
-        duration.nanoseconds or INFINITE_NS, NANOSECONDS
-    )  # 0 stands for an unset duration
+    # 0 stands for an unset duration
+    sec, nsec = divmod(duration.nanoseconds or INFINITE_NS, NANOSECONDS)
     return {"sec": sec, "nsec": nsec}

@@ -19,9 +19,8 @@ from flight_core.text import bounded
 
 Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
 
-DeserializationError = (
-    _rclpy.RMWError
-)  # the exception of `deserialize_message` for bytes that are not a message of the type
+# the exception of `deserialize_message` for bytes that are not a message of the type
+DeserializationError = _rclpy.RMWError
 
 ARGUMENT_ERRORS = (
     ParameterException,

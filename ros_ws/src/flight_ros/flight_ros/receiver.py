@@ -55,9 +55,8 @@ class Refusals:
     """The refused samples of a node."""
 
     def __init__(self, node: Node, clock_of: Callable[[str], str] = lambda sender: "") -> None:
-        self.clock_of = (
-            clock_of  # the end of a sentence on the stamp of a sender whose clock differs
-        )
+        # the end of a sentence on the stamp of a sender whose clock differs
+        self.clock_of = clock_of
         self.counts: Counter[str] = Counter()  # by "topic: reason"
         self.last: dict[
             str, tuple[int, str]

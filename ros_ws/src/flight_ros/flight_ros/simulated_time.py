@@ -18,9 +18,8 @@ from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
 
-LARGEST_JUMP_NS = (
-    60 * NANOSECONDS
-)  # /clock may be lost for so long; a node then catches up with its missed ticks
+# /clock may be lost for so long; a node then catches up with its missed ticks
+LARGEST_JUMP_NS = 60 * NANOSECONDS
 LONGEST_WAIT_NS = NANOSECONDS // 50  # so that signals and service calls are handled in a pause
 SILENT_NS = NANOSECONDS  # without a message of /clock, before a node says that it waits
 HISTORY = 4096  # messages of /clock, by which the instants of other messages are known

@@ -10,9 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-SPIN_TIME = (
-    2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
-)
+# s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+SPIN_TIME = 2.5e-4
 MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
 
 
@@ -113,9 +112,8 @@ class TickTimes:
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:
                 values = np.sort(times) * 1e-9
-                nearest = (
-                    math.ceil(0.99 * len(values)) - 1
-                )  # np.percentile would import numpy.ma inside a tick
+                # np.percentile would import numpy.ma inside a tick
+                nearest = math.ceil(0.99 * len(values)) - 1
                 report |= {
                     f"{key} mean (s)": f"{values.mean():.6f}",
                     f"{key} p99 (s)": f"{values[nearest]:.6f}",

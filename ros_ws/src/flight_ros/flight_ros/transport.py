@@ -55,9 +55,8 @@ def open_to_network() -> list[str]:
     import psutil  # noqa: PLC0415 - see flight_ros.startup
 
     process = psutil.Process()
-    connections = (
-        getattr(process, "net_connections", None) or process.connections
-    )  # before psutil 6: Ubuntu 24.04 has 5.9
+    # before psutil 6: Ubuntu 24.04 has 5.9
+    connections = getattr(process, "net_connections", None) or process.connections
     sockets = connections(kind="udp")
     return [
         f"{s.laddr.ip}:{s.laddr.port}"

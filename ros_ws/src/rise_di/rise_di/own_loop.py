@@ -63,9 +63,8 @@ class Loop:
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
-        self.output: ControlOutput | None = (
-            None  # of the last tick; None where nothing is to be sent
-        )
+        # of the last tick; None where nothing is to be sent
+        self.output: ControlOutput | None = None
         self.lost = ""  # why a sample of the last tick is lost; empty where none is
 
     @property
@@ -297,9 +296,8 @@ def as_control(
     p = 0 if guard.allocation is None else len(names)
     start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
     sizes = [value.size for value in start.values()]
-    offset = np.concatenate(
-        [value.ravel() for value in start.values()]
-    )  # so that x = 0 is the engagement in trim
+    # so that x = 0 is the engagement in trim
+    offset = np.concatenate([value.ravel() for value in start.values()])
     ends = np.cumsum(sizes)
 
     def tick(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -63,10 +63,8 @@ SLACK = 0.05
 """s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each.
 Host scheduling delays (`Flight.host_delay`) are allowed in addition."""
 
-REFUSAL_PERIOD, QOS_PERIOD = (
-    2.1,
-    5.1,
-)  # s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
+# s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
+REFUSAL_PERIOD, QOS_PERIOD = (2.1, 5.1)
 REPORT = 1.0  # s, the period of the diagnostics
 DISCOVERY = 0.5  # s, of a new node by all others
 # s, from being ready to full traffic, and until a recorder has received the history of the
@@ -219,9 +217,8 @@ def restart(flight: Flight, role: str) -> None:
     traffic = flight.until(
         lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}"
     )
-    traffic = max(
-        traffic, ready
-    )  # the first tick of a recorder writes what it received before it was ready
+    # the first tick of a recorder writes what it received before it was ready
+    traffic = max(traffic, ready)
     flight.end = ready
     flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
     flight.measured |= {"exec_to_ready": ready - started, "start_run": run, "start_waited": waited}
@@ -457,9 +454,8 @@ CONSUMERS = {
 CONSUMERS["proposal"] = "controller"
 
 Names = tuple[str, ...]
-BadSample = tuple[
-    float, Names, FloatArray
-]  # the offset of its stamp from the present, s; names; values
+# the offset of its stamp from the present, s; names; values
+BadSample = tuple[float, Names, FloatArray]
 
 
 def not_finite(values: tuple[float, ...], names: Names, random: Generator) -> BadSample:
@@ -628,12 +624,10 @@ def incompatible_qos(
     return inject
 
 
-WEAK = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)  # the recorder requests a reliable publisher of y
-STRONG = QoSProfile(
-    depth=1, deadline=Duration(seconds=0.02)
-)  # the controller does not offer a deadline for u
+# the recorder requests a reliable publisher of y
+WEAK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+# the controller does not offer a deadline for u
+STRONG = QoSProfile(depth=1, deadline=Duration(seconds=0.02))
 UNRELIABLE = logs("recorder", r"/y: .*/peer .*[Rr]eliab")
 DEADLINE = logs("controller", r"/u: .*/peer.*[Dd]eadline")
 weaker_qos = incompatible_qos(
@@ -755,9 +749,8 @@ def parameters(flight: Flight, random: Generator) -> None:
         peer_node.until(client.service_is_ready, "the service of parameters")
         k_g = load_scenario(flight.scenario).rise_di().k_g
         first = request("k_g", k_g)
-        peer_node.until(
-            first.done, "the first answer"
-        )  # both ends of the service have discovered each other
+        # both ends of the service have discovered each other
+        peer_node.until(first.done, "the first answer")
         flight.begin_fault()
         futures: list[Any] = []
         done = 0
@@ -767,10 +760,8 @@ def parameters(flight: Flight, random: Generator) -> None:
             while done < len(futures) and futures[done].done():
                 done += 1
             while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
-                lower = (
-                    "k_g",
-                    k_g * float(random.uniform(0.8, 1.0)),
-                )  # a larger one may cost an observer's loop its margin
+                # a larger one may cost an observer's loop its margin
+                lower = ("k_g", k_g * float(random.uniform(0.8, 1.0)))
                 futures.append(request(*(lower if valid[len(futures)] else invalid_change(random))))
 
         feed()

@@ -17,9 +17,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 
 Row = dict[str, str | int | float | bool | None]
-LINES = (
-    12  # of an error in a row: what failed, and the first output of a process that did not answer
-)
+# of an error in a row: what failed, and the first output of a process that did not answer
+LINES = 12
 
 
 def described(error: BaseException) -> str:

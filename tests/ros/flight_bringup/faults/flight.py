@@ -92,9 +92,8 @@ ROLES = {
 }
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 ROSOUT = Topic("/rosout", Log)
-TRUE_POSE = Topic(
-    "true_pose", POSE.type
-)  # of the aircraft in a guided flight: a gate relays it as `pose`
+# of the aircraft in a guided flight: a gate relays it as `pose`
+TRUE_POSE = Topic("true_pose", POSE.type)
 TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
 
 
@@ -115,10 +114,8 @@ MAX_AGE = 0.1  # s, of y and y_m, as in the default scenario
 RATE = 200.0  # Hz, of aircraft and reference model
 U_MAX_AGE = 0.2  # s, of u, the aircraft's default
 LEVEL = 0.01  # rad, of wings
-HOLD, RAMP = (
-    0.2,
-    0.3,
-)  # s, of both failsafes: shorter than the defaults, so that a case sees all of them
+# s, of both failsafes: shorter than the defaults, so that a case sees all of them
+HOLD, RAMP = (0.2, 0.3)
 
 TRACKING = 0.05
 """rad/s, m/s. On an idle host the loop stays within 0.001 of trim, on one with five times its load
@@ -171,9 +168,8 @@ class Probe:
         self.monitored: list[
             Process
         ] = []  # their scheduling delays are sampled once they are ready
-        self.delays: deque[tuple[float, float]] = deque(
-            maxlen=BUFFER_SIZE
-        )  # when, and the longest since the sample before, s
+        # when, and the longest since the sample before, s
+        self.delays: deque[tuple[float, float]] = deque(maxlen=BUFFER_SIZE)
         self._waited_ns: dict[int, int] = {}
         self._changed = threading.Condition()
         self._closed = False
@@ -346,12 +342,10 @@ class ExpectedLog(NamedTuple):
     """What the log must hold of the time of a fault."""
 
     internals: set[bytes]  # of the flight's own controllers, except `last`
-    lines: set[
-        tuple[str, str]
-    ]  # node and log line, except those right before the end of a killed node
-    last: list[
-        list[bytes]
-    ]  # for each killed node its `internals` right before the end, in their order
+    # node and log line, except those right before the end of a killed node
+    lines: set[tuple[str, str]]
+    # for each killed node its `internals` right before the end, in their order
+    last: list[list[bytes]]
 
 
 class Killed(NamedTuple):

@@ -41,13 +41,8 @@ QUIET = 0.02
 are made that hold under any delay, and the delay is added to the time limits."""
 
 EXACT = 1e-12  # of values that are copied, or multiplied once
-CONTINUING = (
-    "y",
-    "y_m",
-    "u",
-    "truth",
-    "internals",
-)  # topics through a fault that does not concern u
+# topics through a fault that does not concern u
+CONTINUING = ("y", "y_m", "u", "truth", "internals")
 SETTLING = 0.2  # s, until the effect of a fault on u shows
 
 
@@ -160,23 +155,20 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     reaction = None
     if case.detection is not None:
         detected = flight.until(lambda: case.detection(flight), case.within + 3.0, "detected")  # type: ignore[misc]
-        reaction = max(
-            detected - flight.begin, 0.0
-        )  # the message of the detection may overtake that of the fault
+        # the message of the detection may overtake that of the fault
+        reaction = max(detected - flight.begin, 0.0)
     engaged = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
     host_delay = flight.host_delay(flight.begin - 0.1, engaged + SETTLING)
-    slack = SLACK + case.host_delays * host_delay * (
-        case.response is not Response.LATE
-    )  # there the delay is the fault
+    # there the delay is the fault
+    slack = SLACK + case.host_delays * host_delay * (case.response is not Response.LATE)
     recovery = max(engaged - flight.end, 0.0)
     if reaction is not None:
         allowed = case.within + slack
         assert reaction <= allowed, f"detected after {reaction:.3f} s, allowed {allowed:.3f} s"
     # A node starts again, and catches up, in many shares of a busy processor: their delays add up.
     allowed = case.recovery + max(slack, SLACK + flight.waited(flight.end, engaged))
-    disturbed = (
-        case.response is Response.UNCHANGED and host_delay > QUIET
-    )  # by the host, during the fault or later
+    # by the host, during the fault or later
+    disturbed = case.response is Response.UNCHANGED and host_delay > QUIET
     assert recovery <= allowed or disturbed, (
         f"engaged {recovery:.3f} s after the fault, allowed {allowed:.3f} s"
     )
@@ -217,9 +209,8 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     if Mode.TRIM not in ticks.modes:  # else the failsafe was over, and the publisher lock free
         assert not flight.foreign_y(flight.begin, until)
         assert np.abs(ticks.y_m).max() <= USUAL
-    starved = (
-        window.host_delay > MAX_AGE
-    )  # by a storm that uses up the processors: the failsafe may act
+    # by a storm that uses up the processors: the failsafe may act
+    starved = window.host_delay > MAX_AGE
     assert starved or np.abs(ticks.y).max() <= USUAL
     if (
         flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None
@@ -354,10 +345,8 @@ def check_released(case: Case, flight: Flight, window: Window) -> None:
     check_pauses(flight, ("y_m",), window.engaged, window)
 
 
-MAX_BANK, MAX_LEVEL_BANK = (
-    np.radians(45.0),
-    np.radians(5.0),
-)  # of the ending of u_m, at any time and after LEVEL
+# of the ending of u_m, at any time and after LEVEL
+MAX_BANK, MAX_LEVEL_BANK = (np.radians(45.0), np.radians(5.0))
 
 
 def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
@@ -369,9 +358,8 @@ def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
     """
     host_delay = flight.host_delay(flight.begin - 0.1, flight.begin + LEVEL)
     roll_rate = load_scenario(flight.scenario).reference_model.live.roll_rate
-    untracked = (
-        2.0 * roll_rate * host_delay if host_delay > MAX_AGE else 0.0
-    )  # below it the law stays engaged
+    # below it the law stays engaged
+    untracked = 2.0 * roll_rate * host_delay if host_delay > MAX_AGE else 0.0
     t, phi = flight.bank(flight.begin, flight.begin + LEVEL)
     flight.measured["bank_deg"] = float(np.degrees(np.abs(phi).max()))
     flight.measured["last_bank_deg"] = float(np.degrees(np.abs(phi[-1])))

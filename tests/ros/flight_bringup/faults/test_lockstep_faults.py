@@ -83,9 +83,8 @@ def fly_with_a_fault(
     """A lockstep flight with a fault at a random instant."""
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}")
     folder = scenario.parent / runs
-    command.wait_for_log(
-        folder, 200_000
-    )  # bytes: the flight has begun, and a chunk of the log is complete
+    # bytes: the flight has begun, and a chunk of the log is complete
+    command.wait_for_log(folder, 200_000)
     time.sleep(random.uniform(0.0, FASTEST))  # the instant of the fault is anywhere in the flight
     victim = command.child(MODULES[role])
     if kills:

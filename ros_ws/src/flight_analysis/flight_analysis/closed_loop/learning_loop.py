@@ -105,9 +105,8 @@ class Identifications:
             return None
         self._last = identification
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
-        self._names = self._names or tuple(
-            entries
-        )  # a topic keeps its channels: those of the rough airframe
+        # a topic keeps its channels: those of the rough airframe
+        self._names = self._names or tuple(entries)
         return learned(
             (entries[name] for name in self._names),
             self._outputs,

@@ -30,10 +30,8 @@ from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
 
 SHOWN_CHANGES = 20  # of the parameters, in the notes
 
-U_PREFIXES = (
-    "u.",
-    "published.",
-)  # prefixes of the channels of u, from `internals` and from the topic `u`
+# prefixes of the channels of u, from `internals` and from the topic `u`
+U_PREFIXES = ("u.", "published.")
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
 
@@ -65,13 +63,11 @@ class ReplayResult(NamedTuple):
     recorded: FloatArray  # (N, k)
     computed: FloatArray  # (N, k), NaN where nothing was computed
     checked: NDArray[np.bool_]  # (N,), whether the state before the tick is known
-    other_parameters: NDArray[
-        np.bool_
-    ]  # (N,), whether the recorded controller had other parameters
+    # (N,), whether the recorded controller had other parameters
+    other_parameters: NDArray[np.bool_]
     notes: tuple[str, ...]
-    published: NDArray[np.bool_] | None = (
-        None  # (N,), whether y and u of the tick are on their topics
-    )
+    # (N,), whether y and u of the tick are on their topics
+    published: NDArray[np.bool_] | None = None
 
     @property
     def compared(self) -> NDArray[np.bool_]:

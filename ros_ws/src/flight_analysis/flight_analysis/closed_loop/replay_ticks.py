@@ -24,9 +24,8 @@ COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
 
 
-Change = Mapping[
-    str, Any
-]  # parameters of the controller by dotted name that were changed in flight at one instant
+# parameters of the controller by dotted name that were changed in flight at one instant
+Change = Mapping[str, Any]
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
@@ -268,9 +267,8 @@ def _as_published(
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)
     for k, stamp in enumerate(stamp_ns.tolist()):
-        candidates = rows.get(
-            stamp, []
-        )  # two if a failsafe u has the stamp of a y that arrived later
+        # two if a failsafe u has the stamp of a y that arrived later
+        candidates = rows.get(stamp, [])
         matched[k] = bool(candidates)
         if candidates and not any(
             published[row].tobytes() == values[k].tobytes() for row in candidates

@@ -25,9 +25,8 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-RECORDER_RATE = (
-    100.0  # Hz, of a scenario without the section `recorder`: that of the shipped scenarios
-)
+# Hz, of a scenario without the section `recorder`: that of the shipped scenarios
+RECORDER_RATE = 100.0
 STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]

@@ -93,9 +93,8 @@ class Topics:
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
         """Record a sample, then call the subscribers. Raises ChannelError for a missing channel."""
         if self._recorded:
-            self._stamps[topic].append(
-                sample.stamp_ns
-            )  # first: an interrupt before the next line leaves a stamp without a row
+            # first: an interrupt before the next line leaves a stamp without a row
+            self._stamps[topic].append(sample.stamp_ns)
             self._rows[topic].append(sample.value)
         for channels, take in self._subscriptions.get(topic, ()):
             wanted = (

@@ -63,17 +63,14 @@ NOISE_FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
 INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals` and their labels
 MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
-FREQUENCIES = [
-    digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))
-]  # Hz, ticks of a spectrum
-MIN_VISIBLE_FRACTION = (
-    1 / 500
-)  # of the axis, about two pixels: shorter intervals are lengthened to it
+# Hz, ticks of a spectrum
+FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
+# of the axis, about two pixels: shorter intervals are lengthened to it
+MIN_VISIBLE_FRACTION = 1 / 500
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
-Limits = Mapping[
-    str, tuple[float, float]
-]  # lower and upper limit by input, SI; infinite without a limit
+# lower and upper limit by input, SI; infinite without a limit
+Limits = Mapping[str, tuple[float, float]]
 
 Runs = Mapping[str, tuple[Tape, int]]  # tape and period of the ticks in ns, by label of the flight
 

@@ -25,11 +25,12 @@ from flight_core.outcome import (
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Tape
 
+# of an outcome
 SHORTFALL = re.compile(
     rf", (?:{LOOP_LOST}: |{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{NOT_JOINED}|"
     rf"{BESIDE}|{INCOMPLETE}).*",
     re.DOTALL,
-)  # of an outcome
+)
 
 
 def final_outcome(outcome: str, account: Account) -> str:

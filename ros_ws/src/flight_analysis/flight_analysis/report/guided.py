@@ -65,9 +65,8 @@ class FlownLeg(NamedTuple):
     start: float  # s, from then on the aircraft is under way to the leg
     joined: float | None  # s, from then on the aircraft is on the leg; None: never
     stop: float  # s
-    result: (
-        str  # "flown", "missed", or "not ended": by another command, or by the end of the flight
-    )
+    # "flown", "missed", or "not ended": by another command, or by the end of the flight
+    result: str
     missed: float  # m, distance from the end of a missed leg; else 0
 
 
@@ -100,9 +99,8 @@ def segments(tape: Tape) -> list[Segment]:
     ]
     columns = np.column_stack([log[name] for name in named])
     follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
-    columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = (
-        0.0  # they change along the leg
-    )
+    # they change along the leg
+    columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = 0.0
     changes = np.any(np.diff(columns, axis=0) != 0.0, axis=1)
     starts = [0]
     for k in np.flatnonzero(changes) + 1:

@@ -43,9 +43,8 @@ MODE_SHADES = {
     Mode.POSE_LOST: MODE_COLOURS[ControllerMode.RAMP],
 }
 
-Bounds = Mapping[
-    str, tuple[float, float]
-]  # least and largest command by channel, SI; infinite without a limit
+# least and largest command by channel, SI; infinite without a limit
+Bounds = Mapping[str, tuple[float, float]]
 
 
 def guided_context(context: PlotContext) -> PlotContext:
@@ -232,13 +231,14 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
         for part in np.array_split(np.arange(len(pose.stamp_ns)), len(wind))
     ]
     for k, (to_north, to_east) in zip(middles, wind * (ARROW_PIXELS / strongest), strict=True):
+        # ay points down
         arrow = {
             "x": pose["east"][k],
             "y": pose["north"][k],
             "ax": -to_east,
             "ay": to_north,
             "text": "",
-        }  # ay points down
+        }
         arrow |= {"showarrow": True, "arrowhead": 2, "arrowwidth": 1.6, "arrowcolor": WIND}
         figure.layout["annotations"].append(arrow)
     label = f"wind, the longest arrow {strongest:.2g} m/s"

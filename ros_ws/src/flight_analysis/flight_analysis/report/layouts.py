@@ -83,9 +83,8 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
         name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")
     ]
     integrals = [f"{group}.{name}" for name, group in product(outputs, ("integral_e", "Pi"))]
-    integrals = [
-        name for name in integrals if name in channels["internals"]
-    ]  # another law may have neither
+    # another law may have neither
+    integrals = [name for name in integrals if name in channels["internals"]]
 
     def log(title: str, *names: str) -> Plot:
         return Plot(title, tuple(("internals", name) for name in names))

@@ -26,9 +26,8 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 T = TypeVar("T", bound=np.generic)
-MAX_POINTS = (
-    2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
-)
+# of a curve over the page's width: above the smallest and the largest value of each pixel
+MAX_POINTS = 2400
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
 # samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
@@ -53,9 +52,8 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 class Instants(NamedTuple):
     """The instants of a curve."""
 
-    t_ns: NDArray[
-        np.int64
-    ]  # since the start of the flight, with one more at the start of each gap; two of each bin
+    # since the start of the flight, with one more at the start of each gap; two of each bin
+    t_ns: NDArray[np.int64]
     gaps: NDArray[np.intp]  # the samples before which a NaN stands for a gap
     width: int  # samples of a bin; 1 where each sample is drawn
 
@@ -67,9 +65,8 @@ class SampleStore:
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
-        self._pool = ThreadPoolExecutor(
-            PACKERS
-        )  # compression leaves the interpreter to the other threads
+        # compression leaves the interpreter to the other threads
+        self._pool = ThreadPoolExecutor(PACKERS)
         self._instants: dict[tuple[str, int, bool], Instants] = {}
         self._digests: dict[
             int, tuple[str, NDArray[np.int64]]
@@ -115,9 +112,8 @@ class SampleStore:
     def _add(self, kind: str, array: NDArray[Any]) -> str:
         name = kind + _digest(array)
         if name not in self._packed:
-            wait(
-                [packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS]
-            )  # each holds its array
+            # each holds its array
+            wait([packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS])
             self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
 
@@ -252,13 +248,11 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
                 "zerolinecolor": ZERO,
                 "title": axis.get("title", {}) | {"standoff": standoff},
             }
-            axis |= {
-                "type": axis.get("type", "linear")
-            }  # plotly reads the samples of an axis without a type
+            # plotly reads the samples of an axis without a type
+            axis |= {"type": axis.get("type", "linear")}
     for axis in figure.y:
-        axis["ticklabeloverflow"] = (
-            "allow"  # the margin has room for them: plotly does not measure each
-        )
+        # the margin has room for them: plotly does not measure each
+        axis["ticklabeloverflow"] = "allow"
     figure.layout |= {
         "height": above + rows + below,
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},

@@ -17,27 +17,17 @@ from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
 from flight_log.flight_processes import controller_starts
 
-WHOLE = (
-    0.99  # least share of the samples of a topic without a remark, unless a single one is missing
-)
+# least share of the samples of a topic without a remark, unless a single one is missing
+WHOLE = 0.99
 LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
-AIRCRAFT = re.compile(
-    r"/aircraft(#\d+)?$"
-)  # of a process that is the simulated aircraft of the stack
+# of a process that is the simulated aircraft of the stack
+AIRCRAFT = re.compile(r"/aircraft(#\d+)?$")
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
-RATED = (
-    "y",
-    "y_m",
-    "u",
-    "internals",
-    "truth",
-    "pose",
-    "guidance",
-    "u_m",
-)  # topics with a rate of the scenario
+# topics with a rate of the scenario
+RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")
 
 
 class TopicAccount(NamedTuple):
@@ -49,15 +39,13 @@ class TopicAccount(NamedTuple):
     last: float | None
     gap: float | None  # longest interval between two samples
     gap_at: float | None  # begin of the interval
-    repeated: (
-        int  # samples with the stamp of the sample before, except in a failsafe; not among `found`
-    )
+    # samples with the stamp of the sample before, except in a failsafe; not among `found`
+    repeated: int
     unset: int  # samples without a usable stamp, left out
     step: float  # of the clock of the stamps, s; 0 without a step
     left_out: int  # samples after the step
-    unsent: (
-        int  # samples that the publisher left out on a busy host, by the numbers of the messages
-    )
+    # samples that the publisher left out on a busy host, by the numbers of the messages
+    unsent: int
 
     @property
     def share(self) -> float | None:

@@ -36,12 +36,10 @@ def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, Fl
     scipy.signal takes half a second to load, a tenth of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
-    parts = sliding_window_view(values, window, axis=0)[
-        :: window - window // 2
-    ]  # (parts, m, window)
+    # (parts, m, window)
+    parts = sliding_window_view(values, window, axis=0)[:: window - window // 2]
     spectra = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
     power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T / (rate * np.sum(hann**2))
-    power[1 : (window + 1) // 2] *= (
-        2.0  # each frequency but 0 and the highest of an even window stands for two
-    )
+    # each frequency but 0 and the highest of an even window stands for two
+    power[1 : (window + 1) // 2] *= 2.0
     return np.fft.rfftfreq(window, 1.0 / rate).astype(np.float64), power

@@ -15,9 +15,8 @@ class TickMetrics(NamedTuple):
     """Timing of the controller's ticks; times in s."""
 
     ticks: int
-    without_new_y: (
-        int  # periods without a step of the controller: no new y arrived, or the tick was missed
-    )
+    # periods without a step of the controller: no new y arrived, or the tick was missed
+    without_new_y: int
     period_mean: float
     period_p99: float
     period_max: float
