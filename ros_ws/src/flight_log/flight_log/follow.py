@@ -20,9 +20,10 @@ from flight_core.rates import NANOSECONDS
 from flight_log.bag import stack_topic
 from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, SQLITE, file_kind
 from flight_log.named_vectors import STAMP, full_name, stamps_of
-from flight_log.open_log import ROSBAG2, SqliteScan, open_scan, plain_batches
+from flight_log.open_log import ROSBAG2, open_scan, plain_batches
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import MessageBatch, Scan
+from flight_log.sqlite_scan import SqliteScan
 
 
 class Messages(NamedTuple):

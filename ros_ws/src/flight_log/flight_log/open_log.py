@@ -8,20 +8,15 @@ A path that is no log is refused in one sentence with what is there.
 
 import re
 import shutil
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import quote
 
 import lz4.frame  # type: ignore[import-untyped]
-import numpy as np
 import zstandard
-from mcap.records import Channel, McapRecord, Message, Schema
-from numpy.typing import NDArray
+from mcap.records import Channel, Schema
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
@@ -37,7 +32,6 @@ from flight_log.file_kinds import (
     ZSTD_MAGIC,
     file_kind,
 )
-from flight_log.named_vectors import tables
 from flight_log.rosbag2_metadata import (
     METADATA,
     PACKED_SUFFIXES,
@@ -46,13 +40,13 @@ from flight_log.rosbag2_metadata import (
     plain_name,
 )
 from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
+from flight_log.sqlite_scan import SqliteScan, message_tables
 
 A_RUN = "the folder of a run or an MCAP file"
 ROSBAG2 = "rosbag2"
 """In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside
 it has the attachments."""
 
-BATCH = 4096  # messages of SQLite that are grouped by channel
 NAMED = 5  # files, folders or topics that a sentence names
 COPY_BYTES = 1 << 20
 UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
@@ -237,97 +231,9 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
         yield batch
         return
     rows = [plain_message(row.tobytes()) for row in batch.data]
-    yield from _batches(batch.channel_id, rows, batch.log_ns, batch.publish_ns, batch.sequence)
-
-
-def _batches(
-    channel_id: int, messages: Iterable[bytes], *columns: NDArray[np.int64]
-) -> Iterator[MessageBatch]:
-    """Messages of a channel with the columns of a MessageBatch, those of equal length together."""
-    begin = 0
-    for table in tables(messages):
-        end = begin + len(table)
-        yield MessageBatch(channel_id, table, *(column[begin:end] for column in columns))
-        begin = end
-
-
-class SqliteScan:
-    """A file of rosbag2's storage sqlite3, with the interface of `Scan`. The storage has no time of
-    sending: it is 0.
-    """
-
-    def __init__(self, path: Path, shown: Path | None = None) -> None:
-        self.path = path
-        self.complete = True
-        self.damaged = 0
-        self.known_end_ns = 0
-        self.message_counts: dict[int, int] = {}
-        self._shown = shown or path  # the packed file
-
-    def records(self) -> Iterator[McapRecord]:
-        """The schemas, channels and messages. Raises ParameterError for a database that is no
-        bag.
-        """
-        for row in self._rows():
-            if isinstance(row, tuple):
-                channel, log_ns, data = row
-                yield Message(channel, log_ns, data, 0, 0)
-            else:
-                yield row
-
-    def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, the messages of a channel in a table. Raises ParameterError."""
-        rows = self._rows()
-        while block := list(islice(rows, BATCH)):
-            by_channel: dict[int, list[tuple[int, bytes]]] = defaultdict(list)
-            for row in block:
-                if isinstance(row, tuple):
-                    by_channel[row[0]].append(row[1:])
-                else:
-                    yield row
-            for channel, messages in by_channel.items():
-                log_ns = np.array([time_ns for time_ns, _ in messages], dtype=np.int64)
-                unknown = np.zeros(len(messages), dtype=np.int64)
-                contents = (data for _, data in messages)
-                yield from _batches(channel, contents, log_ns, unknown, unknown)
-
-    def _rows(self) -> Iterator[Schema | Channel | tuple[int, int, bytes]]:
-        # Takes 70 ms, which no bag of ours needs.
-        from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
-        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415
-
-        reader = Sqlite3Reader(Path(quote(str(self.path.absolute()))))  # it makes a URI of the path
-        encodings = {MessageDefinitionFormat.IDL: "ros2idl", MessageDefinitionFormat.MSG: "ros2msg"}
-        try:
-            reader.open()
-            connections = reader.connections
-            self.message_counts = {connection.id: connection.msgcount for connection in connections}
-            self.known_end_ns = max(reader.metadata.end_time - 1, 0)
-        except Exception as error:  # of SQLite or of rosbags: the content may be damaged anywhere
-            reason = str(error) or type(error).__name__
-            raise ParameterError(
-                f"{self._shown}: cannot be read ({reason}), expected a bag of rosbag2"
-            ) from None
-        try:
-            for connection in connections:
-                definition = connection.msgdef
-                ext = connection.ext
-                encoding = encodings.get(definition.format, "ros2msg")
-                yield Schema(
-                    id=connection.id,
-                    data=definition.data.encode(),
-                    encoding=encoding,
-                    name=connection.msgtype,
-                )
-                serialised = str(getattr(ext, "serialization_format", "cdr"))
-                yield Channel(connection.id, connection.topic, serialised, {}, connection.id)
-            for connection, log_ns, data in reader.messages(connections):
-                yield connection.id, log_ns, bytes(data)
-        except Exception:  # as above: what was read so far stays
-            self.damaged = self.damaged + 1
-            self.complete = False
-        finally:
-            reader.close()
+    yield from message_tables(
+        batch.channel_id, rows, batch.log_ns, batch.publish_ns, batch.sequence
+    )
 
 
 def require_mcap(file: Path) -> None:
