@@ -40,7 +40,7 @@ class ReceivedMessage(NamedTuple):
 
 
 class PolledSubscription:
-    """A subscription that is polled by `take`."""
+    """A subscription that is polled by `take`; a `raw` message is its bytes, CDR."""
 
     def __init__(self, node: Node, topic: Topic, qos: QoSProfile, *, raw: bool = False) -> None:
         self.topic = topic

@@ -210,8 +210,9 @@ def step_with_anti_windup(
     integral_e is dropped. The increment of Pi, the faster integral, is scaled to bring u to the
     limit:
 
-        excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e),
-        0) change = abs(change of u by the increment of Pi)
+        beyond = abs(u_trim + u - saturated)
+        excess = max(beyond - abs(change of u by the increment of integral_e), 0)
+        change = abs(change of u by the increment of Pi)
         Pi+    = Pi + max(change - excess, 0) / change (increment of Pi)
 
     Without saturation every bit equals the law alone. Theorem 1 does not cover saturation.
