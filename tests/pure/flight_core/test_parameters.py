@@ -312,6 +312,8 @@ SET_BY_THE_FLIGHT = {
 IN_NO_FILE = {
     "aircraft.commands",  # by the airframe of JSBSim: docs/aircraft.md has a line
     "aircraft.shear.exponent",  # the power law in place of the log law
+    "guidance.landing",  # docs/guidance.md has a landing, tests/pure/flight_guidance flies it
+    *(f"guidance.landing.{key}" for key in ("waypoint", "flare", "sink", "decrab", "V")),
     "controller.allocation.priority",
     *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
     *(f"controller.probe{key}" for key in ("", ".effect", ".lowest", ".window", ".false_alarm")),
