@@ -31,7 +31,6 @@ MAX_NESTED = 1.0  # comprehensions inside another; these have 0 to 0.5
 
 MAX_FUNCTION = 60  # lines beside the docstring: a page of an editor
 MAX_FILE = 600  # lines
-"""Functions and files that are longer. The list only shrinks."""
 
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
