@@ -64,6 +64,7 @@ NAMES = {
     "y": SCENARIO.controller.outputs,
     "y_m": SCENARIO.controller.outputs,
     "u": SCENARIO.controller.inputs,
+    "effects": SCENARIO.controller.inputs,
     "u_m": SCENARIO.reference_model.outputs,
     "pose": POSE,
     "target": ("heading",),
@@ -119,7 +120,7 @@ def test_u_of_the_bridge_is_bounded_both_ways() -> None:
     limit = channel_map.silence.max_age + max(row.max_age for row in channel_map.outputs.values())
     with world_of("-p", f"map:={MAP}") as world:
         made = world.make(BridgeNode)
-        require_bounds(made, {"u": limit})
-        assert {subscription.topic.name for subscription in made.polled_subscriptions} - {
-            "u"
-        } <= channel_map.topics.keys()
+        from_controller = {"u": limit, "effects": limit}
+        require_bounds(made, from_controller)
+        topics = {subscription.topic.name for subscription in made.polled_subscriptions}
+        assert topics - from_controller.keys() <= channel_map.topics.keys()
