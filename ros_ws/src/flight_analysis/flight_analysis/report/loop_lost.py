@@ -39,14 +39,14 @@ def lost_parts(tape: Tape) -> tuple[str, ...]:
 
 
 def _between_limits(tape: Tape) -> list[str]:
-    """The inputs that go from limit to limit."""
+    """The inputs that go from limit to limit, of those with u and u_free in the log."""
     if "internals" not in tape:
         return []
     limited = tape["internals"].group("limited")
     u = tape["internals"].group("u")
     u_free = tape["internals"].group("u_free")
     parts = []
-    for name in limited.names:
+    for name in sorted({*limited.names} & {*u.names} & {*u_free.names}, key=limited.names.index):
         at_limit = limited[name] != Saturation.NO
         above = at_limit & (u_free[name] > u[name])
         below = at_limit & (u_free[name] < u[name])
