@@ -377,9 +377,10 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
 
     definition = Definition.model_validate_json(text)
     scenario, course, vehicle, law, mission = _prepare(text, case)
+    drawn = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
     with turn():
-        drawn = drawn_fleet(definition, scenario, course, vehicle, first, size)
-        flown = batch.fly(drawn.fleet, drawn.vehicle, course, law.control_law, law.params, mission)
+        fleet, equipped = drawn.on_device(course, vehicle)
+        flown = batch.fly(fleet, equipped, course, law.control_law, law.params, mission)
         result = batch.on_host(flown)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
     outputs = scenario.controller.outputs
@@ -399,7 +400,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
         ("slew", inputs, slew),
     ):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    entries = {name: value[:count] for name, value in drawn.entries.items()}
+    entries = {name: value[:count] for name, value in drawn.entries().items()}
     return Chunk(first, result.diverged[:count], figures, entries)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The drawn aircraft of a campaign as arrays for the compiled loop."""
+"""The drawn aircraft of a campaign: on the host, then as arrays of the device."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,30 +19,38 @@ if TYPE_CHECKING:
 
 
 class DrawnFleet(NamedTuple):
-    """Aircraft of a campaign."""
+    """Aircraft of a campaign on the host: the device may fly others meanwhile."""
 
-    fleet: Fleet
-    vehicle: Vehicle  # with their equipment
-    entries: dict[str, FloatArray]  # what was drawn, by name, (N,) each
+    scenario: Scenario
+    A: FloatArray  # (N, n, n)
+    B: FloatArray  # (N, n, m)
+    gust_directions: FloatArray  # (N, n, G), of `gust_directions`
+    equipment: dict[str, FloatArray]  # by name, (N,) each
+
+    def on_device(self, course: Course, vehicle: Vehicle) -> tuple[Fleet, Vehicle]:
+        """The aircraft for the compiled loop, and the vehicle with their equipment."""
+        delay = self.equipment.get(equipment.DELAY, np.zeros(1))
+        fleet = batch_matrices.assemble(
+            self.A,
+            self.B,
+            self.scenario.aircraft.plant(),
+            course,
+            late=np.round(delay / course.period).astype(np.int64),
+            gust_directions=self.gust_directions,
+        )
+        return fleet, batch.with_equipment(vehicle, self.scenario, self.equipment)
+
+    def entries(self) -> dict[str, FloatArray]:
+        """What was drawn, by name, shape (N,) each."""
+        airframe = self.scenario.aircraft.nominal_airframe()
+        return drawn_entries(airframe, self.A, self.B) | self.equipment
 
 
-def drawn_fleet(
-    definition: "Definition",
-    scenario: Scenario,
-    course: Course,
-    vehicle: Vehicle,
-    first: int,
-    count: int,
-) -> DrawnFleet:
+def drawn_fleet(definition: "Definition", scenario: Scenario, first: int, count: int) -> DrawnFleet:
     """The `count` aircraft of a campaign from number `first`."""
     part = definition.uncertainty
     airframe = scenario.aircraft.nominal_airframe()
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, count)
-    late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
-    fleet = batch_matrices.assemble(
-        A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions
-    )
-    entries = drawn_entries(airframe, A, B) | equipped
-    return DrawnFleet(fleet, batch.with_equipment(vehicle, scenario, equipped), entries)
+    return DrawnFleet(scenario, A, B, directions, equipped)

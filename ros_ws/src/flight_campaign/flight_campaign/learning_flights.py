@@ -153,8 +153,9 @@ def side_by_side(
     if not flies_side_by_side(controller, course):
         return None
     vehicle = batch.vehicle(scenario)
-    drawn = drawn_fleet(definition, scenario, course, vehicle, first, len(learn))
-    return LearningFleet(drawn.fleet, drawn.vehicle, course, controller, learn, windows)
+    drawn = drawn_fleet(definition, scenario, first, len(learn))
+    fleet, equipped = drawn.on_device(course, vehicle)
+    return LearningFleet(fleet, equipped, course, controller, learn, windows)
 
 
 def _fly_side_by_side(
