@@ -149,6 +149,8 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
     ]
     processes += start_further(start, tmp_path, lockstep=False)
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=False, learns=True):
+        for process in processes:
+            process.wait_for(": ready")  # with all of its topics
         real_time = discovered(peer_node, (*ROLES, *FURTHER, "bridge", "monitor"))
     assert real_time["monitor"] == policy["monitor"]
     check_bridge(real_time["bridge"], policy["bridge"])
