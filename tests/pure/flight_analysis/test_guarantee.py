@@ -265,6 +265,13 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
     write_loop_page(tmp_path / "loop.html", "loop", linear)
     assert guarantee_text(promise)[0] in (tmp_path / "loop.html").read_text()
     assert kept(integrator(151.0, 0.1)) is None  # another gain
+    box = linear.box
+    assert box is not None
+    half = box._replace(part=0.5 * box.part, F=0.5 * box.F, G=0.5 * box.G)
+    assert kept(linear._replace(box=half)) is not None  # the guarantee says its size
+    skewed = box._replace(G=box.G * np.linspace(1.0, 2.0, len(box.G))[:, None] + 1.0)
+    assert kept(linear._replace(box=skewed)) is None  # other aircraft
+    assert kept(linear._replace(box=None)) is None
     (file,) = (tmp_path / "caches" / "rise-di" / "guarantees").iterdir()
     file.write_text("{")
     assert kept(linear) is None

@@ -521,9 +521,12 @@ class Campaign:
 
     def guarantee(self, case: int) -> Guarantee | None:
         """The guarantee that was computed for the loop of a case; None without one."""
-        scenario = self.definition.scenario(case)
+        definition = self.definition
+        scenario = definition.scenario(case)
+        part = definition.uncertainty
+        spread = definition.spread
         try:
-            return kept(scenario_loop(scenario, scenario.controller))
+            return kept(scenario_loop(scenario, scenario.controller, 0, part, spread=spread))
         except ParameterError:
             return None
 

@@ -18,7 +18,6 @@ from rich.table import Table
 
 from flight_analysis.closed_loop.guarantee import Guarantee, guarantee
 from flight_analysis.closed_loop.kept_guarantee import keep
-from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (
@@ -293,10 +292,9 @@ def _write_page(path: Path, answer: Assessment) -> None:
     """The margins of a gain set on a page. Raises ParameterError for the literal sign, which has no
     linear loop.
     """
-    study = answer.study
-    loop = linear_loop(answer.controller, study.airframe, study.A, study.B)
+    loop = answer.loop_with_box()
     with writing("--set page", path, "a page that can"):
-        write_loop_page(path, f"Loop of {study.airframe.name}", loop)
+        write_loop_page(path, f"Loop of {answer.study.airframe.name}", loop)
 
 
 def _require_margins(selection: Selection, *, theorem: bool) -> None:

@@ -4,7 +4,8 @@
 none.
 
 The folder is rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache. A file is named by the digest
-of the nominal loop, so that a changed gain or airframe has none.
+of the nominal loop and of the shape of its box, so that a changed gain, airframe, allocation or
+deviation of an entry has none. The size of the box is in the guarantee.
 """
 
 import hashlib
@@ -53,7 +54,11 @@ def kept(linear: LinearLoop) -> Guarantee | None:
 def _path(linear: LinearLoop) -> Path:
     nominal = linear.nominal
     loop = linear.loop
-    arrays = (*nominal, *linear.law, loop.lag, np.array([loop.delay, loop.period, BOUND]))
+    arrays = [*nominal, *linear.law, loop.lag, np.array([loop.delay, loop.period, BOUND])]
+    if linear.box is not None:
+        box = linear.box
+        size = box.part.max()
+        arrays += [box.part / size, box.E, box.F / size, box.G / size]
     digest = hashlib.sha256()
     for array in arrays:
         rounded = (f"{value + 0.0:.{DIGITS - 1}e}" for value in np.ravel(array).tolist())

@@ -201,7 +201,7 @@ def scenario_loop(
     seen = through_allocation(airframe, controller)
     linear = linear_loop(controller, seen, A, B @ T)
     box = box_of(airframe, controller, uncertainty, spread)
-    return linear._replace(box=box) if aircraft and box.part.any() else linear
+    return linear._replace(box=box) if box.part.any() else linear
 
 
 def linear_loop(
