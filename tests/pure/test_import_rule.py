@@ -126,7 +126,11 @@ def may_import_ros(path: Path) -> bool:
     return path.name in ROS_FILES or bool(ROS_FOLDERS & set(path.relative_to(SOURCES).parts[:-1]))
 
 
-FILES = sorted(path for path in SOURCES.glob("*/**/*.py") if path.name != "setup.py")
+FILES = sorted(
+    path
+    for path in SOURCES.glob("*/**/*")
+    if path.suffix in {".py", ".pyi"} and path.name != "setup.py"
+)
 
 
 def test_mathematics_never_imports_ros() -> None:

@@ -22,6 +22,8 @@ setup(
             "py.typed",
             "scenarios/*.yaml",
             "report/*.jinja",
+            "report/*.json",
+            "report/*.urdf",
             "report/*.js",
             "report/scene/*",
             "report/vendor/*",

@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["rise_di"],
-    package_data={"rise_di": ["py.typed"]},
+    package_data={"rise_di": ["py.typed", "*.pyi"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/rise_di"]),
         ("share/rise_di", ["package.xml"]),

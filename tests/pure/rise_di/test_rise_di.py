@@ -4,7 +4,6 @@
 sentences about wrong input.
 """
 
-import ast
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -47,32 +46,9 @@ def test_every_name_loads() -> None:
     assert all(getattr(rise_di, name) is not None for name in rise_di.__all__)
 
 
-def type_checker_imports() -> set[tuple[str | None, str, str]]:
-    """Module, name and name in `rise_di` of each import for type checkers."""
-    tree = ast.parse(Path(str(rise_di.__file__)).read_text())
-    block = next(node for node in tree.body if isinstance(node, ast.If))
-    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
-    return {
-        (node.module, alias.name, alias.asname or alias.name)
-        for node in imports
-        for alias in node.names
-    }
-
-
-def test_type_checkers_see_the_table() -> None:
-    homes = vars(rise_di)["HOMES"]
-    table = {
-        (module, name.split(" as ")[0], name.split(" as ")[-1])
-        for module, names in homes.items()
-        for name in names
-    }
-    assert type_checker_imports() == table
-
-
 def test_the_import_loads_no_library() -> None:
-    assert modules_loaded_by("import rise_di") - modules_loaded_by("import typing, importlib") == {
-        "rise_di"
-    }
+    of_python = modules_loaded_by("import ast, importlib, pathlib")
+    assert modules_loaded_by("import rise_di") - of_python == {"rise_di"}
 
 
 def test_the_interface_needs_no_ros() -> None:
@@ -92,9 +68,6 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_the_page_of_the_interface_has_every_name() -> None:
     page = (REPOSITORY / "docs" / "reference" / "python.md").read_text()
     assert sorted(re.findall(r"^::: rise_di\.(\w+)$", page, re.MULTILINE)) == rise_di.__all__
-
-
-# Old names
 
 
 # A flight
@@ -169,10 +142,6 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         "scenario: found 'osprey_gast', expected one of ",
     ),
     "no scenario": (lambda: api.find_scenario(None), "scenario: found None, expected one of "),
-    "missing file": (
-        lambda: api.find_scenario(Path("a.yaml")),
-        "scenario: found 'a.yaml', expected one of ",
-    ),
     "text as duration": (
         lambda: api.find_scenario("osprey_gust", "5"),
         "flight.duration: found '5', expected a number",
@@ -196,25 +165,9 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         lambda: scenario.vary(controller=scenario.flight),
         "controller: found FlightConfig(",
     ),
-    "unknown parameter": (
-        lambda: scenario.vary(controller={"betta": 1}),
-        "controller.betta: unknown key, expected beta perhaps, or another of ",
-    ),
-    "short list": (
-        lambda: scenario.vary(controller={"beta": np.ones(2)}),
-        "controller.beta: found 2 values, expected 4, one for each of q, p, r, V",
-    ),
     "matrix as list": (
         lambda: scenario.vary(controller={"beta": np.eye(4)}),
         "controller.beta[0]: found [1.0, 0.0, 0.0, 0.0], expected a number (and 3 more)",
-    ),
-    "NaN": (
-        lambda: scenario.vary(controller={"beta": np.full(4, np.nan)}),
-        "controller.beta[0]: found nan, expected a finite number (and 3 more)",
-    ),
-    "law without gains": (
-        lambda: scenario.vary(controller={"law": "pi"}),
-        "controller.K: missing, expected ",
     ),
     "name as scenario": (
         lambda: api.simulate("osprey_gust"),
@@ -278,14 +231,6 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
     "report of nothing": (api.report, f"runs: found none, {A_RUN}"),
     "list of runs": (lambda: api.report(["a"]), f"run: found ['a'], {A_RUN}"),
     "number as file": (lambda: api.report("a", csv=3), "csv: found 3, expected the path of a file"),
-    "unknown law": (
-        lambda: api.law_schema("nope"),
-        "law: found 'nope', expected a registered law: ",
-    ),
-    "unknown airframe": (
-        lambda: api.load_airframe("ospry"),
-        "airframe: found 'ospry', expected one of ",
-    ),
     "text as rate": (
         lambda: api.select_gains("osprey", rate="fast"),
         "rate: found 'fast', expected 1 to 1000 Hz",

@@ -11,9 +11,6 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
-
-import yaml
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
@@ -25,18 +22,10 @@ COLUMNS = 2
 MAP = "3D!map"
 """The 3-D panel of a guided flight: route and aircraft in the frame `map`, ENU."""
 MAP_TOPICS = ("odometry", "path", "markers")
-# m
-CAMERA_DISTANCE = 3000.0
-GRID_SIZE = 10_000.0
-CHASE_DISTANCE = 15.0  # m, of the camera of RViz behind the aircraft
+HERE = Path(__file__).parent
 
-SPAN = 3.0  # m, of the drawn aircraft
-BOXES = {  # (size, centre) of its parts in spans: forward, left, up
-    "body": ((0.8, 0.08, 0.09), (-0.1, 0.0, 0.0)),
-    "wing": ((0.2, 1.0, 0.02), (-0.03, 0.0, 0.01)),
-    "tail": ((0.11, 0.36, 0.01), (-0.465, 0.0, 0.01)),
-    "fin": ((0.11, 0.01, 0.17), (-0.465, 0.0, 0.09)),
-}
+FOXGLOVE = json.loads((HERE / "layout.foxglove.json").read_text(encoding="utf-8"))
+"""The parts of a layout of Foxglove that are the same for every aircraft, lengths in m."""
 
 Channels = Mapping[str, Sequence[str]]
 """The channels of the topics of an aircraft, in their order."""
@@ -145,8 +134,7 @@ def foxglove(aircraft: Mapping[str, Channels]) -> str:
             panels[f"Tab!{namespace}"] = {"activeTabIdx": 0, "tabs": panel_tabs}
             tabs.append({"title": namespace, "layout": f"Tab!{namespace}"})
     panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": tabs}
-    defaults = {"globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
-    return json.dumps({"configById": panels, **defaults, "layout": "Tab!rise_di"}, indent=2) + "\n"
+    return json.dumps({"configById": panels, **FOXGLOVE["layout"]}, indent=2) + "\n"
 
 
 def _foxglove_tabs(
@@ -180,44 +168,13 @@ def _foxglove_plot(plot: Plot, namespace: str, channels: Channels) -> dict[str, 
         }
         for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False)
     ]
-    return {
-        "foxglovePanelTitle": plot.title,
-        "lichtblickPanelTitle": plot.title,
-        "paths": paths,
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-        "showLegend": True,
-        "legendDisplay": "floating",
-        "showPlotValuesInLegend": False,
-        "isSynced": True,
-        "xAxisVal": "timestamp",
-        "sidebarDimension": 240,
-    }
+    titles = dict.fromkeys(("foxglovePanelTitle", "lichtblickPanelTitle"), plot.title)
+    return {**titles, "paths": paths, **FOXGLOVE["plot"]}
 
 
 def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
-    return {
-        "cameraState": {
-            "distance": CAMERA_DISTANCE, "perspective": True, "phi": 45.0, "thetaOffset": 0.0,
-            "fovy": 45.0,
-            "near": 1.0, "far": 100.0 * CAMERA_DISTANCE,
-            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.0],
-            "targetOrientation": [0.0, 0.0, 0.0, 1.0],
-        },
-        "followMode": "follow-none",
-        "followTf": "map",
-        "scene": {},
-        "transforms": {},
-        "topics": {_topic(*pair): {"visible": True} for pair in product(namespaces, MAP_TOPICS)},
-        "layers": {
-            "grid": {
-                "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid",
-                "frameId": "map",
-                "size": GRID_SIZE, "divisions": 10, "color": "#808080ff", "position": [0, 0, 0],
-                "rotation": [0, 0, 0],
-            }
-        },
-    }  # fmt: skip
+    topics = [_topic(*pair) for pair in product(namespaces, MAP_TOPICS)]
+    return {**FOXGLOVE["map"], "topics": {name: {"visible": True} for name in topics}}
 
 
 def _mosaic(names: Sequence[str]) -> Any:
@@ -241,55 +198,14 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
     }
 
 
-def _plotjuggler_tab(window: ElementTree.Element, namespace: str, tab: Tab) -> None:
-    """Add the tab to the window with its plots in rows; a tab without a plot is left out."""
-    if not tab.plots:
-        return
-    title = f"{namespace} {tab.title}".strip()
-    element = ElementTree.SubElement(window, "Tab", {"tab_name": title, "containers": "1"})
-    rows = [tab.plots[start : start + COLUMNS] for start in range(0, len(tab.plots), COLUMNS)]
-    outer = _splitter(ElementTree.SubElement(element, "Container"), "-", len(rows))
-    for row in rows:
-        inner = _splitter(outer, "|", len(row))
-        for plot in row:
-            _plotjuggler_plot(inner, plot, namespace)
-
-
 def plotjuggler(aircraft: Mapping[str, Channels]) -> str:
     """A layout of PlotJuggler: XML, tabs of docked plots, curves "/topic/channel/position".
     `aircraft` as in `foxglove`.
     """
-    root = ElementTree.Element("root")
-    window = ElementTree.SubElement(
-        root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"}
-    )
-    for namespace, channels in aircraft.items():
-        for tab in tabs_of(channels):
-            _plotjuggler_tab(window, namespace, tab)
-    ElementTree.SubElement(window, "currentTabIndex", {"index": "0"})
-    ElementTree.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _splitter(parent: ElementTree.Element, orientation: str, count: int) -> ElementTree.Element:
-    sizes = ";".join([f"{1.0 / count:.6g}"] * count)
-    return ElementTree.SubElement(
-        parent, "DockSplitter", {"orientation": orientation, "count": str(count), "sizes": sizes}
-    )
-
-
-def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot, namespace: str) -> None:
-    area = ElementTree.SubElement(parent, "DockArea", {"name": plot.title})
-    element = ElementTree.SubElement(
-        area, "plot", {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
-    )
-    for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False):
-        ElementTree.SubElement(
-            element,
-            "curve",
-            {"name": f"{_topic(namespace, topic)}/{channel}/position", "color": colour},
-        )
+    tabs = [
+        (namespace, tab) for namespace, channels in aircraft.items() for tab in tabs_of(channels)
+    ]
+    return _rendered("plotjuggler.xml", tabs=tabs, columns=COLUMNS, colours=COLOURS)
 
 
 def rviz(namespaces: Sequence[str], description: Path) -> str:
@@ -298,61 +214,23 @@ def rviz(namespaces: Sequence[str], description: Path) -> str:
 
     `description`: the file of `urdf`.
     """
-    displays: list[dict[str, Any]] = [
-        {
-            "Class": "rviz_default_plugins/Grid",
-            "Name": "Grid",
-            "Cell Size": 100.0,
-            "Plane Cell Count": int(GRID_SIZE / 100.0),
-        }
-    ]
-    for name in namespaces:
-        model = {
-            "Description Source": "File",
-            "Description File": str(description),
-            "TF Prefix": name,
-        }
-        displays += [
-            {"Class": "rviz_default_plugins/RobotModel", "Name": name or "aircraft"} | model,
-            {
-                "Class": "rviz_default_plugins/Path",
-                "Name": f"{name} path".strip(),
-                "Topic": {"Value": _topic(name, "path")},
-            },
-            {
-                "Class": "rviz_default_plugins/MarkerArray",
-                "Name": f"{name} route".strip(),
-                "Topic": {"Value": _topic(name, "markers")},
-            },
-        ]
     body = f"{namespaces[0]}/base_link".lstrip("/")
-    behind = {"Target Frame": body, "Distance": CHASE_DISTANCE, "Pitch": 0.3, "Yaw": 3.1416}
-    manager = {
-        "Class": "",
-        "Displays": [display | {"Enabled": True, "Value": True} for display in displays],
-        "Global Options": {"Fixed Frame": "map", "Frame Rate": 30},
-        "Tools": [{"Class": "rviz_default_plugins/MoveCamera"}],
-        "Views": {
-            "Current": {"Class": "rviz_default_plugins/Orbit", "Name": "Current View"} | behind
-        },
-    }
-    panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
-    return yaml.safe_dump({"Panels": panels, "Visualization Manager": manager}, sort_keys=False)
+    return _rendered("rviz", namespaces=namespaces, description=str(description), body=body)
+
+
+def _rendered(program: str, **values: Any) -> str:
+    """The template of a program with values."""
+    from jinja2 import Environment, FileSystemLoader  # noqa: PLC0415 - a flight does not need it
+
+    environment = Environment(
+        loader=FileSystemLoader(HERE),
+        autoescape=program.endswith("xml"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(f"layout.{program}.jinja").render(topic=_topic, **values) + "\n"
 
 
 def urdf() -> str:
-    """The aircraft of `BOXES` as the link `base_link`, forward-left-up, as URDF."""
-    robot = ElementTree.Element("robot", {"name": "aircraft"})
-    link = ElementTree.SubElement(robot, "link", {"name": "base_link"})
-    for name, (size, centre) in BOXES.items():
-        visual = ElementTree.SubElement(link, "visual", {"name": name})
-        ElementTree.SubElement(visual, "origin", {"xyz": _spans(centre)})
-        geometry = ElementTree.SubElement(visual, "geometry")
-        ElementTree.SubElement(geometry, "box", {"size": _spans(size)})
-    ElementTree.indent(robot)
-    return ElementTree.tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _spans(values: Sequence[float]) -> str:
-    """Lengths in spans as m, as an attribute."""
-    return " ".join(f"{SPAN * value:.4g}" for value in values)
+    """An aircraft of four boxes, 3 m wide, as the link `base_link`, forward-left-up, as URDF."""
+    return (HERE / "aircraft.urdf").read_text(encoding="utf-8")
