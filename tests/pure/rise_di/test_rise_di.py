@@ -6,7 +6,6 @@ sentences about wrong input.
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, assert_type
 
 import numpy as np
