@@ -8,7 +8,7 @@ the table of these files.
         # measure this again; "speed" is every name that begins so; repeatable
     make evidence ARGS="--again long"          # up to 80 min each, by name alone
 
-Goals are in benchmarks/evidence_goals.py. build/evidence/ has the logs.
+Commands and goals are in benchmarks/evidence.yaml. build/evidence/ has the logs.
 """
 
 import csv
@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
-from benchmarks.evidence_goals import COMMANDS, GOALS, LONG, SECTIONS
+import yaml
 from benchmarks.tables import parser_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -35,6 +35,15 @@ FOLDER, PAGE, BUILD = (
     REPOSITORY / "docs/evidence.md",
     REPOSITORY / "build/evidence",
 )
+SECTIONS: Mapping[str, Mapping[str, Any]] = yaml.safe_load(
+    Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8")
+)
+MEASUREMENTS = {
+    name: measurement
+    for measurements in SECTIONS.values()
+    for name, measurement in measurements.items()
+    if "command" in measurement
+}
 DIRTY = "-dirty"  # end of a revision with changes that are not committed
 BUSY, BUSY_SHARE = (
     "busy with other work",
@@ -159,14 +168,16 @@ def write(name: str, figures: Iterable[Row], origin: Origin) -> None:
 def write_page() -> None:
     """Write the page from the files."""
     lines = [HEAD]
-    for section, titles in SECTIONS.items():
+    for section, measurements in SECTIONS.items():
         lines += [
             f"## {section}",
             "",
             "| measurement | goals met, and missed | date |",
             "|---|---|---|",
         ]
-        lines += [_line(FOLDER / f"{name}.csv", title) for name, title in titles.items()] + [""]
+        for name, measurement in measurements.items():
+            lines.append(_line(FOLDER / f"{name}.csv", measurement["title"]))
+        lines.append("")
     PAGE.write_text("\n".join(lines))
 
 
@@ -240,17 +251,18 @@ def host() -> str:
 def measure(name: str) -> int:
     """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
     busy = psutil.cpu_percent(interval=2.0) / 100.0
-    begun = origin(COMMANDS[name])  # before the run: a commit meanwhile is not what runs
+    planned = MEASUREMENTS[name]["command"]
+    begun = origin(planned)  # before the run: a commit meanwhile is not what runs
     with tempfile.TemporaryDirectory() as folder, (BUILD / f"{name}.log").open("w") as log:
         file = Path(folder) / "result.json"
-        command = COMMANDS[name].replace("FILE", str(file)).replace("FOLDER", folder).split()
+        command = planned.replace("FILE", str(file)).replace("FOLDER", folder).split()
         command[0] = str(Path(sys.executable).parent / command[0])
         done = subprocess.run(  # noqa: S603
             command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True, check=False
         )
         log.write(done.stdout)
         text = file.read_text() if file.exists() else done.stdout
-    if COMMANDS[name].startswith("pytest"):
+    if planned.startswith("pytest"):
         ended = re.findall(r"(\d+) (passed|failed|skipped|error)", text.strip().rpartition("\n")[2])
         result: Any = {"failed": 0} | {kind: int(count) for count, kind in ended}
     else:
@@ -266,7 +278,7 @@ def measure(name: str) -> int:
         [
             *failed,
             *(
-                rows(result, GOALS.get(name, {}))
+                rows(result, MEASUREMENTS[name].get("goals", {}))
                 if found is None
                 else (Row(*each) for each in found)
             ),
@@ -288,15 +300,17 @@ def main() -> int:
     )
     again = tuple(parser.parse_args().again)
     missing = [
-        name for name in COMMANDS if name not in LONG and not (FOLDER / f"{name}.csv").exists()
+        name
+        for name, measurement in MEASUREMENTS.items()
+        if "long" not in measurement and not (FOLDER / f"{name}.csv").exists()
     ]
-    todo = [name for name in COMMANDS if name.startswith(again)] if again else missing
+    todo = [name for name in MEASUREMENTS if name.startswith(again)] if again else missing
     if again and not todo:
-        parser.error(f"--again: found {again[0]!r}, expected one of {', '.join(COMMANDS)}")
+        parser.error(f"--again: found {again[0]!r}, expected one of {', '.join(MEASUREMENTS)}")
     BUILD.mkdir(parents=True, exist_ok=True)
     failed = 0
     for number, name in enumerate(todo, 1):
-        print(f"[{number} of {len(todo)}] {name}: {COMMANDS[name]}", flush=True)
+        print(f"[{number} of {len(todo)}] {name}: {MEASUREMENTS[name]['command']}", flush=True)
         failed += measure(name) != 0
     write_page()
     return int(failed > 0)

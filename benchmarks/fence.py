@@ -21,12 +21,14 @@ an aircraft did not come home.
 import csv
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from benchmarks import evidence
 from benchmarks.guidance import aircraft_of, turbulence
 from benchmarks.tables import parser_of
@@ -48,48 +50,25 @@ CHUNK, UNCERTAINTY = 250, 0.3
 """Aircraft in one flight; share of the entries of A and B."""
 
 HOME = (-1.0, 0.0)  # radii
-SHAPES: Mapping[str, tuple[Zone, ...]] = {
-    "square": (Zone((-2.5, 2.5, 2.5, -2.5), (-2.2, -2.2, 2.2, 2.2)),),
-    "slanting edge": (Zone((-2.5, 1.5, 4.0, -2.5), (-2.5, -2.5, 2.5, 2.5)),),
-    "ell": (Zone((-2.5, 3.0, 3.0, 0.2, 0.2, -2.5), (-2.2, -2.2, 1.4, 1.4, 4.5, 4.5)),),
-    "circle": (Zone((-0.5,), (0.0,), 3.0),),
-    "no-fly zone": (
-        Zone((-2.5, 8.0, 8.0, -2.5), (-5.0, -5.0, 5.0, 5.0)),
-        Zone((2.0, 3.5, 3.5, 2.0), (-1.0, -1.0, 1.0, 1.0), exclude=True),
-    ),
-}
-"""Fences in least radii of the aircraft in the wind."""
 
-OUTSIDE: Mapping[str, Fence] = {
-    "square": Fence((Zone((-6.0, -1.0, -1.0, -6.0), (-2.0, -2.0, 3.0, 3.0)),), (-3.5, 0.5)),
-    "slot of a U, home in the other arm": Fence(
-        (
-            Zone(
-                (-3.0, 5.5, 5.5, -3.0, -3.0, 2.0, 2.0, -3.0),
-                (-3.3, -3.3, 4.0, 4.0, 0.7, 0.7, -0.3, -0.3),
-            ),
-        ),
-        (-0.5, 2.3),
-    ),
-    "notch of an L": Fence(
-        (Zone((-4.5, 3.5, 3.5, -0.4, -0.4, -4.5), (-5.0, -5.0, -0.4, -0.4, 4.0, 4.0)),), (1.5, -2.7)
-    ),
-    "no-fly zone in a circle": Fence(
-        (
-            Zone((0.0,), (0.0,), 6.0),
-            Zone((-0.7, 0.7, 0.7, -0.7), (-1.0, -1.0, 0.4, 0.4), exclude=True),
-        ),
-        (-3.0, -2.0),
-    ),
-    "two zones that touch": Fence(
-        (
-            Zone((-1.0, 2.5, 2.5, -1.0), (0.6, 0.6, 5.0, 5.0)),
-            Zone((2.5, 6.0, 6.0, 2.5), (0.6, 0.6, 5.0, 5.0)),
-        ),
-        (4.2, 2.8),
-    ),
+
+def zones_of(rows: Sequence[Mapping[str, Any]]) -> tuple[Zone, ...]:
+    """Zones of the file of fences."""
+    zones = []
+    for row in rows:
+        corners = {axis: tuple(row[axis]) for axis in ("north", "east")}
+        zones.append(Zone(**{**row, **corners}))
+    return tuple(zones)
+
+
+FENCES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+SHAPES = {name: zones_of(zones) for name, zones in FENCES["shapes"].items()}
+OUTSIDE = {
+    name: Fence(zones_of(fence["zones"]), tuple(fence["home"]))
+    for name, fence in FENCES["outside"].items()
 }
-"""Fences that the origin is outside of, with home, in least radii of the aircraft in the wind."""
+"""Fences by name, those of OUTSIDE with the origin outside, in least radii of the aircraft in the
+wind."""
 
 OUTSIDE_WINDS: Mapping[str, tuple[float, float]] = {
     "0.4 V from behind": (0.4, 0.0),
