@@ -20,7 +20,6 @@ autopilot's log, each 0.1 s; PX4's own law by nav_state.
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -64,7 +63,7 @@ if TYPE_CHECKING:
     from tests.sitl.kit import Autopilot
 
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
-ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
+ENGAGEMENTS = 20
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
 GUIDED, EACH, SETTLED = (
     300.0,
@@ -383,9 +382,11 @@ def releases() -> dict[str, Any]:
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
     subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
     suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now
-    times: dict[str, float | None] = dict.fromkeys(
-        RELEASE_GOALS
-    )  # a time that is missing misses its goal
+    goals = evidence.goals_of("autopilots-releases")
+    # a time that is missing misses its goal
+    times: dict[str, float | None] = {
+        name.removeprefix("times: "): None for name in goals if name.startswith("times: ")
+    }
     times |= {
         timed.attrib["name"]: float(timed.attrib["value"]) for timed in suite.iter("property")
     }
@@ -412,54 +413,6 @@ MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "own_log": own_log,
     "releases": releases,
 }
-
-
-# The rows
-
-# s, until the pilot or PX4's own law flies: one sample of ArduPlane's RC, 0.6 s of PX4, or what the
-# autopilot's parameters say and 0.1 s for a sample of its log: RC_OVERRIDE_TIME of 3 s,
-# COM_OF_LOSS_T of 1 s or what the test sets. The age limit of u is 1 s in the tests.
-RELEASE_GOALS = {
-    "ArduPlane, release": 0.1,
-    "ArduPlane, override by a switch": 0.1,
-    "ArduPlane, override by a moved stick": 0.1,
-    "ArduPlane, controller killed": 1.1,
-    "ArduPlane, bridge killed": 3.1,
-    "ArduPlane, agent killed": 3.1,
-    "PX4, release": 0.6,
-    "PX4, override by the stick": 0.6,
-    "PX4, mode changed": 0.6,
-    "PX4, controller killed": 0.6,
-    "PX4, bridge killed": 1.1,
-    "PX4, bridge killed, short timeout": 0.4,
-    "PX4, agent killed": 1.1,
-}
-OMEGA_GOAL = 0.15  # of elevator and aileron by the autopilot's log over that of the stack
-# Of the rms of e: rad/s, and m/s for V. PX4: half of what the first flight had.
-ERROR_GOALS = {
-    "arduplane": {"q": 0.010, "p": 0.020, "r": 0.015, "V": 0.05},
-    "px4": {"q": 0.0265, "p": 0.0505, "r": 0.015, "V": 0.215},
-}
-
-
-GOALS: dict[str, dict[str, str]] = {
-    **{
-        name: {f"^rms: {channel}": f"<= {limit:g}" for channel, limit in limits.items()}
-        | {"refused": "<= 0"}
-        for name, limits in ERROR_GOALS.items()
-    },
-    "engagements": {"steps: .*": f"<= {LARGEST_STEP:g}"},
-    "signs": {"right sign wrong": "<= 0", "miss a sign": "<= 0"},
-    "pose": {"largest difference from 1": "<= 0.01"},
-    "probe": {"stuck: .*": "<= 8", "false alarms": "<= 0"},
-    "own_log": {"difference: (elevator|aileron)": f"<= {OMEGA_GOAL:g}"},
-    "releases": {
-        f"times: {re.escape(name)}": f"<= {limit:g}" for name, limit in RELEASE_GOALS.items()
-    }
-    | {"failures|errors": "<= 0"},
-}
-"""By measurement: patterns of the end of a figure's name, SI."""
-GOALS["arduplane"]["behind: .*"] = "<= 0.1"
 
 
 def main() -> None:
@@ -502,7 +455,11 @@ def main() -> None:
         (FOLDER / f"{name}.json").write_text(json.dumps({"result": result}, indent=1))
         print(name, json.dumps(result), flush=True)
         figures = counted(result) if name == "signs" else result
-        evidence.write(f"autopilots-{name}", evidence.rows(figures, GOALS.get(name, {})), begun)
+        evidence.write(
+            f"autopilots-{name}",
+            evidence.rows(figures, evidence.goals_of(f"autopilots-{name}")),
+            begun,
+        )
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ MEASUREMENTS = {
     name: measurement
     for measurements in SECTIONS.values()
     for name, measurement in measurements.items()
-    if "command" in measurement
 }
+COMMANDS = {name: each["command"] for name, each in MEASUREMENTS.items() if "command" in each}
 DIRTY = "-dirty"  # end of a revision with changes that are not committed
 BUSY, BUSY_SHARE = (
     "busy with other work",
@@ -99,6 +99,12 @@ def row(
         else str(value)
     )
     return Row(name, text, unit, goal="" if limit is None else f"{sign} {limit:.6g}")
+
+
+def goals_of(name: str) -> Mapping[str, str]:
+    """Goals of a measurement by the pattern of the end of a figure's name."""
+    goals: Mapping[str, str] = MEASUREMENTS[name].get("goals", {})
+    return goals
 
 
 def split(name: str) -> tuple[str, str]:
@@ -251,7 +257,7 @@ def host() -> str:
 def measure(name: str) -> int:
     """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
     busy = psutil.cpu_percent(interval=2.0) / 100.0
-    planned = MEASUREMENTS[name]["command"]
+    planned = COMMANDS[name]
     begun = origin(planned)  # before the run: a commit meanwhile is not what runs
     with tempfile.TemporaryDirectory() as folder, (BUILD / f"{name}.log").open("w") as log:
         file = Path(folder) / "result.json"
@@ -277,11 +283,7 @@ def measure(name: str) -> int:
         name,
         [
             *failed,
-            *(
-                rows(result, MEASUREMENTS[name].get("goals", {}))
-                if found is None
-                else (Row(*each) for each in found)
-            ),
+            *(rows(result, goals_of(name)) if found is None else (Row(*each) for each in found)),
         ],
         begun,
     )
@@ -299,18 +301,15 @@ def main() -> int:
         help="only measure again what begins so",
     )
     again = tuple(parser.parse_args().again)
-    missing = [
-        name
-        for name, measurement in MEASUREMENTS.items()
-        if "long" not in measurement and not (FOLDER / f"{name}.csv").exists()
-    ]
-    todo = [name for name in MEASUREMENTS if name.startswith(again)] if again else missing
+    short = [name for name in COMMANDS if "long" not in MEASUREMENTS[name]]
+    missing = [name for name in short if not (FOLDER / f"{name}.csv").exists()]
+    todo = [name for name in COMMANDS if name.startswith(again)] if again else missing
     if again and not todo:
-        parser.error(f"--again: found {again[0]!r}, expected one of {', '.join(MEASUREMENTS)}")
+        parser.error(f"--again: found {again[0]!r}, expected one of {', '.join(COMMANDS)}")
     BUILD.mkdir(parents=True, exist_ok=True)
     failed = 0
     for number, name in enumerate(todo, 1):
-        print(f"[{number} of {len(todo)}] {name}: {MEASUREMENTS[name]['command']}", flush=True)
+        print(f"[{number} of {len(todo)}] {name}: {COMMANDS[name]}", flush=True)
         failed += measure(name) != 0
     write_page()
     return int(failed > 0)
