@@ -32,7 +32,9 @@ from rise_di_controller.params import ControllerConfig
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"
 )
-RATES = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
+EXAMPLE = REPOSITORY / "examples" / "px4_airplane"
+RATES = EXAMPLE / "rates.yaml"
+OBSERVER = EXAMPLE / "rates_observer.yaml"
 PERIOD_US = 4000
 WARNINGS = ("-Wshadow", "-Wfloat-equal", "-Wdouble-promotion")  # of PX4
 (
@@ -118,10 +120,11 @@ class Shell:
         return [self.run(**changes) for _ in range(cycles)]
 
 
-@pytest.fixture(scope="module", params=["double", "float"])
+@pytest.fixture(scope="module", params=[OBSERVER, RATES], ids=["double", "float"])
 def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """The module with an observer, whose u_o has limits too, in double; without one in float."""
     folder = tmp_path_factory.mktemp("px4")
-    write_px4(find_scenario(str(RATES)), folder, float32=request.param == "float")
+    write_px4(find_scenario(str(request.param)), folder, float32=request.param == RATES)
     return folder
 
 
@@ -359,7 +362,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     """Python computes the u of each tick: from the y, y_m and limits of rise_di_status alone. After
     a gap of the log it begins again with the next engagement.
     """
-    controller = find_scenario(str(RATES)).controller
+    controller = find_scenario(str(OBSERVER)).controller
     table = flown_table(shell, controller)
     log = VehicleLog("a ULog", {STATUS: table}, {}, None)
     if "RISE_DI_FLOAT32 1" in (folder / MODULE / PARAMETERS).read_text("utf-8"):
@@ -397,7 +400,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
 def test_log_of_another_module_is_refused(
     shell: Shell, changes: dict[str, float | None], words: str
 ) -> None:
-    controller = find_scenario(str(RATES)).controller
+    controller = find_scenario(str(OBSERVER)).controller
     table = flown_table(shell, controller)
     fields = dict(table.fields)
     for name, value in changes.items():

@@ -14,6 +14,7 @@ from c_export.proof import SOURCE, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
+from rise_di_controller.params import ControllerConfig
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y and the axes of autopilots: roll, pitch, yaw."""
@@ -162,6 +163,19 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         f"#define RISE_DI_SPEED ((rise_di_real){speed!r}) /* m/s */",
         f"#define RISE_DI_SLOWEST {SLOWEST * speed!r}F",
         f"#define RISE_DI_FASTEST {FASTEST * speed!r}F",
+        *_observer_limits(controller, suffix),
         "#endif",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _observer_limits(controller: ControllerConfig, suffix: str) -> list[str]:
+    """The limits of u_o in those of u: the part of their magnitude, and its change in a second."""
+    observer = exportable(controller).observer
+    if observer is None:
+        return []
+    slew = observer.part / observer.within
+    return [
+        f"#define RISE_DI_OBSERVER_PART ((rise_di_real){observer.part.hex()}{suffix})",
+        f"#define RISE_DI_OBSERVER_SLEW ((rise_di_real){slew.hex()}{suffix}) /* 1/s */",
+    ]

@@ -106,7 +106,7 @@ static void engage(rise_di_rates *rates, rise_di_real scale) {
     }
 }
 
-/* No u beyond the torque of 1 at this airspeed: other limits are other parameters. */
+/* No u beyond the torque of 1 at this airspeed: other limits, of the observer too, are other parameters. */
 static void limit(rise_di_rates *rates, rise_di_real scale) {
     const rise_di_parameters *now = rates->controller.parameters;
     rise_di_parameters *next = &rates->parameters[(now == &rates->parameters[0]) ? 1 : 0];
@@ -118,6 +118,11 @@ static void limit(rise_di_rates *rates, rise_di_real scale) {
         next->limits.upper[i] = (exported.limits.upper[i] > end) ? end : exported.limits.upper[i];
         changed = changed || (next->limits.lower[i] < now->limits.lower[i]) || (next->limits.lower[i] > now->limits.lower[i]) ||
                   (next->limits.upper[i] < now->limits.upper[i]) || (next->limits.upper[i] > now->limits.upper[i]);
+#if RISE_DI_S > 0
+        next->observer_limits.lower[i] = RISE_DI_OBSERVER_PART * next->limits.lower[i];
+        next->observer_limits.upper[i] = RISE_DI_OBSERVER_PART * next->limits.upper[i];
+        next->observer_limits.rate[i] = (RISE_DI_OBSERVER_SLEW * (next->limits.upper[i] - next->limits.lower[i])) / (rise_di_real)2;
+#endif
     }
     if (changed) {
         rise_di_retune(&rates->controller, next);
