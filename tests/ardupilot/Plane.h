@@ -30,6 +30,7 @@ extern const AP_HAL::HAL &hal;
 
 struct AP_InertialSensor {
     bool get_gyro_health() const;
+    uint16_t get_gyro_filter_hz() const;
 };
 struct AP_Logger {
     void WriteStreaming(const char *name, const char *labels, const char *fmt, ...);

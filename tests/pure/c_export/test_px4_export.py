@@ -56,7 +56,7 @@ class Cycle(ctypes.Structure):
     """rise_di_cycle."""
 
     _fields_ = (
-        *((name, ctypes.c_uint64) for name in ("now_us", "rates_us", "setpoint_us")),
+        *((name, ctypes.c_uint64) for name in ("now_us", "rates_us", "filter_us", "setpoint_us")),
         *((name, ctypes.c_bool) for name in ("enabled", "armed", "has_rates", "landed")),
         *((name, 3 * ctypes.c_float) for name in ("rates", "setpoint", "spare")),
         *((name, ctypes.c_float) for name in ("airspeed", "max_age", "max_error")),
@@ -218,6 +218,14 @@ def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
     assert refusals == [FLIES] * 5 + [STALE_RATES] * 5
 
 
+def test_y_is_of_the_instant_before_the_filters_of_the_rates(shell: Shell) -> None:
+    """By their delay: y_m of that instant is compared, so the rates, not what the filters leave of
+    them, follow the reference.
+    """
+    shell.fly(20, filter_us=5600)
+    assert shell.values[20] == shell.now_us - 5600
+
+
 def test_reference_follows_the_setpoint(shell: Shell) -> None:
     """y_m is that of Python at the instants of the periods, for any rates that come faster; a pause
     starts it again.
@@ -288,7 +296,7 @@ def test_parameters_and_topics_are_those_of_the_source(folder: Path) -> None:
     module = folder / MODULE
     source = (module / "RiseDiControl.cpp").read_text()
     yaml = (module / "module.yaml").read_text()
-    used = set(re.findall(r"px4::params::(\w+)", source))
+    used = set(re.findall(r"px4::params::(RDI_\w+)", source))
     assert used == set(re.findall(r"^        (RDI_\w+):", yaml, re.MULTILINE))
     assert all(len(name) <= 16 for name in used)
     message = (folder / "msg" / "RiseDiStatus.msg").read_text()
@@ -341,7 +349,12 @@ def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
         rates = tuple(2.0 + rate for rate in rates) if 900 < k < 1200 else rates  # into the limits
         enabled = not 1500 <= k < 1600
         refusal = shell.run(
-            setpoint=setpoint, rates=rates, airspeed=speed, enabled=enabled, max_error=30.0
+            setpoint=setpoint,
+            rates=rates,
+            airspeed=speed,
+            enabled=enabled,
+            max_error=30.0,
+            filter_us=5600,
         )
         rows.append({"refusal": refusal, "airspeed": speed, "now": shell.now_us})
         rows[-1]["values"] = shell.values.copy()

@@ -22,6 +22,17 @@ extern "C" {
 static const float END = 4500.0f;
 static const SRV_Channel::Function surfaces[3] {SRV_Channel::k_aileron, SRV_Channel::k_elevator, SRV_Channel::k_rudder};
 
+// The equivalent airspeed, m/s: airspeed_estimate before ArduPlane 4.8.
+template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, int) -> decltype(ahrs.airspeed_EAS(airspeed))
+{
+    return ahrs.airspeed_EAS(airspeed);
+}
+
+template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, long) -> decltype(ahrs.airspeed_estimate(airspeed))
+{
+    return ahrs.airspeed_estimate(airspeed);
+}
+
 static const char *text_of(bool flies, const rise_di_rates &rates)
 {
     return flies ? "RISE-DI flies" : rise_di_refusal_text(rates.refusal);
@@ -63,6 +74,8 @@ void Plane::rise_di()
     rise_di_cycle cycle {};
     cycle.now_us = AP_HAL::micros64();
     cycle.rates_us = AP::ins().get_gyro_health() ? cycle.now_us : rates.last_us;
+    const float cutoff = AP::ins().get_gyro_filter_hz(); // of a second-order filter: delay 1 / (sqrt(2) pi f)
+    cycle.filter_us = cutoff > 1.0f ? (uint64_t)(225079.0f / cutoff) : 0;
     cycle.setpoint_us = cycle.now_us; // stabilize has run in this loop
     cycle.enabled = RC_Channels::get_radio_in(RISE_DI_SWITCH - 1) > 1700;
     cycle.armed = hal.util->get_soft_armed();
@@ -79,7 +92,7 @@ void Plane::rise_di()
     }
 
     float airspeed = 0.0f;
-    cycle.airspeed = ahrs.airspeed_EAS(airspeed) ? airspeed : 0.0f;
+    cycle.airspeed = take_airspeed(ahrs, airspeed, 0) ? airspeed : 0.0f;
     cycle.max_age = RISE_DI_MAX_AGE;
     cycle.max_error = RISE_DI_MAX_ERROR;
 

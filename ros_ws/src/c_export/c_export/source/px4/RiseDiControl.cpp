@@ -45,6 +45,7 @@ public:
 private:
 	void Run() override;
 	bool is_enabled() const;
+	hrt_abstime filter_delay() const;
 	void publish(bool flies);
 
 	uORB::SubscriptionCallbackWorkItem _velocity_sub{this, ORB_ID(vehicle_angular_velocity)};
@@ -77,9 +78,17 @@ private:
 		(ParamInt<px4::params::RDI_EN>) _enabled,
 		(ParamInt<px4::params::RDI_AUX>) _aux,
 		(ParamFloat<px4::params::RDI_MAX_AGE>) _max_age,
-		(ParamFloat<px4::params::RDI_MAX_ERR>) _max_error
+		(ParamFloat<px4::params::RDI_MAX_ERR>) _max_error,
+		(ParamFloat<px4::params::IMU_GYRO_CUTOFF>) _cutoff
 	)
 };
+
+// Of the second-order Butterworth filter at low frequencies, us: 1 / (sqrt(2) pi f).
+hrt_abstime RiseDiControl::filter_delay() const
+{
+	const float cutoff = _cutoff.get();
+	return cutoff > 1.f ? (hrt_abstime)(225079.f / cutoff) : 0;
+}
 
 bool RiseDiControl::is_enabled() const
 {
@@ -115,6 +124,7 @@ void RiseDiControl::Run()
 	rise_di_cycle cycle{};
 	cycle.now_us = now;
 	cycle.rates_us = _velocity.timestamp_sample;
+	cycle.filter_us = filter_delay();
 	cycle.setpoint_us = _setpoint.timestamp;
 	cycle.enabled = is_enabled();
 	cycle.armed = _mode.flag_armed;

@@ -75,7 +75,8 @@ static rise_di_real effect_scale(const rise_di_cycle *cycle) {
 
 /* The samples of y and of y_m for the controller: the reference model steps past the instant of the rates. */
 static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle) {
-    const int64_t stamp_ns = in_ns(cycle->rates_us);
+    const uint64_t stamp_us = (cycle->rates_us > cycle->filter_us) ? (cycle->rates_us - cycle->filter_us) : 0U;
+    const int64_t stamp_ns = in_ns(stamp_us);
     const int64_t now_ns = in_ns(cycle->now_us);
     rise_di_real u_m[RISE_DI_M];
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -86,7 +87,7 @@ static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle) {
     }
     if ((cycle->rates_us - rates->last_us) > (((uint64_t)model.period_ns * PAUSE_PERIODS) / 1000U)) {
         rise_di_reference_start(&rates->reference, &model);
-        rates->reference_us = cycle->rates_us;
+        rates->reference_us = stamp_us;
     }
     (void)rise_di_take_u_m(&rates->reference, stamp_ns - in_ns(rates->reference_us), u_m);
     while ((in_ns(rates->reference_us) + (rates->reference.number * model.period_ns)) < stamp_ns) {

@@ -30,6 +30,7 @@ typedef enum {
 typedef struct {
     uint64_t now_us;
     uint64_t rates_us;    /* of the sample of the rates */
+    uint64_t filter_us;   /* delay of the filters of the rates: y is of the instant before it */
     uint64_t setpoint_us; /* of the setpoint */
     bool enabled, armed, has_rates, landed;
     float rates[3];
