@@ -60,7 +60,7 @@ struct ScheduledWorkItem {
 private:
 	virtual void Run() = 0;
 };
-enum class params { RDI_EN, RDI_AUX, RDI_MAX_AGE, RDI_MAX_ERR, IMU_GYRO_CUTOFF };
+enum class params { RDI_EN, RDI_AUX, RDI_MAX_AGE, RDI_MAX_ERR, IMU_GYRO_CUTOFF, IMU_GYRO_RATEMAX };
 }
 template <px4::params> struct ParamInt { int32_t get() const; };
 template <px4::params> struct ParamFloat { float get() const; };
@@ -68,7 +68,7 @@ struct ModuleParams {
 	explicit ModuleParams(ModuleParams *) {}
 	void updateParams();
 };
-#define DEFINE_PARAMETERS(a, b, c, d, e) PX4_DECLARE(a) PX4_DECLARE(b) PX4_DECLARE(c) PX4_DECLARE(d) PX4_DECLARE(e)
+#define DEFINE_PARAMETERS(a, b, c, d, e, f) PX4_DECLARE(a) PX4_DECLARE(b) PX4_DECLARE(c) PX4_DECLARE(d) PX4_DECLARE(e) PX4_DECLARE(f)
 #define PX4_DECLARE(x) PX4_TYPE x;
 #define PX4_TYPE(...) __VA_ARGS__
 

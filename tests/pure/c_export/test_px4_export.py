@@ -49,7 +49,9 @@ WARNINGS = ("-Wshadow", "-Wfloat-equal", "-Wdouble-promotion")  # of PX4
     REFUSED,
     FAILSAFE,
     DIVERGED,
-) = range(11)
+    _,
+    SLOW,
+) = range(13)
 
 
 class Cycle(ctypes.Structure):
@@ -88,11 +90,11 @@ int host_run(rise_di_rates *rates, const rise_di_cycle *cycle, float *torque, do
 class Shell:
     """The decisions of the module, with a clock of its own: a cycle a period."""
 
-    def __init__(self, library: Path) -> None:
+    def __init__(self, library: Path, rate: float = 250.0) -> None:
         self._library = ctypes.CDLL(str(library))
         self._library.host_bytes.restype = ctypes.c_ulong
         self._memory = ctypes.create_string_buffer(self._library.host_bytes())
-        self._library.rise_di_rates_start(self._memory)
+        self._library.rise_di_rates_start(self._memory, ctypes.c_float(rate))
         self.now_us = 1_000_000
         self.torque = np.zeros(3, dtype=np.float32)
         self.values = np.zeros(21)  # y_m, u; then what rise_di_status has
@@ -169,6 +171,12 @@ def test_spare_flies_until_all_is_ready(shell: Shell) -> None:
         assert shell.fly(3, **changes) == [refusal] * 3
         assert (shell.torque == np.array(shell.spare, dtype=np.float32)).all()
     assert shell.run() == FLIES
+
+
+def test_spare_flies_on_where_the_rates_come_too_slowly(library: Path) -> None:
+    """The rate of the export is 250 Hz; samples may come faster."""
+    assert Shell(library, 200.0).fly(3) == [SLOW] * 3
+    assert Shell(library, 400.0).run() == FLIES
 
 
 def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:

@@ -62,8 +62,7 @@ void Plane::rise_di()
     static bool begun = false;
 
     if (!begun) {
-        rise_di_rates_start(&rates);
-        rates.started = rates.started && rise_di_rates_is_fast_enough((float)scheduler.get_loop_rate_hz());
+        rise_di_rates_start(&rates, (float)scheduler.get_loop_rate_hz());
         begun = true;
     }
 

@@ -30,7 +30,10 @@ class RiseDiControl : public ModuleBase<RiseDiControl>, public ModuleParams, pub
 public:
 	RiseDiControl() : ModuleParams(nullptr), ScheduledWorkItem(MODULE_NAME, px4::wq_configurations::nav_and_controllers)
 	{
-		rise_di_rates_start(&_rates);
+		rise_di_rates_start(&_rates, (float)_fastest.get());
+
+		if (_rates.slow) { PX4_ERR("fw_rate_control flies on: %s", rise_di_refusal_text(RISE_DI_SLOW)); }
+
 		_torque_pub.advertise();
 		_thrust_pub.advertise();
 		_status_pub.advertise();
@@ -79,7 +82,8 @@ private:
 		(ParamInt<px4::params::RDI_AUX>) _aux,
 		(ParamFloat<px4::params::RDI_MAX_AGE>) _max_age,
 		(ParamFloat<px4::params::RDI_MAX_ERR>) _max_error,
-		(ParamFloat<px4::params::IMU_GYRO_CUTOFF>) _cutoff
+		(ParamFloat<px4::params::IMU_GYRO_CUTOFF>) _cutoff,
+		(ParamInt<px4::params::IMU_GYRO_RATEMAX>) _fastest
 	)
 };
 

@@ -39,6 +39,8 @@ static rise_di_refusal refusal_before(const rise_di_rates *rates, const rise_di_
     rise_di_refusal refusal = rates->latched;
     if (!rates->started) {
         refusal = RISE_DI_REFUSED;
+    } else if (rates->slow) {
+        refusal = RISE_DI_SLOW;
     } else if (!cycle->enabled) {
         refusal = RISE_DI_OFF;
     } else if (!cycle->armed) {
@@ -160,11 +162,12 @@ static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, ri
     return refusal;
 }
 
-void rise_di_rates_start(rise_di_rates *rates) {
+void rise_di_rates_start(rise_di_rates *rates, float rate) {
     rates->parameters[0] = exported;
     rates->parameters[1] = exported;
     rates->parameters[1].digest = exported.digest + 1U;
     rates->started = rise_di_start(&rates->controller, rates->parameters);
+    rates->slow = (rate * (float)exported.period_ns) < 0.99e9f;
     rise_di_reference_start(&rates->reference, &model);
     rates->refusal = RISE_DI_OFF;
     rates->latched = RISE_DI_FLIES;
@@ -185,8 +188,6 @@ void rise_di_rates_start(rise_di_rates *rates) {
         rates->handover[k] = 0.0f;
     }
 }
-
-bool rise_di_rates_is_fast_enough(float rate) { return (rate * (float)exported.period_ns) > 0.99e9f; }
 
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle) {
     const bool fresh = cycle->rates_us > rates->last_us;
@@ -231,6 +232,7 @@ const char *rise_di_refusal_text(rise_di_refusal refusal) {
         "none", "off", "not armed", "no rate control in this mode", "landed", "stale rates", "stale setpoint",
         "a rate or a setpoint that is not finite", "compiler flags that change the bits", "failsafe of the law",
         "a rate too far from its reference", "a torque that is not finite",
+        "rates slower than the controller: export it with --set rate",
     };
     return texts[refusal];
 }

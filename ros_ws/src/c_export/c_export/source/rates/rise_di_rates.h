@@ -23,7 +23,8 @@ typedef enum {
     RISE_DI_REFUSED = 8,        /* wrong compiler flags */
     RISE_DI_FAILSAFE = 9,       /* of the law; this and the next two until not enabled */
     RISE_DI_DIVERGED = 10,      /* a rate is too far from its reference */
-    RISE_DI_WRONG_TORQUE = 11   /* not finite */
+    RISE_DI_WRONG_TORQUE = 11,  /* not finite */
+    RISE_DI_SLOW = 12           /* the rates come slower than the controller's rate */
 } rise_di_refusal;
 
 /* What a cycle takes. */
@@ -46,6 +47,7 @@ typedef struct {
     rise_di_controller controller;
     rise_di_reference reference;
     bool started;
+    bool slow; /* the rates come slower than a tick a period needs */
     rise_di_refusal refusal;
     rise_di_refusal latched; /* one of the last three, or RISE_DI_FLIES */
     uint64_t last_us;        /* sample of the rates of the last cycle */
@@ -62,11 +64,8 @@ typedef struct {
     float handover[3];       /* the last torque less that of the spare when it took over; fades */
 } rise_di_rates;
 
-/* Begin with the spare. */
-void rise_di_rates_start(rise_di_rates *rates);
-
-/* Whether samples of this rate, Hz, are enough for a tick a period. */
-bool rise_di_rates_is_fast_enough(float rate);
+/* Begin with the spare. `rate`, Hz, of the samples of the rates: below that of the controller the spare flies on. */
+void rise_di_rates_start(rise_di_rates *rates, float rate);
 
 /* A cycle, at each sample of the rates and when these stop. Returns whether RISE-DI flies; rates->torque is to be sent. */
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle);
