@@ -61,6 +61,8 @@ class Kind(NamedTuple):
     takes: Callable[[Any], bool]  # whether a value has the type
     # (value of the type, key, problems) -> the value in the set
     content: Callable[[Any, str, Problems], Any]
+    # whether all values of a list are permitted as they are: most of a scenario are matrices
+    takes_all: Callable[[Sequence[Any]], bool] = lambda _: False
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
         """The value for the set. A value not permitted adds a sentence to `problems`."""
@@ -106,10 +108,20 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
                 )
         return number
 
+    def takes_all(values: Sequence[Any]) -> bool:
+        if kind is not float or set(map(type, values)) != {float}:
+            return False
+        ends = (min(values), max(values))
+        in_limits = all(holds(end, limit) for holds, _, limit in checks for end in ends)
+        return in_limits and all(map(math.isfinite, values))
+
     types = (int, kind)
     expected = "an integer" if kind is int else "a number"
     return Kind(
-        expected, lambda value: isinstance(value, types) and not isinstance(value, bool), content
+        expected,
+        lambda value: isinstance(value, types) and not isinstance(value, bool),
+        content,
+        takes_all,
     )
 
 
@@ -158,6 +170,8 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
 
     def content(value: Sequence[Any], key: str, problems: Problems) -> tuple[Any, ...]:
         _check_count(len(value), key, problems, least, most)
+        if repeated and value and kinds[0].takes_all(value):
+            return tuple(value)
         each = zip(kinds * len(value) if repeated else kinds, value, strict=False)
         return tuple(
             kind.read(item, f"{key}[{i}]", problems) for i, (kind, item) in enumerate(each)

@@ -6,7 +6,7 @@ delay margin.
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import Measurements, TunedLaw, fields, restored
 from rise_di_controller.law import LawParams, Sign, total_lag
+from rise_di_controller.observer import ObserverParams
 
 SPECTRAL_RADIUS_TOLERANCE = 1e-6
 """A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a
@@ -22,6 +23,8 @@ double eigenvalue 1, which rounding splits by the root of the rounding error, 1e
 MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
 of this stack."""
+
+NEAR = 4  # of the resolution, first step of the search about the delay margin of a loop nearby
 
 ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
 
@@ -81,6 +84,10 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     sets = () if candidates is None else (candidates,)
+    at_once = candidates is None and _takes_columns(params)
+    if at_once:
+        params = _for_columns(params)
+        sets = (1,)
     zero = np.zeros((m, *sets))
     vanes = getattr(params, "vanes", None)
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
@@ -107,14 +114,37 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
     equilibrium = step(begin[:size], begin[size:])
-    units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
-    columns = [
-        (step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL for unit in units
-    ]
-    matrix = np.array(columns).T
+    if at_once:
+        moved = begin + SMALL * np.eye(size + wide)
+        matrix = (step(moved[:size], moved[size:]) - equilibrium) / SMALL
+    else:
+        units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
+        columns = [
+            (step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL
+            for unit in units
+        ]
+        matrix = np.array(columns).T
     above = matrix[..., :size, :]
     below = matrix[..., size:, :]
     return LinearLaw(above[..., :size], above[..., size:], below[..., :size], below[..., size:])
+
+
+def _takes_columns(params: Any) -> bool:
+    """Whether a law is known to take columns side by side: RISE-DI, also under an observer."""
+    if isinstance(params, ObserverParams) and params.vanes is None:
+        params = params.law
+    return isinstance(params, LawParams)
+
+
+def _for_columns(params: Any) -> Any:
+    """Parameters of a law for columns side by side: a vector (k,) becomes (k, 1)."""
+    values = []
+    for value in params:
+        if hasattr(value, "_asdict"):
+            values.append(_for_columns(value))
+        else:
+            values.append(value[:, None] if np.ndim(value) == 1 else value)
+    return type(params)(*values)
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
@@ -255,23 +285,42 @@ def delay_margin(
     loop: Loop,
     channel: int | None = None,
     longest: float = MAX_DELAY_MARGIN,
+    near: float | None = None,
 ) -> float:
     """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all
     channels or in `channel`.
 
     0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The
-    search takes steps of half a period, then bisects down to 0.1 ms.
+    search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a loop
+    `near` this one, s, the search begins there, in a third of the time.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
-    if not is_stable(plant, law, loop, 0.0 * delayed):
+    stride = 1  # in parts of 0.1 ms or less
+    while loop.period / 2.0 / stride > 1e-4:
+        stride *= 2
+    part = loop.period / 2.0 / stride
+
+    def stable(place: int) -> bool:
+        return is_stable(plant, law, loop, place * part * delayed)
+
+    lower = 0
+    growth = 1
+    if near is not None and 0.0 < near < longest:
+        lower = round(near / part)
+        stride = NEAR
+        growth = 2
+        while lower > 0 and not stable(lower):
+            lower = max(lower - stride, 0)
+            stride *= growth
+        stride = max(stride // growth, NEAR)
+    if lower == 0 and not stable(0):
         return 0.0
-    lower = 0.0
-    stride = loop.period / 2.0
-    while is_stable(plant, law, loop, (lower + stride) * delayed):
+    while stable(lower + stride):
         lower += stride
-        if lower > longest:
+        stride *= growth
+        if lower * part > longest:
             return math.inf
-    while stride > 1e-4:
-        stride /= 2.0
-        lower += stride * is_stable(plant, law, loop, (lower + stride) * delayed)
-    return lower
+    while stride > 1:
+        stride //= 2
+        lower += stride * stable(lower + stride)
+    return lower * part

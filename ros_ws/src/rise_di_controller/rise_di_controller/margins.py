@@ -349,7 +349,10 @@ def _refined(
     falsi, Illinois.
     """
     aircraft, place, channel = places
-    forms = SchurForm(*(part[aircraft] for part in form))
+    # of the input of each crossing alone
+    forms = SchurForm(
+        form.T[aircraft], form.R[aircraft, :, channel, None], form.L[aircraft, None, channel]
+    )
     low = w[aircraft, place]
     high = w[aircraft, place + 1]
     at_low = values[aircraft, place, channel]
@@ -363,7 +366,7 @@ def _refined(
             gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap)
         )
         S = _sensitivity(forms, np.exp(1j * middle * period)[:, None])[:, 0]
-        L = 1.0 / S[np.arange(len(low)), channel, channel] - 1.0
+        L = 1.0 / S[:, 0, 0] - 1.0
         value = residual(L)
         side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
         share = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved

@@ -3,6 +3,7 @@
 """Files of tuned gains: a file per scenario, with gains by law and objective."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,6 +50,12 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
     """
     if not path.exists():
         return {}
+    return {law: dict(sets) for law, sets in _load(path, path.stat().st_mtime_ns).items()}
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
+    """`load`, once for each state of a file: a learner designs every few seconds."""
     content = read_yaml(path, path.name, "a file of tuned gains")
     try:
         laws = content["laws"].items()
