@@ -27,7 +27,7 @@ from flight_campaign.statistics import score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
-from flight_design.learning.scenario_learner import learner
+from flight_design.learning.scenario_learner import quick_learner
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SCENARIO, DURATION = "osprey_learn", 64.0  # s
@@ -88,7 +88,7 @@ def main(
     definition = define(find_scenario(SCENARIO, DURATION), aircraft, UNCERTAINTY, SEED, aircraft)
     flown = [definition.aircraft_scenario(number) for number in range(aircraft)]
     true = scores(definition, [knowing(each) for each in flown])  # compiles the loop, too
-    make = learner(flown[0])
+    make = quick_learner(flown[0])
     assert make is not None  # noqa: S101 - the scenario learns
     begin = time.process_time()
     learned = scores(definition, [make] * aircraft)

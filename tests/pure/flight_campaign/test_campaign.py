@@ -370,13 +370,36 @@ def test_flight_that_falls_back_is_that_of_the_single_process(
         assert {name: row[name] for name in alone} == alone
 
 
-def test_learner_finds_the_same_side_by_side(tmp_path: Path) -> None:
+def kept(learners: list[Any], make: Callable[[Scenario], Learn | None]) -> Any:
+    """Learners as made, each also put into a list."""
+
+    def learner(scenario: Scenario) -> Learn:
+        learn = make(scenario)
+        assert learn is not None
+
+        def made(parameters: RiseDiConfig) -> Any:
+            learners.append(learn(parameters))
+            return learners[-1]
+
+        return made
+
+    return learner
+
+
+def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(tmp_path: Path) -> None:
     scenario = learning(11.5, updates=[10.0])
-    campaign = flown_rows(tmp_path / "real", scenario, scenario_learner.learner, 1)
+    learners: list[Any] = []
+    quick = kept(learners, scenario_learner.quick_learner)
+    campaign = flown_rows(tmp_path / "real", scenario, quick, 1)
     row = campaign.rows().collect().row(0, named=True)
     assert (row["first_model"], row["models"]) == (10.5, 1)
-    alone = flown_alone(campaign, 0, scenario_learner.learner)
-    assert {name: row[name] for name in alone} == approx(alone, rel=SIDE_BY_SIDE)
+    alone = flown_alone(campaign, 0, kept(learners, scenario_learner.learner))
+    # the searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations
+    entries = [each.identification.entries for each in learners]
+    for near, thorough in zip(*entries, strict=True):
+        assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
+    # half the steps of a design: a relaxation larger by 10 % moves an rms by 0.5 %
+    assert {name: row[name] for name in alone} == approx(alone, rel=1e-2)
 
 
 @pytest.mark.parametrize(

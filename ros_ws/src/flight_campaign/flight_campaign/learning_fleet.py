@@ -182,22 +182,24 @@ class LearningFleet:
         assert parameters.learn is not None  # noqa: S101 - for the type checker
         updates = Updates(parameters.learn)
         latency_ns = nanoseconds(parameters.learn.latency)
-        ticks = range(len(course.segments.t))
-        self._due = [k for k in ticks if updates.due(k * self._period_ns)]
-        # A proposal acts before the first tick of its latency after the tick where it is due.
-        self._acting = {max(k + 1, k - (-latency_ns // self._period_ns)) for k in self._due} & set(
-            ticks
-        )
+        # A proposal acts before the first tick of its latency after the tick where it is due. One
+        # that would act after the flight is not made.
+        self._acting = {}
+        for k in range(len(course.segments.t)):
+            acting = max(k + 1, k - (-latency_ns // self._period_ns))
+            if updates.due(k * self._period_ns) and acting < len(course.segments.t) - 1:
+                self._acting[k] = acting
 
     def fly(self) -> tuple[FleetResult, list[Outcome]]:
         """The figures of the flights, and what the learning of each came to."""
         count = len(self._course.segments.t)
-        ends = sorted({*(k + 1 for k in self._due), *self._acting, count})
+        acting = set(self._acting.values())
+        ends = sorted({*(k + 1 for k in self._acting), *acting, count})
         state = self._begin()
         for first, last in pairwise([0, *ends]):
             state = self._span(state, first, last)
             self._learn(state, first, last)
-            if last in self._acting:
+            if last in acting:
                 state = self._changed(state, last)
         result = batch_loop.figures(state.loop, count, self._course.period, None, self._timing)
         bounded = np.asarray(state.loop.bounded)
@@ -258,7 +260,8 @@ class LearningFleet:
                 continue
             each.watch(its_y - segments.sampled_y_m[ticks], segments.dt[ticks].tolist())
             each.take(stamp_ns, its_y, its_u)
-            if each.learning.ticked(each.controller, stamp_ns[-1]) and not each.left_loop:
+            due = each.learning.ticked(each.controller, stamp_ns[-1]) and last - 1 in self._acting
+            if due and not each.left_loop:
                 each.propose(stamp_ns[-1])
 
     def _changed(self, state: FleetState, k: int) -> FleetState:

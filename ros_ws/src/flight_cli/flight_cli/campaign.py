@@ -46,7 +46,7 @@ from flight_cli.output import (
 from flight_cli.words import argument, json_option, option, require_unused, setting
 from flight_core.files import display_path, writing
 from flight_core.parameters import require
-from flight_design.learning.scenario_learner import learner
+from flight_design.learning.scenario_learner import quick_learner
 
 # options of a new campaign
 OF_DEFINITION = (
@@ -160,7 +160,7 @@ class Campaign:
     def _begun(self) -> MonteCarlo:
         """A new campaign of the scenario."""
         chosen = find_scenario(self.scenario, self.duration)
-        learner(chosen)  # refuses what the aircraft could not learn with
+        quick_learner(chosen)  # refuses what the aircraft could not learn with
         spread = chosen.aircraft.uncertainty.spread()
         if self.entry is not None:
             entries = _named_numbers("entry", self.entry, "A[q,alpha]=0.6")
@@ -249,7 +249,7 @@ def _fly_missing(
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
             task = bar.add_task("aircraft", total=total, completed=stored, shown=f"starting{place}")
-            for flights in monte_carlo.fly(engine, learner):
+            for flights in monte_carlo.fly(engine, quick_learner):
                 flown += flights
                 speed = flown * seconds / (time.monotonic() - begin)
                 bar.update(

@@ -18,7 +18,7 @@ from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import write_results
 from flight_core.arguments import FilePath, as_count, as_number, as_path
 from flight_core.parameters import ParameterError, require
-from flight_design.learning.scenario_learner import learner
+from flight_design.learning.scenario_learner import quick_learner
 
 if TYPE_CHECKING:
     import polars as pl
@@ -116,7 +116,7 @@ def fly_campaign(
     definition = define(
         chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
     )
-    learner(chosen)  # refuses what the aircraft could not learn with
+    quick_learner(chosen)  # refuses what the aircraft could not learn with
     flies = _engine(definition, workers)
     report = _progress(progress)
     folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
@@ -193,7 +193,7 @@ def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> Camp
     missing = campaign.missing()
     total = definition.aircraft * definition.cases
     flown = total - sum(definition.size(job) for job in missing)
-    for flights in campaign.fly(engine, learner):
+    for flights in campaign.fly(engine, quick_learner):
         flown += flights
         progress(flown, total)
     figures, _ = write_results(campaign)

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -396,6 +397,7 @@ def observed(
     uncertain: bool = True,
     sketched: bool = False,
     speeds: tuple[float, float] | None = None,
+    quick: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
@@ -405,7 +407,8 @@ def observed(
     the total lag; else they follow from the lags by a rule. Of several gain sets it is the one that
     the margins change least, then the one of the least cost. `uncertain` counts the phase margin of
     uncertain aircraft too, `sketched` takes the gains for a model from a sketch, and `speeds` are
-    two ratios to the trim speed, with models there. `progress` as for `with_aircraft_observer`.
+    two ratios to the trim speed, with models there. `quick` and `progress` as for
+    `with_aircraft_observer`.
     """
     channels = scenario.aircraft.channels().outputs
     by_name = dict(
@@ -431,6 +434,7 @@ def observed(
         vanes,
         uncertain=uncertain,
         speeds=speeds,
+        quick=quick,
         progress=progress,
     )
     origin = origins[selected.place]
@@ -482,11 +486,17 @@ def _gain_sets(
     ]
 
 
+@lru_cache
+def _shipped(name: str) -> Scenario:
+    """A scenario of the library, read once: a learner designs every few seconds."""
+    return find_scenario(name)
+
+
 def _tuned_scenario(scenario: Scenario) -> Scenario:
     """The scenario itself if it has tuned gains, else one that ships with the same airframe and
     actuators and has them.
     """
-    shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
+    shipped = (_shipped(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
     model = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
     equal = (
         candidate

@@ -44,6 +44,8 @@ RELAXATION = 1.05
 """Factor by which `effort` rises, and K and the integral fall, in a step of the search for the
 margins."""
 
+LATE = 1e-3  # of its fraction: what a delay margin that is too small counts in a quick search
+
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
@@ -117,6 +119,12 @@ class MarginSearch(NamedTuple):
     needed: Requirement
     vanes: VanesConfig | None = None
     others: Sequence[AtSpeed] = ()  # speeds whose margins count too
+    quick: bool = False  # steps twice as long, and first the delay margin alone
+
+    @property
+    def step(self) -> float:
+        """Factor of a step."""
+        return RELAXATION**2 if self.quick else RELAXATION
 
     @property
     def nominal(self) -> LinearPlant:
@@ -138,7 +146,7 @@ class MarginSearch(NamedTuple):
         Raises ParameterError for margins out of reach.
         """
         search = self._replace(needed=above_zeros(self.needed, self.nominal))
-        steps = RELAXATION ** np.eye(len(self.model.lag))
+        steps = self.step ** np.eye(len(self.model.lag))
         selected = search._best(np.ones((1, len(steps))))
         fractions = [selected.fraction]
         while True:
@@ -150,11 +158,12 @@ class MarginSearch(NamedTuple):
             if selected.relaxation.max() > MAX_RELAXATION or stalled:
                 raise search._refusal(selected)
             if selected.fraction < 1.0:
-                stepped = search._best(selected.relaxation * steps)
+                near = selected.delay_margin
+                stepped = search._best(selected.relaxation * steps, near)
                 selected = (
                     stepped
                     if stepped.fraction > selected.fraction
-                    else search._best(selected.relaxation[None] * RELAXATION)
+                    else search._best(selected.relaxation[None] * self.step, near)
                 )
                 fractions.append(selected.fraction)
                 continue
@@ -164,9 +173,9 @@ class MarginSearch(NamedTuple):
             selected = search._best(selected.relaxation * steps[[weak]])
             fractions = []
 
-    def _best(self, relaxations: FloatArray) -> SelectedObserver:
+    def _best(self, relaxations: FloatArray, near: float | None = None) -> SelectedObserver:
         """The first with the largest fraction; loop margins only where the delay margin leaves a
-        chance.
+        chance. `near` is the delay margin of the step before.
         """
         controllers = [
             _parameters(
@@ -174,7 +183,7 @@ class MarginSearch(NamedTuple):
             )
             for relaxation in relaxations
         ]
-        delayed = [self._delayed(controller, self.nominal) for controller in controllers]
+        delayed = [self._delayed(controller, self.nominal, near) for controller in controllers]
         fractions = [self._delay_fraction(delay) for _, delay in delayed]
         candidates: dict[int, SelectedObserver] = {}
         for k in sorted(range(len(delayed)), key=lambda k: -fractions[k]):
@@ -182,6 +191,9 @@ class MarginSearch(NamedTuple):
             if candidates and fractions[k] < best:
                 break
             laws, delay = delayed[k]
+            if self.quick and fractions[k] < 1.0:
+                late = LATE * fractions[k]
+                return SelectedObserver(controllers[k], delay, np.nan, late, relaxations[k])
             phase, fraction = self._margin_fraction(controllers[k], laws, self.nominal)
             elsewhere = (
                 self._fraction_at(speed, controllers[k], relaxations[k]) for speed in self.others
@@ -193,12 +205,14 @@ class MarginSearch(NamedTuple):
         )
 
     def _delayed(
-        self, controller: RiseDiConfig, plant: LinearPlant
+        self, controller: RiseDiConfig, plant: LinearPlant, near: float | None = None
     ) -> tuple[list[LinearLaw], float]:
         """The laws, for every set of vanes in use, and the least delay margin, s."""
         laws = _laws(controller)
         longest = DELAYS * self.margin
-        return laws, min(delay_margin(plant, law, self.loop, longest=longest) for law in laws)
+        return laws, min(
+            delay_margin(plant, law, self.loop, longest=longest, near=near) for law in laws
+        )
 
     def _delay_fraction(self, delay: float) -> float:
         return delay / (self.margin + RESOLUTION) if self.margin > 0.0 else 1.0

@@ -25,6 +25,7 @@ STARTS = (
     13,
 )  # levels with which the search begins: calm air, light and moderate turbulence, gusts
 TURBULENT = STARTS[2]
+ALIKE = 0.8  # of the spans: so many have the same level where `fit_alike` takes it for all
 SIGNS = (-1.0, 1.0)  # of the effect of the slope of the vertical wind on q, in two further starts
 # at most, of each start, and of the search from one of the best
 START_STEPS = 8
@@ -81,7 +82,34 @@ class Search(Likelihood):
         best = min(ends, key=lambda end: end.cost)
         same = np.full_like(best.levels, np.bincount(best.levels).argmax())
         steady = self._refined(best.theta, same, used, progress)
-        best = min(best, steady, key=lambda end: end.cost)
+        return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
+
+    def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
+        """The minimum of `fit` in air that is the same in every span, from one start: the model
+        that has `flown`, or the nominal one, in moderate turbulence.
+
+        None where fewer than ALIKE of the spans have the same level.
+        """
+        coarse = self.coarse
+        free = np.ones(len(self.prior), dtype=bool)
+        free[self._winds] = flown is not None
+        begin = np.zeros(len(self.prior)) if flown is None else flown
+        turbulent = np.full(len(coarse._spans), TURBULENT)
+        theta = self._started(begin, turbulent, free, lambda: None)
+        counts = np.bincount(coarse.levels(theta))
+        if counts.max() < ALIKE * counts.sum():
+            return None
+        same = np.full(len(self._spans), counts.argmax())
+        return self._fit_at(self._refined(theta, same, used, lambda: None), same, used, flown)
+
+    def _fit_at(
+        self,
+        best: End,
+        same: NDArray[np.int64],
+        used: NDArray[np.bool_],
+        flown: FloatArray | None,
+    ) -> Fit:
+        """The fit at the end of a search, `same` the level that most of its spans have."""
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
 

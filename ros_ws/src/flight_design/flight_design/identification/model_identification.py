@@ -164,6 +164,25 @@ class _Study(NamedTuple):
             else advantage(fit.before, fit.flown, span_length(self.recorded)),
         )
 
+    def fit(
+        self,
+        search: Search,
+        used: NDArray[np.bool_],
+        progress: Callable[[], None],
+        flown: Airframe | None,
+        *,
+        quick: bool,
+    ) -> tuple[Fit, Part]:
+        """The most probable theta of a block, and the model."""
+        also = None if flown is None else search.model_errors(flown)
+        alike = search.fit_alike(used, also) if quick else None
+        if alike is not None:
+            part = self.part(search, alike)
+            if not part.refusal and part.after.whiteness.max() <= MAX_WHITENESS:
+                return alike, part
+        fit = search.fit(used, progress, flown=also)
+        return fit, self.part(search, fit)
+
 
 def identify(
     recorded: Recording,
@@ -176,14 +195,17 @@ def identify(
     flown: Airframe | None = None,
     *,
     may_couple: bool = True,
+    quick: bool = False,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
     keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
     bound; `unknown` what else is identified; `flown` the model in flight, a further start;
-    `may_couple` whether parts may become one; `progress` takes the steps `completed` and their
-    largest number `total`. Raises ParameterError for an output that does not move.
+    `may_couple` whether parts may become one; `quick` whether the search of a part begins once,
+    where the air is the same in every span and the model may be used; `progress` takes the steps
+    `completed` and their largest number `total`. Raises ParameterError for an output that does not
+    move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
@@ -203,10 +225,11 @@ def identify(
         progress(completed=next(step_count), total=total)
 
     fits = []
+    parts = []
     for search in (study.search(model, block) for block in every):
-        also = None if flown is None else search.model_errors(flown)
-        fits.append((search, search.fit(used, step, flown=also)))
-    parts = [study.part(*each) for each in fits]
+        fit, part = study.fit(search, used, step, flown, quick=quick)
+        fits.append((search, fit))
+        parts.append(part)
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
     follows = [

@@ -115,6 +115,8 @@ class Learner:
         delay: float = 0.0,
         rough: Unknown = KNOWN,
         design_of_rough: Design | None = None,
+        *,
+        quick: bool = False,
     ) -> None:
         """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling
         and lags. `design_of_rough` designs for a model that errs: by it the rough model flies from
@@ -122,7 +124,8 @@ class Learner:
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances. With
         more noise than DRIFT the aircraft is not tested for a change: the disturbances stand for a
-        change, and for a dead input. Raises ParameterError for a controller that does not learn.
+        change, and for a dead input. `quick` is that of `identify`. Raises ParameterError for a
+        controller that does not learn.
         """
         settings = controller.learn
         require(
@@ -139,6 +142,7 @@ class Learner:
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
         self._believed = rough
+        self._quick = quick
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
@@ -419,6 +423,7 @@ class Learner:
             at_bound=AT_BOUND,
             unknown=unknown,
             may_couple=self._record.is_full,
+            quick=self._quick,
         )
         prior = self._prior
         model = self.model
