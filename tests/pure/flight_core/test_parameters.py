@@ -311,15 +311,7 @@ SET_BY_THE_FLIGHT = {
 """Keys that `rise-di fly` and the launch files set, by the scenario and the options."""
 IN_NO_FILE = {
     "aircraft.commands",  # by the airframe of JSBSim: docs/aircraft.md has a line
-    "aircraft.shear.exponent",  # the power law in place of the log law
-    "guidance.landing",  # docs/guidance.md has a landing, tests/pure/flight_guidance flies it
-    *(f"guidance.landing.{key}" for key in ("waypoint", "flare", "sink", "decrab", "V")),
-    "controller.allocation.priority",
     *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
-    *(f"controller.probe{key}" for key in ("", ".effect", ".lowest", ".window", ".false_alarm")),
-    *(f"controller.{key}" for key in ("amplitude", "width", "period", "lowest", "highest")),
-    "controller.pause",  # with these of `excitation`, which `rise-di identify --bridge` writes
-    *("controller.bandwidth", "controller.Omega"),  # of L1, which `rise-di compare` writes
     *(f"controller.learn.{key}" for key in ("prior", "prior.file", "prior.off", "without")),
 }
 """Keys that no shipped and no example file sets. The list only shrinks."""

@@ -452,19 +452,14 @@ def _spread(
         label_, factor = _label(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
             x, y = _density(tally.figures.get(name, Figure()))
-            line = {
-                "type": "scatter",
-                "x": x * factor,
-                "y": 100.0 * y,
-                "mode": "lines",
-                "name": label,
+            style = {
                 "legendgroup": label,
                 "fill": "tozeroy",
                 "line": {"color": colour, "width": 1.4, "shape": "hvh"},
                 "showlegend": place == 0 and len(labels) > 1,
                 "hovertemplate": "%{y:.3g} % around %{x:.3g}",
             }
-            figure.add(line, place)
+            figure.add_scatter(label, x * factor, 100.0 * y, place, **style)
         figure.x[place] |= {"title": {"text": label_}, "type": "log"}
         figure.y[place] |= {"title": {"text": "%"}, "rangemode": "tozero"}
     return set_layout(figure, below=44)
@@ -493,13 +488,9 @@ def _sweep(definition: Definition, tallies: Sequence[Tally]) -> plotting.Figure 
         curves[label] = [score.quantile(share) for score in scores]
     curves["worst"] = [score.largest for score in scores]
     for (label, values), colour in zip(curves.items(), COLOURS, strict=True):
-        look = {
-            "type": "scatter",
-            "mode": "lines+markers",
-            "name": label,
-            "line": {"color": colour},
-        }
-        figure.add(look | {"x": np.array(definition.sweep.factors), "y": np.array(values)})
+        factors = np.array(definition.sweep.factors)
+        line = {"color": colour}
+        figure.add_scatter(label, factors, np.array(values), mode="lines+markers", line=line)
     figure.x[0] |= {"title": {"text": f"{definition.sweep.parameter} times"}, "type": "log"}
     figure.y[0] |= {"title": {"text": "score"}, "rangemode": "tozero"}
     return set_layout(figure, below=44)

@@ -263,20 +263,14 @@ def learned_figure(context: PlotContext) -> Figure | None:
     figure = Figure(len(known), columns, 110, spacing=0.06)
     for index, name in enumerate(known):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
-        marks = {
-            "type": "scatter",
-            "x": t,
-            "y": values[name],
-            "mode": "markers",
-            "name": name,
-            "error_y": bars,
-        }
         style = {
+            "error_y": bars,
             "marker": {"color": PLANT, "size": 7, "symbol": symbols},
             "showlegend": False,
             "cliponaxis": False,
+            "hovertemplate": "%{y:.4g} at %{x:.1f} s",
         }
-        figure.add(marks | style | {"hovertemplate": "%{y:.4g} at %{x:.1f} s"}, index)
+        figure.add_scatter(name, t, values[name], index, "markers", **style)
         figure.x[index] |= {
             "range": [0.0, context.end],
             "showticklabels": index + columns >= len(known),
@@ -309,18 +303,13 @@ def spectrum_figure(
         frequency, densities = spectra(tape["u"], period_ns)
         for name, density in densities.items():
             unit, factor = units.get(name, NO_UNIT)
-            line = {
-                "type": "scatter",
-                "x": frequency,
-                "y": density * factor,
-                "mode": "lines",
-                "name": label,
+            style = {
                 "line": {"color": colours[label], "width": 1.4},
                 "legendgroup": label,
                 "showlegend": len(runs) > 1 and first_in_legend(figure, label),
                 "hovertemplate": f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
             }
-            figure.add(line, channels.index(name))
+            figure.add_scatter(label, frequency, density * factor, channels.index(name), **style)
     for name, x, y in zip(channels, figure.x, figure.y, strict=True):
         title = {"text": f"{name} ({units.get(name, NO_UNIT).unit}/√Hz)"}
         y |= {"type": "log", "dtick": 1, "exponentformat": "power", "title": title}

@@ -94,15 +94,9 @@ def track_figure(
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
-    ends = {
-        "x": pose["east"][[0, -1]],
-        "y": pose["north"][[0, -1]],
-        "text": ["start", "end"],
-        "name": "start and end",
-    }
-    _add_labels(
-        figure, ends | {"marker": {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}}
-    )
+    ends = [pose[name][[0, -1]] for name in ("east", "north")]
+    mark = {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}
+    _add_labels(figure, "start and end", *ends, text=["start", "end"], marker=mark)
     for route in routes:
         _add_numbers(figure, route)
     if fence is not None:
@@ -111,30 +105,17 @@ def track_figure(
     return set_layout(figure, labels=16)
 
 
-def _add_labels(figure: Figure, trace: dict[str, Any]) -> None:
-    labels = {
-        "type": "scatter",
-        "mode": "markers+text",
-        "textposition": "top center",
-        "hoverinfo": "skip",
-        "showlegend": False,
-    }
-    figure.add(labels | trace)
+def _add_labels(
+    figure: Figure, name: str, east: Any, north: Any, mode: str = "markers+text", **style: Any
+) -> None:
+    labels = {"textposition": "top center", "hoverinfo": "skip", "showlegend": False}
+    figure.add_scatter(name, east, north, mode=mode, **labels | style)
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
     places = leg_places(route)
     north, east = (np.array(values) for values in zip(*places.values(), strict=True))
-    _add_labels(
-        figure,
-        {
-            "x": east,
-            "y": north,
-            "text": [f"{number}" for number in places],
-            "mode": "text",
-            "name": "legs",
-        },
-    )
+    _add_labels(figure, "legs", east, north, "text", text=[f"{number}" for number in places])
 
 
 def _add_fence(figure: Figure, fence: Fence) -> None:
@@ -147,19 +128,10 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
             east = zone.east[0] + zone.radius * np.sin(turn)
         line = {"color": END_STOP, "width": 2.0, "dash": "dot" if zone.exclude else "solid"}
         name = "keep out" if zone.exclude else "fence"
-        figure.add(
-            {
-                "type": "scatter",
-                "x": east,
-                "y": north,
-                "mode": "lines",
-                "name": name,
-                "line": line,
-                "hoverinfo": "skip",
-            }
-        )
-    home = {"x": [fence.home[1]], "y": [fence.home[0]], "text": ["home"], "name": "home"}
-    _add_labels(figure, home | {"marker": {"color": END_STOP, "size": 9, "symbol": "diamond"}})
+        figure.add_scatter(name, east, north, line=line, hoverinfo="skip")
+    north, east = ([place] for place in fence.home)
+    mark = {"color": END_STOP, "size": 9, "symbol": "diamond"}
+    _add_labels(figure, "home", east, north, text=["home"], marker=mark)
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
@@ -172,33 +144,15 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
         north, east, _ = (
             np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True)
         )
-        outline = {
-            "type": "scatter",
-            "x": east,
-            "y": north,
-            "mode": "lines",
-            "name": "route",
-            "line": line,
-        }
-        figure.add(outline | {"hoverinfo": "skip"})
+        figure.add_scatter("route", east, north, line=line, hoverinfo="skip")
     for label, (tape, colour) in tracks.items():
         t = tape.time("guidance")
         pose = tape["guidance"].group("pose")
         keep = np.unique(np.linspace(0, len(t) - 1, TRACK_POINTS).astype(int))
         north, east = (pose[name][keep].astype(np.float32) for name in ("north", "east"))
         line = {"color": colour, "width": 1.4}
-        track = {
-            "type": "scatter",
-            "x": east,
-            "y": north,
-            "mode": "lines",
-            "name": label,
-            "line": line,
-        }
-        figure.add(
-            track
-            | {"text": [f"t = {instant:.1f} s" for instant in t[keep]], "hoverinfo": "x+y+text"}
-        )
+        instants = [f"t = {instant:.1f} s" for instant in t[keep]]
+        figure.add_scatter(label, east, north, line=line, text=instants, hoverinfo="x+y+text")
     figure.x[0]["title"] = {"text": "east (m)"}
     figure.y[0] |= {"title": {"text": "north (m)"}, "scaleanchor": "x", "scaleratio": 1.0}
     return set_layout(figure, labels=16)
@@ -242,16 +196,7 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
         arrow |= {"showarrow": True, "arrowhead": 2, "arrowwidth": 1.6, "arrowcolor": WIND}
         figure.layout["annotations"].append(arrow)
     label = f"wind, the longest arrow {strongest:.2g} m/s"
-    figure.add(
-        {
-            "type": "scatter",
-            "x": [None],
-            "y": [None],
-            "mode": "lines",
-            "name": label,
-            "line": {"color": WIND},
-        }
-    )
+    figure.add_scatter(label, [None], [None], line={"color": WIND})
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:

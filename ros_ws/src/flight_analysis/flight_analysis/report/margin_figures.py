@@ -256,10 +256,9 @@ def bode_figure(loop: LinearLoop) -> Figure:
         phase = np.degrees(np.unwrap(np.angle(L[:, k])))
         phase -= 360.0 * np.ceil(phase[0] / 360.0)
         for place, (values, unit) in enumerate(((decibels(np.abs(L[:, k])), "dB"), (phase, "deg"))):
-            trace = _trace(name, colour, w, values) | {
-                "hovertemplate": f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"
-            }
-            figure.add(trace | {"showlegend": place == 0}, place)
+            hover = f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"
+            style = _style(name, colour, hover) | {"showlegend": place == 0}
+            figure.add_scatter(name, w, values, place, **style)
     ends = [float(w[0]), float(w[-1])]
     for place, level in ((0, 0.0), (1, -180.0)):
         add_line(
@@ -292,22 +291,10 @@ def nyquist_figure(loop: LinearLoop) -> Figure:
         )
     for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
         near = np.abs(L[:, k]) < 10.0
-        figure.add(
-            _trace(name, colour, L[near, k].real, L[near, k].imag)
-            | {"hovertemplate": "%{x:.3g} %{y:+.3g} j"}
-        )
+        style = _style(name, colour, "%{x:.3g} %{y:+.3g} j")
+        figure.add_scatter(name, L[near, k].real, L[near, k].imag, **style)
     point = {"symbol": "cross", "size": 9, "color": BOUND}
-    figure.add(
-        {
-            "type": "scatter",
-            "x": [-1.0],
-            "y": [0.0],
-            "mode": "markers",
-            "name": "-1",
-            "marker": point,
-            "showlegend": False,
-        }
-    )
+    figure.add_scatter("-1", [-1.0], [0.0], mode="markers", marker=point, showlegend=False)
     across, up = NYQUIST_RANGE
     figure.x[0] |= {"title": {"text": "Re L"}, "range": list(across), "constrain": "domain"}
     figure.y[0] |= {"title": {"text": "Im L"}, "range": list(up), "scaleanchor": "x"}
@@ -324,15 +311,6 @@ def _colours(names: Sequence[str]) -> list[str]:
     return [comparison.COLOURS[k % len(comparison.COLOURS)] for k in range(len(names))]
 
 
-def _trace(name: str, colour: str, x: FloatArray, y: FloatArray) -> dict[str, Any]:
+def _style(name: str, colour: str, hover: str) -> dict[str, Any]:
     line = {"color": colour, "width": 1.4}
-    return {
-        "type": "scatter",
-        "x": x,
-        "y": y,
-        "mode": "lines",
-        "name": name,
-        "legendgroup": name,
-        "line": line,
-        "showlegend": True,
-    }
+    return {"legendgroup": name, "line": line, "showlegend": True, "hovertemplate": hover}

@@ -194,6 +194,13 @@ class Figure:
         """Add a trace to a subplot."""
         self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
 
+    def add_scatter(
+        self, name: str, x: Any, y: Any, index: int = 0, mode: str = "lines", **style: Any
+    ) -> None:
+        """Add the points (x, y) as a line, as marks or as texts to a subplot."""
+        points = {"type": "scatter", "name": name, "x": x, "y": y, "mode": mode}
+        self.add(points | style, index)
+
 
 def axis(name: str, index: int) -> str:
     """The name of an axis of a subplot counted from 0: x, x2, x3."""
@@ -288,16 +295,9 @@ def add_line(
     """Add a line to a subplot, with an entry in the legend. None in x breaks the line."""
     if not x:
         return
-    trace = {
-        "type": "scatter",
-        "x": x,
-        "y": y,
-        "mode": "lines",
-        "name": label,
-        "legendgroup": label,
-        "line": style,
-    }
-    figure.add(trace | {"hoverinfo": "skip", "showlegend": first_in_legend(figure, label)}, index)
+    shown = first_in_legend(figure, label)
+    look = {"legendgroup": label, "line": style, "hoverinfo": "skip", "showlegend": shown}
+    figure.add_scatter(label, x, y, index, **look)
 
 
 def _trace(
@@ -427,17 +427,7 @@ def _shade_intervals(
         interval.label: interval.colour for interval in intervals if not interval.labelled
     }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
-        figure.add(
-            {
-                "type": "scatter",
-                "x": [None],
-                "y": [None],
-                "mode": "markers",
-                "name": label,
-                "marker": mark,
-                "showlegend": True,
-            }
-        )
+        figure.add_scatter(label, [None], [None], mode="markers", marker=mark, showlegend=True)
 
 
 def _merged_labels(intervals: Sequence[Interval], end: float) -> dict[float, str]:
