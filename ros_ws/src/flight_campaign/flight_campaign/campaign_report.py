@@ -452,7 +452,7 @@ def _spread(
         label_, factor = _label(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
             x, y = _density(tally.figures.get(name, Figure()))
-            style = {
+            style: dict[str, Any] = {
                 "legendgroup": label,
                 "fill": "tozeroy",
                 "line": {"color": colour, "width": 1.4, "shape": "hvh"},

@@ -7,6 +7,7 @@ The figures do not depend on the aircraft: channels are drawn under their own na
 
 from collections.abc import Mapping, Sequence
 from itertools import chain, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -263,7 +264,7 @@ def learned_figure(context: PlotContext) -> Figure | None:
     figure = Figure(len(known), columns, 110, spacing=0.06)
     for index, name in enumerate(known):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
-        style = {
+        style: dict[str, Any] = {
             "error_y": bars,
             "marker": {"color": PLANT, "size": 7, "symbol": symbols},
             "showlegend": False,
@@ -303,7 +304,7 @@ def spectrum_figure(
         frequency, densities = spectra(tape["u"], period_ns)
         for name, density in densities.items():
             unit, factor = units.get(name, NO_UNIT)
-            style = {
+            style: dict[str, Any] = {
                 "line": {"color": colours[label], "width": 1.4},
                 "legendgroup": label,
                 "showlegend": len(runs) > 1 and first_in_legend(figure, label),

@@ -94,9 +94,9 @@ def track_figure(
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
-    ends = [pose[name][[0, -1]] for name in ("east", "north")]
+    east, north = (pose[name][[0, -1]] for name in ("east", "north"))
     mark = {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}
-    _add_labels(figure, "start and end", *ends, text=["start", "end"], marker=mark)
+    _add_labels(figure, "start and end", east, north, text=["start", "end"], marker=mark)
     for route in routes:
         _add_numbers(figure, route)
     if fence is not None:
@@ -108,8 +108,8 @@ def track_figure(
 def _add_labels(
     figure: Figure, name: str, east: Any, north: Any, mode: str = "markers+text", **style: Any
 ) -> None:
-    labels = {"textposition": "top center", "hoverinfo": "skip", "showlegend": False}
-    figure.add_scatter(name, east, north, mode=mode, **labels | style)
+    style |= {"textposition": "top center", "hoverinfo": "skip", "showlegend": False}
+    figure.add_scatter(name, east, north, mode=mode, **style)
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
@@ -129,9 +129,9 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
         line = {"color": END_STOP, "width": 2.0, "dash": "dot" if zone.exclude else "solid"}
         name = "keep out" if zone.exclude else "fence"
         figure.add_scatter(name, east, north, line=line, hoverinfo="skip")
-    north, east = ([place] for place in fence.home)
+    home_north, home_east = fence.home
     mark = {"color": END_STOP, "size": 9, "symbol": "diamond"}
-    _add_labels(figure, "home", east, north, text=["home"], marker=mark)
+    _add_labels(figure, "home", [home_east], [home_north], text=["home"], marker=mark)
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:

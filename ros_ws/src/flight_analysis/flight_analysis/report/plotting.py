@@ -296,8 +296,9 @@ def add_line(
     if not x:
         return
     shown = first_in_legend(figure, label)
-    look = {"legendgroup": label, "line": style, "hoverinfo": "skip", "showlegend": shown}
-    figure.add_scatter(label, x, y, index, **look)
+    figure.add_scatter(
+        label, x, y, index, legendgroup=label, line=style, hoverinfo="skip", showlegend=shown
+    )
 
 
 def _trace(
