@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from flight_cli.output import new_table, parse_numbers, print_json
+from flight_cli.output import new_table, parse_numbers, print_json, say
 from flight_cli.words import argument, json_option, option, setting, values_of, warn
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -124,13 +124,13 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
             table.add_row(airframe.name, *cells(airframe))
         console.print(table)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
-    console.print(
+    say(
+        console,
         f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling "
         "is max abs(U - I).",
-        soft_wrap=True,
     )
     if marginal := marginal_sentence(facts):
-        console.print(marginal, soft_wrap=True)
+        say(console, marginal)
 
 
 def _show_draft(draft: NewAirframe) -> None:

@@ -18,7 +18,7 @@ from flight_campaign.benchmark_entry import find_entry
 from flight_campaign.benchmark_scores import SCORES, Flights, define
 from flight_campaign.benchmark_scores import Benchmark as BenchmarkRun
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
-from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
+from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar, say
 from flight_cli.words import REQUIRED, argument, json_option, option
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -124,10 +124,7 @@ def _show(console: Console, scores: Mapping[str, Any]) -> None:
             windows = ", ".join(
                 f"{window} s {value:.2f}" for window, value in scored["over_time"].items()
             )
-            console.print(
-                f"over time, damage at 60 s: {windows}; recovery {scored['recovery']:.2f}",
-                highlight=False,
-            )
+            say(console, f"over time, damage at 60 s: {windows}; recovery {scored['recovery']:.2f}")
     for scored in scores["sets"].values():
         if "not_flown" in scored:
             console.print(
@@ -135,4 +132,4 @@ def _show(console: Console, scores: Mapping[str, Any]) -> None:
                 highlight=False,
                 markup=False,
             )
-    console.print(LEGEND, style="dim", highlight=False)
+    say(console, LEGEND, style="dim")

@@ -146,7 +146,7 @@ class BridgeExperiment:
                 engaged_for=planned.controller.duration,
             )
         link_latest(run)
-        console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
+        say(console, f"outcome: {outcome}\nlog:     {display_path(run)}")
         return run
 
     def _with_link(
@@ -393,9 +393,9 @@ def _show_gains(console: Console, channels: Channels, response: Response, flyabl
         table.add_row(f"{output} by {name}", f"{bandwidth:.3g}", f"{params.Lambda[i]:.3g}")
     console.print(table)
     if flyable.delay_margin is not None:
-        console.print(
+        say(
+            console,
             f"delay margin beyond the delay of the gains: {1e3 * flyable.delay_margin:.0f} ms",
-            highlight=False,
         )
 
 

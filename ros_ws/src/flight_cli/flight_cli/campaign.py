@@ -275,7 +275,7 @@ def _print(console: Console, results: Table, first: str) -> None:
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
     console.print(table)
-    console.print(results.legend, style="dim", highlight=False, soft_wrap=True)
+    say(console, results.legend, style="dim")
 
 
 def _show(

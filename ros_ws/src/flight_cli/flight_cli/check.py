@@ -24,7 +24,7 @@ from autopilot_bridge.map_rows import MAVLINK, InputRow, OutputRow
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import log_namespace, warn_of_lacks_in
-from flight_cli.output import new_table, print_json
+from flight_cli.output import new_table, print_json, say
 from flight_cli.words import REQUIRED, argument, json_option, option, warn
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
@@ -138,7 +138,8 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
         fields.add_row(f"y.{channel.output}", _format_field(output), output.topic)
     console.print(fields)
     if checked.seconds:
-        console.print(
+        say(
+            console,
             f"recorded: Omega_ii from {checked.seconds:.0f} s, in brackets the response in "
             f"standard errors; below {MIN_RATIO:g} the sign is not certain (?)",
             style="dim",

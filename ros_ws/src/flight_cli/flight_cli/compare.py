@@ -35,6 +35,7 @@ from flight_cli.output import (
     new_table,
     parse_numbers,
     progress_bar,
+    say,
     write_text,
 )
 from flight_cli.words import argument, option, setting, values_of, write_option
@@ -239,13 +240,13 @@ class Compare:
                 console.print(_table(title, shown, contest.entries, scenario))
         laws = {name: contest.entries[name] for name in tuned if tuned[name]}
         effect = WIND_EFFECTS[scenario.aircraft.uncertainty.wind]
-        console.print(
+        say(
+            console,
             f"{_notes(scenario, benchmark, laws, contest.aims)}\n"
             f"{self.aircraft} aircraft a level, seed {self.seed}; effect of wind on x_dot {effect}"
             f"; turbulence of seed {self.turbulence_seed}, that of the tuning "
             f"{gain_tuning.TUNING_TURBULENCE_SEED}",
             style="dim",
-            highlight=False,
         )
         lacking = [row for row in contest.untuned() if contest.controllers[row[0]] is None]
         if lacking:

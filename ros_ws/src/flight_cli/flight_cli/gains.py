@@ -358,37 +358,33 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
             for row in margin_rows(answer.margins):
                 table.add_row(*row)
             console.print(table)
-            console.print(modes_text(answer.margins), highlight=False, soft_wrap=True)
-        console.print(
-            f"{name}: {_format_delay_margin(study, answer)}", highlight=False, soft_wrap=True
-        )
-    console.print(MARGIN_LEGEND, style="dim", highlight=False, soft_wrap=True)
+            say(console, modes_text(answer.margins))
+        say(console, f"{name}: {_format_delay_margin(study, answer)}")
+    say(console, MARGIN_LEGEND, style="dim")
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
         if not getattr(first, part):
             continue
         console.print(_condition_table(answers, part, heading))
     if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
-        console.print(marginal, highlight=False, soft_wrap=True)
+        say(console, marginal)
     estimate = (
         ""
         if first.bounds is None
         else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
     )
-    console.print(
-        f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True
-    )
+    say(console, f"margin: a condition holds above 1 and fails (!) below{estimate}")
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():
-        console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
+        say(console, f"{word}: {meaning}")
     for name, answer in answers.items():
         failed = answer.failing
-        console.print(
+        say(
+            console,
             f"{name}: "
             f"{'every condition holds' if not failed else f'{len(failed)} conditions fail'}",
-            highlight=False,
         )
         for condition in failed if len(answers) == 1 else ():
-            console.print(f"  {condition.sentence(outputs)}", highlight=False)
+            say(console, f"  {condition.sentence(outputs)}")
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:

@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
-from flight_cli.output import LICENCE, new_table, write_text
+from flight_cli.output import LICENCE, new_table, say, write_text
 from flight_core.arguments import as_number
 from flight_core.files import writing
 from flight_core.parameters import require
@@ -61,7 +61,7 @@ def show_guarantee(
     if promise is None:
         return
     for line in guarantee_text(promise):
-        console.print(line, highlight=False, soft_wrap=True)
+        say(console, line)
     if not promise.holds or margins is None or margins.worst is None:
         return
     heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")

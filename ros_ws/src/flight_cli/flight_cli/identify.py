@@ -234,7 +234,7 @@ class Identify:
             print_json(identified_as_json(identified, path))
         else:
             show_identified(console, identified)
-            console.print(f"scenario: {display_path(path)}", highlight=False)
+            say(console, f"scenario: {display_path(path)}")
         if identified.failure:
             warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
             raise typer.Exit(CANNOT_FLY)
@@ -355,9 +355,7 @@ def _write_model(console: Console, identification: Identification, log: Path, pa
     write_text("--write", path, model_yaml(identification, str(log)))
     page = path.with_suffix(".html")
     write_text("--write", page, page_html(_innovation_page(identification, log.name)))
-    console.print(
-        f"model: {display_path(path)}, innovations: {display_path(page)}", highlight=False
-    )
+    say(console, f"model: {display_path(path)}, innovations: {display_path(page)}")
 
 
 class _Reflight(NamedTuple):
@@ -415,9 +413,9 @@ def _show_model(console: Console, identification: Identification) -> None:
         )
     console.print(table)
     gain = identification.after.log_likelihood - identification.before.log_likelihood
-    console.print(
+    say(
+        console,
         f"whiteness: 1 for white noise; change of the log-likelihood of a sample: {gain:+.3g}",
-        highlight=False,
     )
 
 

@@ -68,7 +68,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         _show_imported(console, flight)
         return
     if busy := (summary["account"] or {}).get("busy"):
-        console.print(busy, style="bold", highlight=False, soft_wrap=True)
+        say(console, busy, style="bold")
     title = f"Tracking error ({summary['error']}), {time_flown(summary)}"
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
     console.print(
@@ -88,16 +88,16 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
     if commands := command_results(summary):
         say(console, commands)
-    console.print(
+    say(
+        console,
         f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error",
         style="dim",
-        highlight=False,
     )
     for line in (
         *_timing(summary),
         *(f"note: {note}" for note in summary["notes"] if note != busy),
     ):
-        console.print(line, highlight=False)
+        say(console, line)
 
 
 def _show_imported(console: Console, flight: RecordedFlight) -> None:
@@ -112,7 +112,7 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
             )
         )
     for note in summary["notes"]:
-        console.print(f"note: {note}", highlight=False)
+        say(console, f"note: {note}")
 
 
 def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
@@ -279,9 +279,9 @@ def parse_numbers(text: str) -> list[float]:
         return []
 
 
-def say(console: Console, text: str) -> None:
+def say(console: Console, text: str, style: str = "") -> None:
     """Print a text as it is, also where it is longer than a line."""
-    console.print(text, highlight=False, soft_wrap=True)
+    console.print(text, style=style, highlight=False, soft_wrap=True)
 
 
 def print_json(value: Any) -> None:
