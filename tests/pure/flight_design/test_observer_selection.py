@@ -7,6 +7,7 @@ without A, the command.
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_search
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import STABLE, observed
 from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_search import WORST_OF
 from flight_design.gains.observer_selection import (
@@ -204,3 +205,28 @@ def test_aircraft_that_no_gains_hold_do_not_count() -> None:
     assert controller.observer is not None
     assert f"{diverging} of {WORST_OF} uncertain aircraft do not count" in origin
     assert 0 < diverging < WORST_OF / 2
+
+
+def test_gains_of_a_file_make_the_observer_of_the_example(tmp_path: Path) -> None:
+    """As the file has them, where any stable loop is enough; its digits are six."""
+    folder = REPOSITORY / "examples" / "px4_airplane"
+    airframe = load_airframe(str(folder / "rates_airframe.yaml"))
+    scenario = find_scenario(str(folder / "rates_observer.yaml"))
+    shipped = scenario.rise_di().observer
+    file = folder / "rates_weights.yaml"
+    begin = scenario.rise_di(), scenario, airframe, 0.01, STABLE
+
+    def designed(path: Path) -> Any:
+        return observed(*begin, uncertain=False, weights=path)[0].observer
+
+    observer = designed(file)
+    assert pytest.approx(shipped.L, rel=1e-4, abs=1e-4) == observer.L
+    assert pytest.approx(shipped.F, rel=1e-4, abs=1e-4) == observer.F
+    edited = tmp_path / "weights.yaml"
+    for old, new, words in (
+        ("gust: [0.334652, 0.122641]", "gust: [0.3]", r"gust: found \[0.3\], expected 2 numbers"),
+        ("drift:", "drifts:", "weights: found .* expected a file of K, Lambda"),
+    ):
+        edited.write_text(file.read_text().replace(old, new))
+        with refusing(words):
+            designed(edited)

@@ -76,7 +76,7 @@ LOOP = ("rate", "y_rate", "lag", "delay", "inputs")
 STUDY = ("uncertainty", "gamma_2", "samples", "seed")
 SELECTION = (
     *("rate", "y_rate", "delay", "feedforward", "observer", "model"),
-    *("margin", "phase_margin", "accept", "mixing"),
+    *("margin", "weights", "phase_margin", "accept", "mixing"),
 )
 """Fields of a loop, of a check, and of a selection."""
 
@@ -158,6 +158,10 @@ class Gains:
     speeds: str | None = setting(
         "With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
         "schedule that flies them."
+    )
+    weights: Path | None = setting(
+        "With --observer: file of gains and weights in place of those of a search or a rule; "
+        "with accept they are taken as they are."
     )
     phase_margin: float = setting(
         "Least phase margin of the loop behind servos, deg; 35 or less with the observer.",

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,7 @@ from flight_design.gains.observer_gains import (
     gains_beside_sketch,
     gains_by_rule,
     gains_of_search,
+    read_gains,
 )
 from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from flight_design.gains.requirement import (
@@ -47,6 +49,8 @@ SLOWER = 1.8
 searched with 38 ms in q, they have the margins with 55 ms and miss them with 65 and 75 ms. Those of
 the rule have them from 75 ms on."""
 BY_RULE = "gains by a rule from the lags, a start"
+STABLE = Requirement(1e-3, 1.001, 1e3, 1e-3, 0.0)
+"""What gains have to have that are taken as a file has them: a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
@@ -74,6 +78,7 @@ def select_gains(
     model: FilePath | Airframe | None = None,
     margin: float = 0.03,
     speeds: ArrayLike = (),
+    weights: FilePath | None = None,
     phase_margin: float = PHASE_MARGIN,
     accept: bool = False,
     mixing: str = DIAGONAL,
@@ -108,6 +113,9 @@ def select_gains(
         speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A
             schedule flies the observer from the one to the other. Empty: the observer holds at the
             trim speed alone.
+        weights: File of gains and weights from which the search for the margins begins
+            (`observer_gains.read_gains`); with `accept` they are taken as they are. None: those of
+            a search for the scenario, or of a rule.
         phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a
             sensitivity of at most 2 and a damping of 0.4; 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
@@ -141,6 +149,7 @@ def select_gains(
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
     )
+    require(observer or weights is None, "weights", weights, "observer beside it")
     require(
         observer or model is None, "model", model, "observer beside it: it is the observer's model"
     )
@@ -154,13 +163,16 @@ def select_gains(
     needed = setting.requirement._replace(
         phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase)
     )
+    as_given = weights is not None and accept
     controller, origin = observed(
         selection.chosen,
         chosen,
         through_allocation(known_model, setting.base),
         margin,
-        needed,
+        STABLE if as_given else needed,
+        uncertain=not as_given,
         speeds=pair,
+        weights=weights,
         progress=progress,
     )
     return replace(selection, chosen=controller, origin=origin)
@@ -398,17 +410,18 @@ def observed(
     sketched: bool = False,
     speeds: tuple[float, float] | None = None,
     quick: bool = False,
+    weights: FilePath | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
-    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships
-    with its airframe and lags, where the model has the same states and no channel has SLOWER times
-    the total lag; else they follow from the lags by a rule. Of several gain sets it is the one that
-    the margins change least, then the one of the least cost. `uncertain` counts the phase margin of
-    uncertain aircraft too, `sketched` takes the gains for a model from a sketch, and `speeds` are
-    two ratios to the trim speed, with models there. `quick` and `progress` as for
-    `with_aircraft_observer`.
+    The gains are those of the file `weights`. Without a file they are those that `rise-di compare
+    --tune` found in the scenario, or in one that ships with its airframe and lags, where the model
+    has the same states and no channel has SLOWER times the total lag; else they follow from the
+    lags by a rule. Of several gain sets it is the one that the margins change least, then the one
+    of the least cost. `uncertain` counts the phase margin of uncertain aircraft too, `sketched`
+    takes the gains for a model from a sketch, and `speeds` are two ratios to the trim speed, with
+    models there. `quick` and `progress` as for `with_aircraft_observer`.
     """
     channels = scenario.aircraft.channels().outputs
     by_name = dict(
@@ -422,7 +435,11 @@ def observed(
         [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
     )
     nominal = model_for(model, controller, noise)
-    candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
+    if weights is None:
+        candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
+    else:
+        read = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
+        candidates = [(read, f"gains of {Path(weights).name}")]
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
         controller,

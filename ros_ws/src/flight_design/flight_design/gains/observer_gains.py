@@ -5,6 +5,7 @@ sketch, and of a search.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,9 @@ import numpy as np
 from aircraft_sim.turbulence import MODERATE, dryden
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Weights
+from flight_core.arguments import as_numbers
+from flight_core.files import read_yaml
+from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
@@ -68,6 +72,29 @@ def gains_beside_sketch(
     return by_rule._replace(
         K=K * by_rule.K, Lambda=K * by_rule.Lambda, beta=K * by_rule.beta, weights=weights
     )
+
+
+def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGains:
+    """Gains of a file with the fields of ObserverGains and of Weights by name, a list each.
+
+    T is the total lag, (m,), s; `axes` of the wind and `states` of the model are counts. Raises
+    ParameterError.
+    """
+    m = len(T)
+    lengths: dict[str, tuple[int, ...]]
+    lengths = dict.fromkeys(("K", "Lambda", "beta", "effort", "drift"), (m,))
+    lengths |= {"softening": (1, m), "gust": (axes,), "wind_time": (axes,), "loose": (1, states)}
+    content = read_yaml(path, "weights", expected := f"a file of {', '.join(lengths)}")
+    named = isinstance(content, dict) and set(content) == set(lengths)
+    require(named, "weights", path, expected)
+    gains: dict[str, list[float]] = {}
+    for name, allowed in lengths.items():
+        row = as_numbers(content[name], f"weights.{name}", "numbers above 0")
+        count = " or ".join(str(number) for number in allowed)
+        fits = len(row) in allowed and min(row) > 0.0
+        require(fits, f"weights.{name}", content[name], f"{count} numbers above 0")
+        gains[name] = list(row)
+    return gains_of_search(gains, T)
 
 
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
