@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.conftest import REPOSITORY, refusing
 
-from c_export.autopilots import VEHICLE, write_ardupilot
+from c_export.autopilots import SHELLS, write_module
 from c_export.proof import build
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from rise_di.c_code import export
@@ -25,13 +25,13 @@ WARNINGS = ["-O2", "-Wall", "-Wextra", "-Werror", "-Wshadow", "-Wfloat-equal", "
 @pytest.fixture(scope="module", params=["double", "float"])
 def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     folder = tmp_path_factory.mktemp("ardupilot")
-    write_ardupilot(find_scenario(str(RATES)), folder, float32=request.param == "float")
+    write_module("ardupilot", find_scenario(str(RATES)), folder, float32=request.param == "float")
     return folder
 
 
 def test_compiles_beside_a_stub_of_arduplane(folder: Path, tmp_path: Path) -> None:
     """In float also under the flag of ArduPilot that makes constants float."""
-    code = folder / VEHICLE
+    code = folder / SHELLS["ardupilot"].place
     stub = f"-I{REPOSITORY / 'tests' / 'ardupilot'}"
     shell = ["g++", "-std=gnu++17", *WARNINGS, "-Wno-unused-parameter", stub]
     build([*shell, "-c", "-o", str(tmp_path / "o"), "rise_di.cpp"], code)
@@ -46,6 +46,6 @@ def test_refuses_a_yaw_rate_and_an_unknown_autopilot(tmp_path: Path) -> None:
     """The rudder coordinates turns in ArduPlane: nothing there gives a yaw rate to follow."""
     three = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
     with refusing("controller.outputs: found q, p, r, expected some of p, q: ArduPlane"):
-        write_ardupilot(find_scenario(str(three)), tmp_path, float32=True)
+        write_module("ardupilot", find_scenario(str(three)), tmp_path, float32=True)
     with refusing("autopilot: found inav, expected one of px4, ardupilot"):
         export(str(RATES), tmp_path, autopilot="inav", proof=False)

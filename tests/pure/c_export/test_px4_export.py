@@ -16,7 +16,7 @@ import typer
 from pytest import approx
 from tests.conftest import REPOSITORY, refusing
 
-from c_export.autopilots import AXES, MODULE, SAMPLES, write_px4
+from c_export.autopilots import AXES, SAMPLES, SHELLS, write_module
 from c_export.constants import exportable
 from c_export.events import flight_recordings
 from c_export.proof import FLAGS, PARAMETERS, build, write_code
@@ -32,6 +32,7 @@ from rise_di_controller.params import ControllerConfig
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"
 )
+MODULE = SHELLS["px4"].place
 EXAMPLE = REPOSITORY / "examples" / "px4_airplane"
 RATES = EXAMPLE / "rates.yaml"
 OBSERVER = EXAMPLE / "rates_observer.yaml"
@@ -126,7 +127,7 @@ class Shell:
 def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     """The module with an observer, whose u_o has limits too, in double; without one in float."""
     folder = tmp_path_factory.mktemp("px4")
-    write_px4(find_scenario(str(request.param)), folder, float32=request.param == RATES)
+    write_module("px4", find_scenario(str(request.param)), folder, float32=request.param == RATES)
     return folder
 
 
@@ -326,7 +327,7 @@ def test_flight_needs_no_more_samples_than_the_module_keeps(folder: Path) -> Non
 def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
     def refused(scenario: Scenario, words: str) -> None:
         with refusing(words):
-            write_px4(scenario, tmp_path, float32=False)
+            write_module("px4", scenario, tmp_path, float32=False)
 
     rates = find_scenario(str(RATES))
     refused(

@@ -8,28 +8,19 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 from c_export.constants import exportable
 from c_export.proof import SOURCE, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
-from rise_di_controller.params import ControllerConfig
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y and the axes of autopilots: roll, pitch, yaw."""
 
-MODULE = "src/modules/rise_di_control"
-VEHICLE = "ArduPlane"
 SAMPLES = 8  # kept: y_m is stepped past each y, so a tick needs the newest y and two of y_m
 SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed: where the dynamic pressure is clipped
-
-FILES = {
-    "src/CMakeLists.txt": "set(config_module_list_external modules/rise_di_control PARENT_SCOPE)\n",
-    "msg/CMakeLists.txt": "set(config_msg_list_external RiseDiStatus.msg PARENT_SCOPE)\n",
-    "extras.txt": "fw_rate_control stop\nfw_rate_control start vtol\nrise_di_control start\n",
-}
-"""Texts of PX4 that are equal for every scenario."""
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
     void rise_di();
@@ -54,81 +45,89 @@ float64[{m}] u_end       # abs(u) of the torque of 1 at this airspeed
 float64 y_m_offset       # [s] of the newest y_m after y
 """
 
-
-def write_px4(
-    scenario: Scenario, folder: Path, *, float32: bool, samples: int = SAMPLES
-) -> list[Path]:
-    """Write the module to a folder, for `make px4_sitl EXTERNAL_MODULES_LOCATION=FOLDER`. Raises
-    ParameterError.
-
-    The outputs are body rates; an input of u at the upper end stop of its actuator is a torque of
-    1, with the sign of D.
-    """
-    outputs = scenario.controller.outputs
-    files = _write(
-        scenario, folder, MODULE, "px4", AXES, "PX4 controls the speed",
-        float32=float32, samples=samples,
-    )  # fmt: skip
-    message = MESSAGE.format(channels=", ".join(outputs), m=len(outputs))
-    return [*files, *_texts({**FILES, "msg/RiseDiStatus.msg": message}, folder)]
+PX4 = {
+    "src/CMakeLists.txt": "set(config_module_list_external modules/rise_di_control PARENT_SCOPE)\n",
+    "msg/CMakeLists.txt": "set(config_msg_list_external RiseDiStatus.msg PARENT_SCOPE)\n",
+    "extras.txt": "fw_rate_control stop\nfw_rate_control start vtol\nrise_di_control start\n",
+    "msg/RiseDiStatus.msg": MESSAGE,
+}
 
 
-def write_ardupilot(
-    scenario: Scenario, folder: Path, *, float32: bool, samples: int = SAMPLES
-) -> list[Path]:
-    """Write the files of a fast task of ArduPlane to a folder, for its tree; hooks.txt has two
-    lines of it. Raises ParameterError.
+HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the scenario, written by `rise-di export`. */
+#ifndef RISE_DI_AXES_H
+#define RISE_DI_AXES_H
+#define RISE_DI_AXES {{{axes}}} /* roll 0, pitch 1, yaw 2 */
+#define RISE_DI_TORQUE_PER_U {{{per_u}}}
+#define RISE_DI_SCALED {scaled} /* 1: the torque follows the dynamic pressure */
+#define RISE_DI_SPEED ((rise_di_real){speed!r}) /* m/s */
+#define RISE_DI_SLOWEST {slowest!r}F
+#define RISE_DI_FASTEST {fastest!r}F
+#define RISE_DI_OBSERVER_PART {part} /* limits of u_o over those of u */
+#define RISE_DI_OBSERVER_SLEW {slew} /* 1/s, change of u_o in a second over the limits of u */
+#endif
+"""  # noqa: E501 - a text as it is written
 
-    The outputs are q, p or both; an input of u at the upper end stop is a deflection of 45 degrees.
-    """
-    axes = {name: axis for name, axis in AXES.items() if name != "r"}
-    files = _write(
-        scenario, folder, VEHICLE, "ardupilot", axes,
+
+class Shell(NamedTuple):
+    """How the code becomes a part of an autopilot; its files are in source/NAME."""
+
+    place: str  # of the code in the folder
+    axes: str  # outputs that it may have
+    reason: str
+    texts: Mapping[str, str]  # further files, with `{channels}` and `{m}` filled in
+
+
+SHELLS = {
+    "px4": Shell("src/modules/rise_di_control", "pqr", "PX4 controls the speed", PX4),
+    "ardupilot": Shell(
+        "ArduPlane",
+        "pq",
         "ArduPlane controls the speed and coordinates turns by the rudder",
-        float32=float32, samples=samples,
-    )  # fmt: skip
-    return [*files, *_texts({"hooks.txt": HOOKS}, folder)]
+        {"hooks.txt": HOOKS},
+    ),
+}
 
 
-def _write(
+def write_module(
+    autopilot: str,
     scenario: Scenario,
     folder: Path,
-    place: str,
-    shell: str,
-    axes: Mapping[str, int],
-    reason: str,
     *,
     float32: bool,
-    samples: int,
+    samples: int = SAMPLES,
 ) -> list[Path]:
-    """Write code, source/rates and a shell to `place` in a folder, for outputs among `axes`."""
+    """Write the module of an autopilot to a folder: for PX4 that of EXTERNAL_MODULES_LOCATION, for
+    ArduPlane files for its tree, with two lines of it in hooks.txt. Raises ParameterError.
+
+    The outputs are body rates. An input of u at the upper end stop of its actuator is a torque of
+    1, in ArduPlane a deflection of 45 degrees, with the sign of D.
+    """
+    shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
     outputs = controller.outputs
-    expected = f"some of {', '.join(sorted(axes))}: {reason}"
-    require(set(outputs) <= set(axes), "controller.outputs", ", ".join(outputs), expected)
+    expected = f"some of {', '.join(shell.axes)}: {shell.reason}"
+    require(set(outputs) <= set(shell.axes), "controller.outputs", ", ".join(outputs), expected)
     require(
         controller.allocation is None,
         "controller.allocation",
         "a section",
         "none: the autopilot allocates the torque",
     )
-    code = folder / place
+    code = folder / shell.place
     model = scenario.reference_model
     files = write_code(controller, scenario.name, code, model, float32=float32, samples=samples)
-    with writing(shell, folder, "a folder that can"):
-        for part in ("rates", shell):
+    with writing(autopilot, folder, "a folder that can"):
+        for part in ("rates", autopilot):
             for source in sorted((SOURCE / part).iterdir()):
                 files.append(Path(shutil.copyfile(source, code / source.name)))
-    return [*files, *_texts({"rise_di_axes.h": _axes(scenario, "F" if float32 else "")}, code)]
-
-
-def _texts(texts: Mapping[str, str], folder: Path) -> list[Path]:
-    """Write texts by their names to a folder."""
+    channels = {"channels": ", ".join(outputs), "m": len(outputs)}
+    texts = {name: text.format(**channels) for name, text in shell.texts.items()}
+    texts[f"{shell.place}/rise_di_axes.h"] = _axes(scenario, "F" if float32 else "")
     with writing("export", folder, "a folder that can"):
         for name, text in texts.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_file(folder / name, text)
-    return [folder / name for name in texts]
+    return [*files, *(folder / name for name in texts)]
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
@@ -144,38 +143,16 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         )
         per_u.append(f"{float(sign / end).hex()}{suffix}")
     speed = channels.speed
-    lines = [
-        (
-            "/* Axes, signs and sizes of the autopilot for the channels of the scenario, written "
-            "by `rise-di export`. */"
-        ),
-        "#ifndef RISE_DI_AXES_H",
-        "#define RISE_DI_AXES_H",
-        (
-            f"#define RISE_DI_AXES {{{', '.join(str(AXES[name]) for name in controller.outputs)}}} "
-            "/* roll 0, pitch 1, yaw 2 */"
-        ),
-        f"#define RISE_DI_TORQUE_PER_U {{{', '.join(per_u)}}}",
-        (
-            f"#define RISE_DI_SCALED {int(speed > 0.0)} /* 1: the torque follows the dynamic "
-            "pressure */"
-        ),
-        f"#define RISE_DI_SPEED ((rise_di_real){speed!r}) /* m/s */",
-        f"#define RISE_DI_SLOWEST {SLOWEST * speed!r}F",
-        f"#define RISE_DI_FASTEST {FASTEST * speed!r}F",
-        *_observer_limits(controller, suffix),
-        "#endif",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _observer_limits(controller: ControllerConfig, suffix: str) -> list[str]:
-    """The limits of u_o in those of u: the part of their magnitude, and its change in a second."""
     observer = exportable(controller).observer
-    if observer is None:
-        return []
-    slew = observer.part / observer.within
-    return [
-        f"#define RISE_DI_OBSERVER_PART ((rise_di_real){observer.part.hex()}{suffix})",
-        f"#define RISE_DI_OBSERVER_SLEW ((rise_di_real){slew.hex()}{suffix}) /* 1/s */",
-    ]
+    part = 0.0 if observer is None else observer.part
+    slew = 0.0 if observer is None else part / observer.within
+    return HEADER.format(
+        axes=", ".join(str(AXES[name]) for name in controller.outputs),
+        per_u=", ".join(per_u),
+        scaled=int(speed > 0.0),
+        speed=speed,
+        slowest=SLOWEST * speed,
+        fastest=FASTEST * speed,
+        part=part.hex() + suffix,
+        slew=slew.hex() + suffix,
+    )

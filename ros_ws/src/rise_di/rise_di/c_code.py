@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from c_export.autopilots import MODULE, SAMPLES, VEHICLE, write_ardupilot, write_px4
+from c_export.autopilots import SAMPLES, SHELLS, write_module
 from c_export.constants import exportable
 from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
@@ -28,8 +28,6 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 PART = 50_000  # drawn steps of a recording
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 LONGEST = 20.0  # s, of a flight without a duration
-SHELLS = {"px4": (write_px4, MODULE), "ardupilot": (write_ardupilot, VEHICLE)}
-"""What writes the code for an autopilot, and where the code lies in the folder."""
 
 
 class Material(NamedTuple):
@@ -170,9 +168,9 @@ def _write(
         files = write_code(controller, title, folder, model, float32=float32, samples=kept)
         return folder, files, kept
     require(autopilot in SHELLS, "autopilot", autopilot, f"one of {', '.join(SHELLS)}")
-    write, place = SHELLS[autopilot]
     kept = samples or SAMPLES
-    return folder / place, write(scenario, folder, float32=float32, samples=kept), kept
+    files = write_module(autopilot, scenario, folder, float32=float32, samples=kept)
+    return folder / SHELLS[autopilot].place, files, kept
 
 
 def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
