@@ -20,7 +20,7 @@ import pytest
 import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.conftest import REPOSITORY, refusing
+from tests.conftest import refusing
 
 from c_export.constants import TABLE, constants, exportable, packed
 from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
@@ -58,7 +58,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
 from flight_log.log_content import StoredFile
-from flight_log.tape_reader import RecordedRun, read_run
+from flight_log.tape_reader import RecordedRun
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
@@ -475,18 +475,6 @@ def test_float32_is_within_its_bound(tmp_path: Path) -> None:
         proof = prove(tmp_path / name, [["gcc"]], sets, recordings, float32=True)
         assert proof.holds, report(proof, name)
         assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
-
-
-def test_log_is_replayed_by_c(tmp_path: Path) -> None:
-    """C gives every u of a log of an earlier version without feedforward, to the bit."""
-    shutil.unpack_archive(
-        REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data"
-    )
-    sets, recording, as_logged = run_recording(read_run(tmp_path / "osprey_servo"))
-    write_code(sets[0], "osprey_servo", tmp_path / "code", float32=False)
-    program = Program(tmp_path / "code", ["gcc"], sets, tmp_path / "program")
-    assert program.compare(recording).differing == 0
-    assert as_logged == recording.ticks > 30
 
 
 def export(scenario: str, folder: Path, **words: Any) -> None:

@@ -177,9 +177,9 @@ class Program:
                 command, cwd=self._folder, capture_output=True, text=True, check=False
             )
         except OSError as error:
-            failure = f"found a program that does not start here ({error.strerror})"
             raise ParameterError(
-                f"compiler: {failure}, expected a compiler for this machine"
+                f"compiler: found a program that does not start here ({error.strerror}), expected "
+                "a compiler for this machine"
             ) from None
         if process.returncode:
             raise ParameterError(
@@ -200,34 +200,29 @@ class Program:
                 f"the exported code: found {len(integers)} ticks of {recording.ticks}, expected "
                 "each"
             )
-        same = np.hstack(
-            [integers == recording.integers, reals.view(np.int64) == recording.reals.view(np.int64)]
-        )
+        modes_differ = integers != recording.integers
+        differ = np.hstack([modes_differ, reals.view(np.int64) != recording.reals.view(np.int64)])
         first = None
-        if not same.all():
-            tick = int(np.flatnonzero(~same.all(axis=1))[0])
-            column = int(np.flatnonzero(~same[tick])[0])
-            both = (
-                np.hstack([recording.integers[tick], recording.reals[tick]]),
-                np.hstack([integers[tick], reals[tick]]),
-            )
+        if differ.any():
+            tick, column = np.argwhere(differ)[0].tolist()
+            python = np.hstack([recording.integers[tick], recording.reals[tick]])
+            c = np.hstack([integers[tick], reals[tick]])
             first = Difference(
-                tick, recording.names[column], float(both[0][column]), float(both[1][column])
+                tick, recording.names[column], float(python[column]), float(c[column])
             )
         u = recording.reals[:, :m]
         with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
             parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(
                 np.ptp(u, axis=0), np.finfo(float).tiny
             )
-        modes_equal = bool((integers == recording.integers).all())
         return Comparison(
             recording.name,
             recording.ticks,
-            same.size,
-            int((~same).sum()),
+            differ.size,
+            int(differ.sum()),
             first,
             float(parts.max()),
-            modes_equal,
+            not modes_differ.any(),
         )
 
 
@@ -301,33 +296,26 @@ def report(proof: Proof, scenario: str) -> str:
     """The proof as text."""
     precision = "float32" if proof.float32 else "float64"
     lines = [
-        (
-            f"C code of the controller of {scenario}, {precision}, beside the Python controller of "
-            "rise-di"
-        ),
+        f"C code of the controller of {scenario}, {precision}, beside the controller in Python",
+        "",
+        *(f"compiler: {name}, {shlex.join(FLAGS)}" for name in proof.compilers),
         "",
     ]
-    lines += [f"compiler: {name}, {shlex.join(FLAGS)}" for name in proof.compilers]
-    lines.append("")
     several = len(proof.compilers) > 1
     for k, comparison in enumerate(proof.comparisons):
         compiler = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
-        counts = (
-            f"{comparison.name}{compiler}: {comparison.ticks} ticks, {comparison.values} values"
-        )
+        difference = f", {comparison.differing} differ"
         if proof.float32:
-            lines.append(
-                f"{counts}; u within {comparison.deviation:.2g} of its range, bound "
-                f"{FLOAT32_BOUND:.2g}"
-            )
-        else:
-            lines.append(f"{counts}, {comparison.differing} differ")
+            reached = f"{comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}"
+            difference = f"; u within {reached}"
+        ticks = f"{comparison.ticks} ticks, {comparison.values} values"
+        lines.append(f"{comparison.name}{compiler}: {ticks}{difference}")
         if comparison.first is not None and not comparison.holds(float32=proof.float32):
             tick, channel, python, c = comparison.first
             lines.append(f"    first in tick {tick}: {channel} is {python!r} in Python, {c!r} in C")
     lines += [
         "",
-        *(f"{FIGURES[name]}: {value}" for name, value in sorted(proof.figures.items(), key=_place)),
+        *(f"{FIGURES[name]}: {proof.figures[name]}" for name in FIGURES if name in proof.figures),
     ]
     result = (
         f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range"
@@ -338,18 +326,12 @@ def report(proof: Proof, scenario: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _place(figure: tuple[str, int]) -> int:
-    return list(FIGURES).index(figure[0])
-
-
 def build(command: Sequence[str], folder: Path) -> None:
     """Run a compiler in a folder. Raises ParameterError with what it says."""
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
     if process.returncode:
-        said = (process.stderr or process.stdout).strip()[
-            -2000:
-        ] or f"exit status {process.returncode}"
-        raise ParameterError(f"{shlex.join(command)}: {said}")
+        said = (process.stderr or process.stdout).strip() or f"exit status {process.returncode}"
+        raise ParameterError(f"{shlex.join(command)}: {said[-2000:]}")
 
 
 def version(compiler: Sequence[str]) -> str:
