@@ -6,7 +6,7 @@ of `rise-di fly --in-process`.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -117,20 +117,22 @@ def _by_channel(flights: Sequence[Flight], kind: str) -> dict[str, FloatArray]:
     return by_channel
 
 
-def _learners(scenarios: Sequence[Scenario], learner: MakeLearner) -> list[Learn]:
-    """What makes the learner of each aircraft: one for those that differ in A and B alone, which a
-    learner does not know.
+MOST_KEPT = 8  # courses and learners
+_KEPT: dict[tuple[object, str], Any] = {}
+
+
+def _kept(make: Callable[..., Any], scenario: Scenario, **options: bool) -> Any:
+    """What a function makes of a scenario, once in a process for those that differ in A and B of
+    the aircraft alone, which neither a learner nor a course knows.
     """
-    made: dict[str, Learn | None] = {}
-    learn = []
-    for scenario in scenarios:
-        known = repr(scenario.aircraft.model_dump(exclude={"uncertainty"}))
-        if known not in made:
-            made[known] = learner(scenario)
-        each = made[known]
-        assert each is not None  # noqa: S101 - the scenario learns
-        learn.append(each)
-    return learn
+    aircraft = scenario.aircraft.model_dump(exclude={"uncertainty"})
+    known = vars(scenario) | {"aircraft": aircraft, "name": "", "path": ""}
+    key = make, repr(known)
+    if key not in _KEPT:
+        if len(_KEPT) >= MOST_KEPT:
+            _KEPT.clear()
+        _KEPT[key] = make(scenario, **options)
+    return _KEPT[key]
 
 
 def side_by_side(
@@ -149,7 +151,7 @@ def side_by_side(
 
     scenario = definition.scenario(case)
     controller = scenario.rise_di()
-    course = build_course(scenario, learns=True)
+    course = _kept(build_course, scenario, learns=True)
     if not flies_side_by_side(controller, course):
         return None
     vehicle = batch.vehicle(scenario)
@@ -167,7 +169,7 @@ def _fly_side_by_side(
     """
     scenarios = [definition.aircraft_scenario(first + k, case) for k in range(count)]
     controller = definition.scenario(case).rise_di()
-    fleet = side_by_side(definition, case, first, _learners(scenarios, learner))
+    fleet = side_by_side(definition, case, first, [_kept(learner, each) for each in scenarios])
     if fleet is None:
         return [fly(each, learner) for each in scenarios]
     result, outcomes = fleet.fly()

@@ -286,13 +286,15 @@ def delay_margin(
     channel: int | None = None,
     longest: float = MAX_DELAY_MARGIN,
     near: float | None = None,
+    above: float | None = None,
 ) -> float:
     """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all
     channels or in `channel`.
 
     0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The
     search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a loop
-    `near` this one, s, the search begins there, in a third of the time.
+    `near` this one, s, the search begins there, in a third of the time. 0 too where the margin is
+    not `above` a value, s.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     stride = 1  # in parts of 0.1 ms or less
@@ -305,7 +307,13 @@ def delay_margin(
 
     lower = 0
     growth = 1
-    if near is not None and 0.0 < near < longest:
+    if above is not None and above < longest:
+        lower = round(above / part) + 1
+        stride = NEAR
+        growth = 2
+        if not stable(lower):
+            return 0.0
+    elif near is not None and 0.0 < near < longest:
         lower = round(near / part)
         stride = NEAR
         growth = 2

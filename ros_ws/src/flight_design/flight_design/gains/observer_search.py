@@ -119,12 +119,7 @@ class MarginSearch(NamedTuple):
     needed: Requirement
     vanes: VanesConfig | None = None
     others: Sequence[AtSpeed] = ()  # speeds whose margins count too
-    quick: bool = False  # steps twice as long, and first the delay margin alone
-
-    @property
-    def step(self) -> float:
-        """Factor of a step."""
-        return RELAXATION**2 if self.quick else RELAXATION
+    quick: bool = False  # the delay margin alone counts until it is enough
 
     @property
     def nominal(self) -> LinearPlant:
@@ -146,7 +141,7 @@ class MarginSearch(NamedTuple):
         Raises ParameterError for margins out of reach.
         """
         search = self._replace(needed=above_zeros(self.needed, self.nominal))
-        steps = self.step ** np.eye(len(self.model.lag))
+        steps = RELAXATION ** np.eye(len(self.model.lag))
         selected = search._best(np.ones((1, len(steps))))
         fractions = [selected.fraction]
         while True:
@@ -163,7 +158,7 @@ class MarginSearch(NamedTuple):
                 selected = (
                     stepped
                     if stepped.fraction > selected.fraction
-                    else search._best(selected.relaxation[None] * self.step, near)
+                    else search._best(selected.relaxation[None] * RELAXATION, near)
                 )
                 fractions.append(selected.fraction)
                 continue
@@ -183,7 +178,11 @@ class MarginSearch(NamedTuple):
             )
             for relaxation in relaxations
         ]
-        delayed = [self._delayed(controller, self.nominal, near) for controller in controllers]
+        delayed = [self._delayed(controllers[0], self.nominal, near)]
+        for controller in controllers[1:]:
+            most = max(delay for _, delay in delayed)
+            above = most if self.quick and self._delay_fraction(most) < 1.0 else None
+            delayed.append(self._delayed(controller, self.nominal, near, above))
         fractions = [self._delay_fraction(delay) for _, delay in delayed]
         candidates: dict[int, SelectedObserver] = {}
         for k in sorted(range(len(delayed)), key=lambda k: -fractions[k]):
@@ -205,13 +204,18 @@ class MarginSearch(NamedTuple):
         )
 
     def _delayed(
-        self, controller: RiseDiConfig, plant: LinearPlant, near: float | None = None
+        self,
+        controller: RiseDiConfig,
+        plant: LinearPlant,
+        near: float | None = None,
+        above: float | None = None,
     ) -> tuple[list[LinearLaw], float]:
         """The laws, for every set of vanes in use, and the least delay margin, s."""
         laws = _laws(controller)
         longest = DELAYS * self.margin
         return laws, min(
-            delay_margin(plant, law, self.loop, longest=longest, near=near) for law in laws
+            delay_margin(plant, law, self.loop, longest=longest, near=near, above=above)
+            for law in laws
         )
 
     def _delay_fraction(self, delay: float) -> float:

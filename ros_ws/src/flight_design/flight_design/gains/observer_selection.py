@@ -102,10 +102,10 @@ def with_aircraft_observer(
     beta. The phase margin is also that of WORST_OF uncertain aircraft where the airframe is
     `uncertain`. `speeds` are two ratios to the trim speed: the controller has a schedule then, and
     the margins at these speeds too. Uncertain aircraft with a zero on the right do not count: no
-    gains hold all outputs there. A `quick` search has half the steps: a relaxation of a channel may
-    be larger by 10 %. `progress` gets a sentence before a step. Raises ParameterError for an
-    airframe with another D or without a wind, one that a feedforward refuses, and for margins that
-    no relaxation reaches.
+    gains hold all outputs there. In a `quick` search the delay margin
+    alone counts until it is enough. `progress` gets a sentence before a step. Raises ParameterError
+    for an airframe with another D or without a wind, one that a feedforward refuses, and for
+    margins that no relaxation reaches.
     """
     designs = _AircraftDesigns.around(controller, airframe, noise)
     if speeds is not None:

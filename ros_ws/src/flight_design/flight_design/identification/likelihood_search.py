@@ -100,22 +100,26 @@ class Search(Likelihood):
         if counts.max() < ALIKE * counts.sum():
             return None
         same = np.full(len(self._spans), counts.argmax())
-        return self._fit_at(self._refined(theta, same, used, lambda: None), same, used, flown)
+        return self._fit_at(self._refined(theta, same, used, lambda: None), None, used, flown)
 
     def _fit_at(
         self,
         best: End,
-        same: NDArray[np.int64],
+        same: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
         flown: FloatArray | None,
     ) -> Fit:
-        """The fit at the end of a search, `same` the level that most of its spans have."""
+        """The fit at the end of a search, other models at their best levels: those by theta, or the
+        `same` one in all spans where it costs less.
+        """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
 
         def beside(errors: FloatArray | float) -> Innovations:
             changed = np.where(self._errors, errors, theta)
-            winds = min(self.levels(changed), same, key=lambda each: self.cost(changed, used, each))
+            winds = self.levels(changed)
+            if same is not None:
+                winds = min(winds, same, key=lambda each: self.cost(changed, used, each))
             return self.predicted(changed, winds)
 
         after = self.predicted(theta, best.levels)

@@ -4,7 +4,6 @@
 of `rise-di gains`.
 """
 
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +44,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         scenario: The flight.
         real_time: Whether the learner works beside a controller in real time.
         quick: Whether an identification begins its search once where the air is the same in every
-            second, and a design takes half the steps, as in a campaign.
+            second, and the search of a design begins with the delay margin, as in a campaign.
 
     Returns:
         A function from the parameters of the controller to a learner, or None.
@@ -113,8 +112,9 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     )
 
 
-quick_learner = partial(learner, quick=True)
-"""The learner of a campaign."""
+def quick_learner(scenario: Scenario) -> Learn | None:
+    """The learner of a campaign."""
+    return learner(scenario, quick=True)
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
