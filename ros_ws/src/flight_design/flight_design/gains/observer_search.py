@@ -283,7 +283,8 @@ class MarginSearch(NamedTuple):
         values = selected.controller.model_dump()
         values["observer"]["margin"] = self.margin
         final = RiseDiConfig.validate_mapping(values, "controller")
-        delay = min(delay_margin(self.nominal, law, self.loop) for law in _laws(final))
+        near = selected.delay_margin
+        delay = min(delay_margin(self.nominal, law, self.loop, near=near) for law in _laws(final))
         return selected._replace(controller=final, delay_margin=delay)
 
 
