@@ -56,7 +56,7 @@ from aircraft_sim.turbulence import Turbulence, dryden, filters
 from aircraft_sim.vanes import ANGLES, Vanes
 from aircraft_sim.wind_field import RelativeWind
 from flight_core import parameters
-from flight_core.channels import POSE
+from flight_core.channels import POSE, vertical
 from flight_core.fields import Field
 from flight_core.parameters import (
     NodeConfig,
@@ -120,10 +120,10 @@ class AircraftConfig(NodeConfig):
     inertial_coupling: float = Field(
         default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling"
     )
-    kinematics: Literal["linear", "euler"] = Field(
+    kinematics: Literal["linear", "euler", "thrust"] = Field(
         default="linear",
         description="the attitude by A, or by Euler's equations with the loss of lift in a "
-        "bank, for guidance",
+        "bank, for guidance; thrust: of a multicopter, which its tilt accelerates",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
@@ -269,7 +269,10 @@ class AircraftConfig(NodeConfig):
             f"{self.inertial_coupling:g}",
             f"0: {has_none} inertial_coupling",
         )
-        missing = [name for name in ("alpha", *EULER_STATES) if name not in airframe.states]
+        needed: tuple[str, ...] = ("alpha", *EULER_STATES)
+        if self.kinematics == "thrust":
+            needed = ("p", "q", "r", vertical([*airframe.states]) or "vertical_speed")
+        missing = [name for name in needed if name not in airframe.states]
         known = self.kinematics == "linear" or not missing
         require(
             known,

@@ -87,7 +87,7 @@ class StateSpaceModel:
             for name, axis in zip(vanes.ANGLES, ("vertical", "lateral"), strict=True)
         ]
         self._speed = airframe.speed
-        self._euler = parameters.kinematics == "euler"
+        self._euler = parameters.kinematics != "linear"
         # north, east, altitude
         self._psi = 0.0
         self._position = [0.0, 0.0, 0.0]
@@ -114,8 +114,11 @@ class StateSpaceModel:
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         if self._over_place is not None:
             forced = forced._replace(rate=forced.rate + self._rate_by_wind())
-        self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
+        self._state = plant.advance(
+            t_ns, self._state, u, duration_ns, self._plant, self._tilted(forced)
+        )
         half = seconds(duration_ns) / 2.0
+        self._fly_on(2.0 * half)
         psi_dot = self._psi_dot
         velocity = self._velocity
         states = self._states()
@@ -134,6 +137,13 @@ class StateSpaceModel:
             ]
             self._wind_here = self._wind_at(t_ns + duration_ns)
             self._wind_dot = (self._wind_here - before) / (2.0 * half)
+
+    def _tilted(self, forced: Forcing) -> Forcing:
+        """The forcing of a step, with what a tilt takes from the lift: nothing of an airplane."""
+        return forced
+
+    def _fly_on(self, dt: float) -> None:
+        """Integrate over a step what no state of the airframe holds, beside heading and place."""
 
     def _wind_at(self, t_ns: int) -> FloatArray:
         """The wind against that of the start, to the north, to the east and down, m/s."""
@@ -250,6 +260,10 @@ class Simulator:
             self._model = JsbsimModel(
                 parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model()
             )
+        elif parameters.kinematics == "thrust":
+            from aircraft_sim.multicopter import MulticopterModel  # noqa: PLC0415 - has this module's model as base
+
+            self._model = MulticopterModel(parameters)
         else:
             self._model = StateSpaceModel(parameters)
         over_place = parameters.relative_wind()

@@ -97,6 +97,8 @@ def _require_flyable(scenario: Scenario, *, learns: bool) -> None:
     for key in ("shear", "microburst"):
         expected = "none: in a campaign the wind is the same everywhere"
         require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
+    expected = "linear or euler: a campaign flies no multicopter"
+    require(aircraft.kinematics != "thrust", "aircraft.kinematics", "thrust", expected)
     fixed = aircraft.over_airspeed is None
     require(
         fixed,

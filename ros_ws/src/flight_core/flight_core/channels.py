@@ -7,6 +7,15 @@ from collections.abc import Sequence
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
+VERTICAL = {"vertical_speed": 1.0, "w": -1.0}
+"""Channels that a multicopter has in place of V, with the climb in m/s by 1 m/s of the channel."""
+
+
+def vertical(names: Sequence[str]) -> str:
+    """The channel of VERTICAL among names; "" without one, as of an airplane."""
+    return next((name for name in names if name in VERTICAL), "")
+
+
 ATTITUDE = ("phi", "theta")
 """Channels of u_m beside the commands: bank, and pitch above the pitch of level flight, rad; for
 the end of u_m alone."""

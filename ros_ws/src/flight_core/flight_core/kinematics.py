@@ -57,6 +57,19 @@ def body_rates(
     return phi_dot - xp.tan(tilt(theta)) * (q * xp.sin(phi) + r * xp.cos(phi)), q
 
 
+def thrust_axis(phi: float, theta: float, psi: float) -> tuple[float, float, float]:
+    """Direction of a thrust against the z axis of the body: to the north, to the east and up, 1.
+
+    The third column of the rotation from the body to north, east and down, with the other sign
+    ahead of the horizontal part. Source: Stevens, Lewis, eq. (1.3-20).
+    """
+    back = math.cos(phi) * math.sin(theta)
+    right = math.sin(phi)
+    north = -back * math.cos(psi) - right * math.sin(psi)
+    east = -back * math.sin(psi) + right * math.cos(psi)
+    return north, east, math.cos(phi) * math.cos(theta)
+
+
 def tilt(angle: Scalar) -> Scalar:
     """An angle within +-MAX_TILT."""
     return clip(angle, MAX_TILT)

@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A multicopter: the linear model of an airframe for rates and climb, and the tilt of the thrust
+for the flight over ground.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from aircraft_sim.dynamics import Forcing
+from aircraft_sim.params import AircraftConfig
+from aircraft_sim.simulator import POSE_STATES, StateSpaceModel
+from flight_core.channels import VERTICAL, vertical
+from flight_core.kinematics import euler_rates, thrust_axis
+from flight_core.units import GRAVITY
+
+PHI = POSE_STATES.index("phi")
+THETA = POSE_STATES.index("theta")
+
+
+class MulticopterModel(StateSpaceModel):
+    """Equation (1) for p, q, r and the climb rate c, with attitude and horizontal velocity v:
+
+        c_dot = A[c, c] c + T_c + (n_up - 1) T,  T = g + T_c,  T_c = (B u)[c]
+        v_dot = T [n_north, n_east] + A[c, c] v
+
+    with n = `thrust_axis` of the attitude, which follows Euler's equations. The damping of the
+    climb counts in every direction. States phi and theta of the airframe, as A has them, act on
+    no pose. The middle of a step gives n and the rates.
+    """  # noqa: D400, D415 - what follows is an equation
+
+    def __init__(self, parameters: AircraftConfig) -> None:
+        states = [*parameters.sampled_airframe().states]
+        self._rates = [states.index(name) for name in ("p", "q", "r")]
+        self._climb = states.index(vertical(states))
+        self._up = VERTICAL[vertical(states)]
+        self._into_climb = self._up * np.eye(len(states))[self._climb]
+        self._phi = 0.0
+        self._theta = 0.0
+        self._level = np.zeros(2)  # v through the air, to the north and to the east, m/s
+        super().__init__(parameters)
+
+    def _thrust(self) -> float:
+        """T, m/s^2."""
+        row = self._plant.aircraft.B[self._climb]
+        return GRAVITY + self._up * float(row @ self._state.position)
+
+    def _tilted(self, forced: Forcing) -> Forcing:
+        """See StateSpaceModel."""
+        up = thrust_axis(self._phi, self._theta, self._psi)[2]
+        return forced._replace(rate=forced.rate + (up - 1.0) * self._thrust() * self._into_climb)
+
+    def _fly_on(self, dt: float) -> None:
+        """See StateSpaceModel."""
+        p, q, r = self._state.x[self._rates].tolist()
+        phi_dot, theta_dot = euler_rates(self._phi, self._theta, p, q, r)
+        half = dt / 2.0
+        north, east, _ = thrust_axis(
+            self._phi + half * phi_dot,
+            self._theta + half * theta_dot,
+            self._psi + half * self._psi_dot,
+        )
+        damping = self._plant.aircraft.A[self._climb, self._climb]
+        self._phi += dt * phi_dot
+        self._theta += dt * theta_dot
+        self._level = self._level + dt * (
+            self._thrust() * np.array([north, east]) + damping * self._level
+        )
+
+    def _states(self) -> list[float]:
+        """See StateSpaceModel."""
+        states = super()._states()
+        states[PHI] = self._phi
+        states[THETA] = self._theta
+        return states
+
+    def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
+        """See StateSpaceModel."""
+        north, east = self._level.tolist()
+        return north, east, self._up * float(self._state.x[self._climb])
