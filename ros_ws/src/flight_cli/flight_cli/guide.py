@@ -46,6 +46,8 @@ class Guide(RouteWords):
         "orbit; one of theta, climb,"
         " altitude; V. phi, theta, heading and course in degrees, r (beside phi) in degrees "
         "a second; else m and m/s."
+        " A multicopter takes phi and theta, course, north and east, or leg; climb or altitude; "
+        "heading; V over ground."
         " Or hold: the heading, altitude and airspeed of now. skip: the waypoint ahead. "
         "resume: the last leg. home: fly"
         " home and orbit. link: keep the operator's link until Ctrl-C. Or a route file, "

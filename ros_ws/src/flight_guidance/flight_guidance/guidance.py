@@ -21,7 +21,7 @@ from flight_core.vectors import (
     require_newer,
     require_not_future,
 )
-from flight_guidance import guidance_state, modes, path, targets
+from flight_guidance import guidance_state, modes, multicopter, path, targets
 from flight_guidance.guidance_state import (
     TARGETS,
     Begin,
@@ -173,8 +173,17 @@ def restored(
         logged["fence.action"],
         logged["loitered"],
         psi,
+        (logged["pose.v_north"], logged["pose.v_east"]),
     )
     return inputs, state
+
+
+def step(
+    state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
+) -> tuple[GuidanceState, Commands]:
+    """The step of the kind of aircraft: `modes.step`, or `multicopter.step`."""
+    flown = modes.step if params.multicopter is None else multicopter.step
+    return flown(state, inputs, route, params)
 
 
 def digest(route: Route | None) -> int:
@@ -267,7 +276,8 @@ class Guidance:
         """
         targets.read_target(values, self._params, self.route, degrees=True)
         # A lateral or vertical command replaces the command of the mode before.
-        for table in (guidance_state.LATERAL, guidance_state.VERTICAL):
+        channels = self._params.channels
+        for table in (channels.lateral, channels.vertical):
             if any(name in table for name in values):
                 self._given = {
                     name: value for name, value in self._given.items() if name not in table
@@ -299,13 +309,13 @@ class Guidance:
         self._link_lost = False
 
     def hold(self) -> bool:
-        """Hold the heading, the altitude and the airspeed of now; False while guidance does not
-        fly.
+        """Hold the heading, the altitude and the airspeed of now, or of a multicopter the place;
+        False while guidance does not fly.
         """
         if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
             return False
-        speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
-        self.take_target(targets.hold(self.pose(), speed, self._params))
+        held = modes.hold_now if self._params.multicopter is None else multicopter.hold
+        self.take_target(held(self.pose(), tuple(self._y.value.tolist()), self._params))
         return True
 
     def home(self) -> bool:
@@ -474,7 +484,7 @@ class Guidance:
         self._begin = Begin.NO
         self._given = {}
         self._route_waits = False
-        self._state, commands = modes.step(self._state, inputs, self.route, self._params)
+        self._state, commands = step(self._state, inputs, self.route, self._params)
         log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
         notices = self._notices.take(
             seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True))

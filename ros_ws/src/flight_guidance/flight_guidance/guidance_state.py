@@ -40,6 +40,7 @@ class Lateral(IntEnum):
     COURSE = 2
     ORBIT = 3
     ROUTE = 4
+    PLACE = 5  # of a multicopter: to a place, and hover there
 
 
 class Vertical(IntEnum):
@@ -90,6 +91,48 @@ VERTICAL: Mapping[str, Vertical] = {
 }
 
 
+class Channels(NamedTuple):
+    """The channels of Target that a kind of aircraft takes."""
+
+    lateral: Mapping[str, Lateral]
+    vertical: Mapping[str, Vertical]
+    further: tuple[str, ...]  # of no mode
+    together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that come together
+
+    def known(self) -> tuple[str, ...]:
+        """All of them."""
+        known = {*self.lateral, *self.vertical, *self.further}
+        return tuple(name for name in TARGETS if name in known)
+
+
+AIRPLANE = Channels(LATERAL, VERTICAL, ("V",), {Lateral.ORBIT: ("north", "east", "radius")})
+MULTICOPTER = Channels(
+    {
+        **dict.fromkeys(("phi", "theta"), Lateral.PHI),
+        "course": Lateral.COURSE,
+        **dict.fromkeys(("north", "east"), Lateral.PLACE),
+        **dict.fromkeys(("leg", "along"), Lateral.ROUTE),
+    },
+    {"climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE},
+    ("heading", "V"),
+    {Lateral.PHI: ("phi", "theta"), Lateral.PLACE: ("north", "east")},
+)
+
+
+class MulticopterParams(NamedTuple):
+    """Gains and limits of a multicopter's guidance."""
+
+    drag: float  # d, deceleration over airspeed, 1/s
+    k_tilt: float  # of the direction of the thrust, 1/s
+    k_psi: float  # of the heading, 1/s
+    k_v: float  # of the velocity, 1/s
+    k_p: float  # of the place, 1/s
+    lead: float  # s, of the tilt behind its command
+    braking: float  # m/s^2, towards a place and in a fillet
+    tilt_rate: float  # rad/s
+    yaw_rate: float  # rad/s
+
+
 class Home(NamedTuple):
     """Where an aircraft goes in the end."""
 
@@ -132,6 +175,8 @@ class GuidanceParams(NamedTuple):
     home: Home = Home()
     link_timeout_ns: int = 0  # of the operator's link; 0: no limit
     dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
+    channels: Channels = AIRPLANE
+    multicopter: MulticopterParams | None = None  # None: of an airplane
 
 
 class Begin(IntEnum):
@@ -180,6 +225,7 @@ class GuidanceState(NamedTuple):
     fence: float = 0.0  # action of the fence: of `fence.Escape`
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
     psi: Scalar = 0.0  # estimated heading, rad
+    velocity: Wind = (0.0, 0.0)  # of the pose of the step, for the wind of a multicopter, m/s
 
 
 class Commands(NamedTuple):

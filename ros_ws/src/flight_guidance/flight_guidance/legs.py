@@ -36,14 +36,14 @@ def along_route(
     if state.joining:
         start, course = route.start(state.leg, state.target.along)
         if path.joined(start, course, near, position, course_and_speed(pose)[0]):
-            state = _on_leg(state, state.leg, route)
+            state = on_leg(state, state.leg, route)
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
         state = _loitering(state, leg, leg.loiter, pose, dt)
         ends = has_loitered(state, pose, route) and leaves(
             leg, EXIT * course_and_speed(pose)[1], pose, position
         )
-        return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
+        return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)  # after a sharp corner, too, the next leg is joined
@@ -83,7 +83,7 @@ def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -
     )
 
 
-def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
+def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
     """The state on a leg of the route, with the leg's altitude and airspeed."""
     target = state.target._replace(V=route.V[leg], along=0.0)
     return state._replace(
@@ -122,7 +122,7 @@ def joining(
     """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg
     where the point is near.
     """
-    state = _on_leg(state, leg, route)
+    state = on_leg(state, leg, route)
     flown = route.legs[leg]
     if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
         return state

@@ -114,6 +114,13 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
 
+def hold_now(
+    pose: Mapping[str, float], y: tuple[float, ...], params: GuidanceParams
+) -> dict[str, float]:
+    """Commands to hold the heading, the altitude and the airspeed of a pose and a y."""
+    return hold(pose, airspeed(y, params), params)
+
+
 def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
     """True airspeed V0 + V, m/s, at least half of V0."""
     return float(true_airspeed(y[params.outputs.index("V")], params))
@@ -155,7 +162,8 @@ def step(
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
     commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
-    return state._replace(t_ns=inputs.t_ns), commands
+    velocity = (pose["v_north"], pose["v_east"])
+    return state._replace(t_ns=inputs.t_ns, velocity=velocity), commands
 
 
 def _wanted_rates(

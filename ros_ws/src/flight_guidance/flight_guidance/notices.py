@@ -27,6 +27,10 @@ LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
 versions had none."""
 
+TILTED = math.radians(10.0)
+TILTED_TIME = 0.1
+"""rad and s. A multicopter beyond its largest tilt by as much for as long does not follow."""
+
 STALE_TIME = 2.0
 """The same for a pose older than its limit, s."""
 
@@ -83,7 +87,8 @@ class Notices:
 
     `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed
     command, m/s, the wind up to which circles fit into the bank; `link_timeout`:
-    guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`.
+    guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`; `largest_tilt`: that of a
+    multicopter, rad.
     """
 
     CHANNELS = (
@@ -99,6 +104,7 @@ class Notices:
             "wind.east",
         ),
         *("fence.action", "fence.clearance", "age.pose"),
+        *("pose.phi", "pose.theta"),
     )
 
     def __init__(
@@ -108,7 +114,10 @@ class Notices:
         largest_wind: Callable[[float], float],
         link_timeout: float = math.inf,
         reach: Callable[[Authority], str] = lambda authority: "",
+        largest_tilt: float = math.inf,
     ) -> None:
+        self._largest_tilt = largest_tilt
+        self._tilted = _Lasting(TILTED_TIME)
         self._reach = reach
         self._authority = Authority()
         self._reached = ""
@@ -160,6 +169,12 @@ class Notices:
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
             texts.append(
                 f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s"
+            )
+        tilt = math.acos(math.cos(log["pose.phi"]) * math.cos(log["pose.theta"]))
+        if self._tilted.due(t, holds=tilt > self._largest_tilt + TILTED):
+            texts.append(
+                f"the tilt is {math.degrees(tilt):.0f} deg, its limit "
+                f"{math.degrees(self._largest_tilt):.0f} deg: a rotor may be lost"
             )
         if self._blown.due(t, holds=bool(is_blown_back(log))):
             texts.append(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from flight_core.channels import RATES_AND_SPEED
+from flight_core.channels import RATES_AND_SPEED, vertical
 from flight_core.fields import Field
 from flight_core.parameters import (
     Names,
@@ -26,18 +26,21 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
-from flight_guidance import protection, reach
+from flight_guidance import multicopter_rules, protection, reach
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
 from flight_guidance.fence import MARGIN, Motion, room_at_home
 from flight_guidance.guidance_state import (
+    MULTICOPTER,
     TARGETS,
     GuidanceParams,
     Home,
     Limits,
+    MulticopterParams,
 )
 from flight_guidance.landing import Lander, Landing, landing_at
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
+from flight_guidance.multicopter_rules import route_through
 from flight_guidance.notices import Notices
 from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
@@ -97,6 +100,10 @@ class GuidanceConfig(NodeConfig):
     ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose`")
     altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose`")
     wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
+    drag: Positive | None = Field(
+        default=None,
+        description="of a multicopter: g tan(tilt) / V in steady flight, 1/s; none: an airplane",
+    )
 
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
         default=math.radians(30.0), description="largest bank phi_max, rad"
@@ -174,12 +181,16 @@ class GuidanceConfig(NodeConfig):
 
     def _check(self) -> None:
         period_ns(self.rate, "rate")
+        climbs = vertical(self.outputs)
+        expected = ("p", "q", "r", climbs) if climbs else RATES_AND_SPEED
         require(
-            sorted(self.outputs) == sorted(RATES_AND_SPEED),
+            sorted(self.outputs) == sorted(expected),
             "outputs",
             ", ".join(self.outputs),
             ", ".join(RATES_AND_SPEED),
         )
+        drag = "g tan(tilt) / V of a steady flight, 1/s" if climbs else "none: an airspeed is flown"
+        require((self.drag is not None) == bool(climbs), "drag", self.drag, drag)
         require_length("natural_frequency", self.natural_frequency, self.outputs)
         if self.throttle_authority:
             require(
@@ -200,6 +211,33 @@ class GuidanceConfig(NodeConfig):
                 f"{self.rate:g} Hz",
                 f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
             )
+        lowest, highest = self._altitudes()
+        require(
+            lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
+        )
+        if climbs:
+            self._check_multicopter()
+        else:
+            self._check_airplane()
+        params = self.params()
+        route = None if self.route is None else self.plan(self.waypoints())
+        if self.landing is not None:
+            require(route is not None, "landing", "no route", "one with its waypoint")
+        if route is not None:
+            self.landing_on(route)
+        for start, target in self.program_steps():
+            read_target(target, params, route, f"program at {start:g} s")
+
+    def _check_multicopter(self) -> None:
+        """What an airplane alone has, and home inside of the fence."""
+        for key in ("stall_speed", "landing", "touchdown", "throttle_authority"):
+            require(not getattr(self, key), key, getattr(self, key), "none of a multicopter")
+        inside = self.fence_clearance(self.home.north, self.home.east)
+        margin = self.fence_margin(self.speed)
+        expected = f"at least {margin:.1f} m inside"
+        require(inside >= margin, "home", f"home {described(inside)}", expected)
+
+    def _check_airplane(self) -> None:
         floor = self._floor()
         require(
             floor < self.speed,
@@ -218,19 +256,7 @@ class GuidanceConfig(NodeConfig):
             f"{fastest:g} m/s",
             f"more than the trim speed, {self.speed:g} m/s",
         )
-        lowest, highest = self._altitudes()
-        require(
-            lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
-        )
         self._check_home()
-        params = self.params()
-        route = None if self.route is None else self.plan(self.waypoints())
-        if self.landing is not None:
-            require(route is not None, "landing", "no route", "one with its waypoint")
-        if route is not None:
-            self.landing_on(route)
-        for start, target in self.program_steps():
-            read_target(target, params, route, f"program at {start:g} s")
 
     def _check_home(self) -> None:
         needed = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
@@ -332,6 +358,15 @@ class GuidanceConfig(NodeConfig):
     def notices(self) -> Notices:
         """What the notices of a flight depend on."""
         link_timeout = self.home.link_timeout or math.inf
+        if self.drag is not None:
+            strongest = GRAVITY * math.tan(self.bank) / self.drag
+            return Notices(
+                self.wind,
+                self.max_age,
+                lambda speed: strongest - speed,
+                link_timeout,
+                largest_tilt=self.bank,
+            )
         reach_of = partial(reach_sentence, self.params())
         wind_of = partial(largest_wind, wind=self.wind, bank=self.bank)
         return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of)
@@ -350,6 +385,8 @@ class GuidanceConfig(NodeConfig):
 
     def params(self) -> GuidanceParams:
         """The numbers of the equations."""
+        if self.drag is not None:
+            return self._multicopter_params(self.drag)
         frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
         floor, (climb, sink) = self._floor(), self.climb_limits()
         roll = frequency["p"] / 4.0
@@ -389,6 +426,48 @@ class GuidanceConfig(NodeConfig):
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
         )
 
+    def _gains(self, drag: float) -> MulticopterParams:
+        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        return multicopter_rules.gains(frequency, self.bank, drag, self.roll_authority or math.inf)
+
+    def _multicopter_params(self, drag: float) -> GuidanceParams:
+        """The numbers of the equations of a multicopter."""
+        own = self._gains(drag)
+        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        climbs = vertical(self.outputs)
+        rates = {"p": own.tilt_rate, "q": own.tilt_rate, "r": own.yaw_rate}
+        rates[climbs] = self.acceleration / frequency[climbs]
+        climb = self.climb or multicopter_rules.CLIMB * self.speed
+        sink = self.sink or multicopter_rules.SINK * self.speed
+        gain = self.altitude_gain or frequency[climbs] / 4.0
+        return GuidanceParams(
+            outputs=self.outputs,
+            period_ns=period_ns(self.rate, "rate"),
+            speed=self.speed,
+            k_chi=0.0,
+            attitude=AttitudeParams(own.k_tilt, own.k_tilt, own.tilt_rate, 0.0, 0.0, 0.0),
+            vertical=VerticalParams(gain, self.acceleration, climb, sink, 0.0),
+            path=PathParams(0.0, self.damping, self.capture),
+            limits=Limits(
+                self.bank,
+                -self.bank,
+                self.bank,
+                0.0,
+                0.0,
+                0.0,
+                self._largest_speed(),
+                *self._altitudes(),
+            ),
+            slew=tuple(frequency[name] * rates[name] for name in self.outputs),
+            max_age_ns=nanoseconds(self.max_age),
+            hold_ns=nanoseconds(self.hold),
+            fence=self.fence_zones(),
+            home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
+            link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
+            channels=MULTICOPTER,
+            multicopter=own,
+        )
+
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
         """The altitude loop. Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4
         / T_L.
@@ -407,6 +486,17 @@ class GuidanceConfig(NodeConfig):
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
         """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
+        if self.drag is None:
+            route = self._airplane_route(waypoints)
+        else:
+            bounds = (*self._altitudes(), self._largest_speed())
+            braking = self._gains(self.drag).braking
+            route = route_through(waypoints, self.speed, self.radius, braking, bounds)
+        if (fence := self.fence_zones()) is not None:
+            require_inside(route, fence, max(map(self.fence_margin, route.V)))
+        return route
+
+    def _airplane_route(self, waypoints: Sequence[Waypoint]) -> Route:
         floor, (climb, sink) = self._floor(), self.climb_limits()
         stall = floor / protection.FLOOR
         flown = speeds(waypoints, self.speed)
@@ -453,7 +543,7 @@ class GuidanceConfig(NodeConfig):
             )
             end = waypoints[to].departure if is_orbit(leg) else waypoints[to].altitude
             altitude.append(departures[-1] if fillet and slopes else end)
-        route = Route(
+        return Route(
             legs,
             tuple(altitude),
             tuple(flown[k] for k in numbers),
@@ -462,9 +552,6 @@ class GuidanceConfig(NodeConfig):
             slopes,
             notes,
         )
-        if (fence := self.fence_zones()) is not None:
-            require_inside(route, fence, max(map(self.fence_margin, flown)))
-        return route
 
     def landing_on(self, route: Route) -> Landing | None:
         """The landing at the end of a line of a route; None without one.

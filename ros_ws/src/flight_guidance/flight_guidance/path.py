@@ -466,15 +466,15 @@ def _between_circles(
     if distance > radius:
         course = course_of(before, last) - math.asin(radius / distance)
         with suppress(ParameterError):
-            return _filleted(
+            return filleted(
                 [*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))],
                 radius,
                 first,
             )
-    return _filleted(points, radius, first)
+    return filleted(points, radius, first)
 
 
-def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg]:
+def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[Leg]:
     """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number
     of the first waypoint.
     """

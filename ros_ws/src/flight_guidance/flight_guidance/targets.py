@@ -12,11 +12,7 @@ from flight_core.vectors import ChannelError, Scalar, array_namespace
 from flight_guidance import path, reach
 from flight_guidance.guidance_state import (
     LARGEST,
-    LATERAL,
-    TARGETS,
-    VERTICAL,
     GuidanceParams,
-    Lateral,
 )
 from flight_guidance.path import Route
 from flight_guidance.reach import Authority
@@ -111,14 +107,15 @@ def read_target(
 
     `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
     """
-    lateral_modes = {LATERAL[name] for name in values if name in LATERAL}
-    vertical_modes = {VERTICAL[name] for name in values if name in VERTICAL}
-    unknown = [name for name in values if name not in TARGETS]
+    channels = params.channels
+    lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
+    vertical_modes = {mode for name, mode in channels.vertical.items() if name in values}
+    unknown = [name for name in values if name not in channels.known()]
     if unknown or not values:
         raise ChannelError(
             "name",
             f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
-            f"{', '.join(TARGETS)}",
+            f"{', '.join(channels.known())}",
         )
     if len(lateral_modes) > 1 or len(vertical_modes) > 1:
         raise ChannelError(
@@ -126,12 +123,11 @@ def read_target(
             f"{what}: found {', '.join(values)}, expected one lateral and one vertical command "
             "at most",
         )
-    if Lateral.ORBIT in lateral_modes and not {"north", "east", "radius"} <= set(values):
-        raise ChannelError(
-            "name",
-            f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit "
-            "together",
-        )
+    for mode in lateral_modes & channels.together.keys():
+        *before, last = channels.together[mode]
+        if not {*before, last} <= values.keys():
+            group = f"{', '.join(before)} and {last} together"
+            raise ChannelError("name", f"{what}: found {', '.join(values)}, expected {group}")
     for name, needed in (("r", "phi"), ("along", "leg")):
         if name in values and needed not in values:
             raise ChannelError(
@@ -217,12 +213,12 @@ def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Commands to orbit home clockwise on the least radius, at the altitude of home or of now."""
+    """Commands to orbit home clockwise on the least radius, or of a multicopter to hover there, at
+    the altitude of home or of now.
+    """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude
-    return {
-        "north": place.north,
-        "east": place.east,
-        "radius": float(math.ceil(params.limits.radius)),
-        "altitude": altitude,
-    }
+    there = {"north": place.north, "east": place.east, "altitude": altitude}
+    if params.multicopter is not None:
+        return there
+    return there | {"radius": float(math.ceil(params.limits.radius))}

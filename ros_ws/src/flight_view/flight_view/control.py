@@ -302,7 +302,8 @@ class Control:
             }
             shown["faults"] = self._faults
         if scenario is not None and scenario.guidance is not None and "guidance" in nodes:
-            shown["radius"] = math.ceil(scenario.guidance.least_radius())  # m, of an orbit
+            orbits = scenario.guidance.drag is None
+            shown["radius"] = math.ceil(scenario.guidance.least_radius()) if orbits else 0  # m
         if "bridge" in nodes:
             shown["bridge"] = {"map": self._map(), "sends": self._sends()}
         return shown

@@ -4,12 +4,13 @@
 profile.
 """
 
+import math
 from typing import Annotated
 
 import numpy as np
 
 from flight_core import parameters
-from flight_core.channels import RATES_AND_SPEED
+from flight_core.channels import RATES_AND_SPEED, vertical
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
@@ -243,8 +244,12 @@ class ReferenceModelConfig(NodeConfig):
         section = self.live
         channels = None
         gain = (0.0, 0.0)
-        if section.speed is not None and self.second_order is not None:
-            q, V, p, r = (self.outputs.index(name) for name in RATES_AND_SPEED)
+        speed = section.speed
+        climbs = vertical(self.outputs)
+        if climbs and {"p", "q", "r"} <= {*self.outputs}:
+            speed = math.inf  # a multicopter levels without a turn
+        if speed is not None and self.second_order is not None:
+            q, V, p, r = (self.outputs.index(name) for name in ("q", climbs or "V", "p", "r"))
             channels = (q, V, p, r)
             frequency = self.second_order.natural_frequency
             gain = (frequency[p] / 4.0, frequency[q] / 4.0)
@@ -253,7 +258,7 @@ class ReferenceModelConfig(NodeConfig):
             nanoseconds(section.levelling),
             np.array([section.bounds.get(name, np.inf) for name in self.outputs]),
             np.array([section.slew.get(name, np.inf) for name in self.outputs]) / self.rate,
-            section.speed,
+            speed,
             channels,
             gain,
             section.roll_rate,

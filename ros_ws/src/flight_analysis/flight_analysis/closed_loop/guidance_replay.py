@@ -15,7 +15,7 @@ from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_guidance import guidance, modes
+from flight_guidance import guidance
 from flight_guidance.guidance_state import Begin, GuidanceState, Inputs, Lateral
 from flight_guidance.notices import LINK_AGE
 from flight_guidance.params import GuidanceConfig
@@ -131,7 +131,7 @@ class _Comparison:
     ) -> FloatArray:
         """The channels of a step after a state, then its u_m."""
         flown = int(channels["route"])
-        state, commands = modes.step(previous, inputs, self._legs[flown], self._params)
+        state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
         link_age = channels.get(LINK_AGE, 0.0)
         row = guidance.row(inputs, state, commands, flown, link_age)
         logged = [name in self._names for name in guidance.names(self._outputs)]

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.arguments import FilePath, as_instance, as_path
-from flight_core.channels import RATES_AND_SPEED
+from flight_core.channels import RATES_AND_SPEED, VERTICAL, vertical
 from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, is_file, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
@@ -262,28 +262,31 @@ def guidance_by_rule(
         raise ParameterError(
             f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot"
         )
-    missing = [name for name in RATES_AND_SPEED if name not in reference.outputs]
+    climbs = vertical(reference.outputs)
+    missing = [name for name in RATES_AND_SPEED if name not in (*reference.outputs, climbs and "V")]
     require(
         not missing,
         "guidance",
         f"an aircraft without {', '.join(missing)}",
-        f"one with {', '.join(RATES_AND_SPEED)}",
+        f"one with {', '.join(RATES_AND_SPEED)}, or {' or '.join(VERTICAL)} in place of V",
     )
-    values = {
+    values: dict[str, Any] = {
         "outputs": reference.outputs,
         "natural_frequency": reference.second_order.natural_frequency,
-        "speed": channels.speed,
     }
+    if not climbs:
+        values["speed"] = channels.speed
     if isinstance(controller, RiseDiConfig) and controller.lower and controller.upper:
 
         def effect(i: int) -> float:
             return controller.omega[i] / controller.input_scale[i]
 
-        at_p, at_v = (controller.outputs.index(name) for name in ("p", "V"))
-        down, up = (
-            abs(limits[at_v]) * effect(at_v) for limits in (controller.lower, controller.upper)
-        )
-        values["throttle_authority"] = (down, up)
+        at_p = controller.outputs.index("p")
+        if not climbs:
+            at_v = controller.outputs.index("V")
+            values["throttle_authority"] = tuple(
+                abs(limits[at_v]) * effect(at_v) for limits in (controller.lower, controller.upper)
+            )
         values["roll_authority"] = min(-controller.lower[at_p], controller.upper[at_p]) * effect(
             at_p
         )
@@ -424,12 +427,13 @@ def require_guidable(scenario: Scenario) -> None:
     guidance = scenario.guidance
     if guidance is None:
         return
-    turns = aircraft.is_jsbsim or aircraft.kinematics == "euler"
+    needed = "euler" if guidance.drag is None else "thrust"
+    turns = {"euler": "a bank turns the aircraft", "thrust": "a tilt accelerates the multicopter"}
     require(
-        turns,
+        aircraft.is_jsbsim or aircraft.kinematics == needed,
         "aircraft.kinematics",
         f"{aircraft.kinematics!r} beside guidance",
-        "euler: a bank turns the aircraft",
+        f"{needed}: {turns[needed]}",
     )
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)
@@ -441,7 +445,7 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
     reference = scenario.reference_model
     aircraft = scenario.aircraft
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
-    for key in ("speed", "outputs", "natural_frequency"):
+    for key in [key for key in ("speed", "outputs", "natural_frequency") if key in rule]:
         value = getattr(guidance, key)
         require(
             value == rule[key],
@@ -454,10 +458,16 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
         "guidance is lost"
     )
     require(
-        reference.live.speed is not None,
+        reference.live.speed is not None or guidance.drag is not None,
         "reference_model.live.speed",
         "none beside guidance",
         levels,
+    )
+    require(
+        guidance.drag is None or not scenario.learns(),
+        "controller.learn",
+        "a section beside the guidance of a multicopter",
+        "none: its limits do not follow a learned model",
     )
     pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")
     period = period_ns(guidance.rate, "guidance.rate")

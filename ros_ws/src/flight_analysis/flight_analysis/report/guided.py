@@ -46,6 +46,10 @@ BANDS: Mapping[str, float] = {
 """Half-width of the settling band by quantity, rad, m, m/s."""
 
 
+PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
+"""Modes with an error in m: beside a path, or from a place."""
+
+
 class Held(NamedTuple):
     """Errors of a held quantity over a segment, in SI. A segment with a begin outside the band has
     overshoot and settling.
@@ -111,7 +115,7 @@ def segments(tape: Tape) -> list[Segment]:
         last = after - 1  # its modes and commands are those that the segment ends with
         lateral = Lateral(int(log["mode.lateral"][last]))
         vertical = Vertical(int(log["mode.vertical"][last]))
-        on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
+        on_path = "xtrack" if lateral in PATHS else lateral.name.lower()
         quantities = (
             on_path,
             "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(),
@@ -360,7 +364,17 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
     for name in (name for name in errors if UNITS[name] == "rad"):
         errors[name] = np.remainder(errors[name] + math.pi, 2.0 * math.pi) - math.pi
     # V of y is a deviation from the trim speed V0, and so is that of u_m: V_c - V0.
-    return errors | {"xtrack": log["xtrack"], "V": log["y.V"] - log["u_m.V"]}
+    V = log["y.V"] - log["u_m.V"] if "y.V" in log.names else flown_speed(tape, 0.0) - log["V_c"]
+    return errors | {"xtrack": log["xtrack"], "V": V}
+
+
+def flown_speed(tape: Tape, trim: float) -> FloatArray:
+    """Airspeed at the samples of `guidance`, m/s: `trim` and V of y; of a multicopter the speed
+    over ground.
+    """
+    log = tape["guidance"]
+    over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])
+    return trim + log["y.V"] if "y.V" in log.names else over_ground
 
 
 def _held(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> Held:

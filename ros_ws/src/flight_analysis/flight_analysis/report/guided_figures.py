@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.display_units import QUANTITY_UNITS
 from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
+from flight_analysis.report.guided import flown_speed
 from flight_analysis.report.plotting import (
     INTERVAL_OPACITY,
     Curve,
@@ -168,9 +169,12 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     log = tape["guidance"]
     pose = log.group("pose")
     heading = log["pose.psi"] + log["pose.beta"]
-    wind = np.column_stack(
-        wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, speed + log["y.V"])
-    )
+    wind = np.column_stack([log["wind.north"], log["wind.east"]])  # of a multicopter
+    if "y.V" in log.names:
+        flown = flown_speed(tape, speed)
+        wind = np.column_stack(
+            wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, flown)
+        )
     return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
 
 
@@ -210,9 +214,8 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
         np.nan,
     )
     commands = {"altitude": commanded, "V": log["V_c"]}
-    return _over_commands(
-        context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds
-    )
+    flown = {"altitude": log["pose.altitude"], "V": flown_speed(context.tape, speed)}
+    return _over_commands(context, commands, flown, bounds)
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:

@@ -63,14 +63,14 @@ function showPilot() { // what a pilot needs at once, in the header
   $("pilot-hold").hidden = $("pilot-home").hidden = !has("guidance");
   $("pilot-stop").hidden = !has("controller") && !has("bridge");
   $("pilot-stop").textContent = has("bridge") ? "Disengage" : "Deactivate";
-  $("fly-to").hidden = !state.radius;
+  $("fly-to").hidden = state.radius === undefined;
 }
 
-// A click on the map: the least orbit round a place, north and east in m.
+// A click on the map: the least orbit round a place, north and east in m; of a multicopter, whose radius is 0, the place.
 export function flyTo([north, east]) {
-  if (!state?.radius || $("fly-to").ariaPressed !== "true") return;
+  if (state?.radius === undefined || $("fly-to").ariaPressed !== "true") return;
   const place = {north: Math.round(north), east: Math.round(east)};
-  act({do: "target", values: {...place, radius: state.radius}}, `flies to north ${place.north} m, east ${place.east} m`);
+  act({do: "target", values: state.radius ? {...place, radius: state.radius} : place}, `flies to north ${place.north} m, east ${place.east} m`);
 }
 
 export function togglesFlyTo() {

@@ -1,0 +1,540 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guidance of a multicopter: place, velocity, acceleration, direction of the thrust, body rates.
+
+The heading is apart: no lateral mode needs a nose. As `modes.step`, the step has no clock and no
+hidden state.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.channels import POSE, VERTICAL, vertical
+from flight_core.kinematics import clip, euler_rates, heading_rate, thrust_axis, tilt
+from flight_core.rates import seconds
+from flight_core.units import GRAVITY
+from flight_guidance import path
+from flight_guidance.fence import (
+    AROUND,
+    BACK,
+    HOME,
+    MARGIN,
+    Escape,
+    Fence,
+    clearance,
+)
+from flight_guidance.guidance_state import (
+    LARGEST,
+    Begin,
+    Commands,
+    GuidanceParams,
+    GuidanceState,
+    Inputs,
+    Lateral,
+    Mode,
+    MulticopterParams,
+    Target,
+    Vertical,
+)
+from flight_guidance.lateral import PathError
+from flight_guidance.legs import on_leg, on_profile
+from flight_guidance.path import Point, Route
+from flight_guidance.targets import home
+from flight_guidance.vertical import VerticalParams, climb_for, slewed
+from flight_guidance.ways import line_clearance, ways
+
+NEAR = 0.5
+"""s of flight from a place within which the place counts as reached, at least 0.5 m."""
+
+ACROSS = math.sin(math.radians(60.0))
+"""Largest share of the speed towards a path, as guidance of airplanes has it."""
+
+WIND_TIME = 3.0
+"""T, s: long against a leg's end, short against a leg."""
+
+LONGEST_LEAD = 0.5
+"""s. Largest age of a pose over which its attitude is brought to now."""
+
+Vector = tuple[float, float]  # to the north and to the east
+
+
+class Wanted(NamedTuple):
+    """What a lateral mode asks for."""
+
+    velocity: Vector  # m/s, over ground
+    ahead: Vector  # m/s, the velocity once the tilt has followed
+    acceleration: Vector = (0.0, 0.0)  # m/s^2, of the way itself
+    error: PathError = PathError(0.0, 0.0, 0.0)
+    to_go: float = 0.0  # m
+
+
+def _own(params: GuidanceParams) -> MulticopterParams:
+    assert params.multicopter is not None  # noqa: S101 - `guidance.step` has looked
+    return params.multicopter
+
+
+def hold(
+    pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
+) -> dict[str, float]:
+    """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead, with the heading and the
+    altitude of now.
+    """
+    north, east = _stop(pose, _own(params))
+    return {"north": north, "east": east, "heading": pose["psi"], "altitude": pose["altitude"]}
+
+
+def _velocity(pose: Mapping[str, float]) -> Vector:
+    return pose["v_north"], pose["v_east"]
+
+
+def _stop(pose: Mapping[str, float], own: MulticopterParams) -> Point:
+    """Where the aircraft stops, m."""
+    v = _velocity(pose)
+    time = own.lead + math.hypot(*v) / (2.0 * own.braking)
+    return pose["north"] + time * v[0], pose["east"] + time * v[1]
+
+
+def step(
+    state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
+) -> tuple[GuidanceState, Commands]:
+    """A step: attitude, commands, u_m.
+
+        v_c = towards the place or the path, within V
+        a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within g tan(bank)
+        [p, q] = k_tilt (angle from the thrust to [a_c, g]),  r = k_psi (heading - psi)
+
+    1. Attitude: of pose, brought to now by p, q, r of y. While pose is stale the thrust is
+       vertical; after `hold` the rates are 0 until pose returns.
+    2. Commands: the next leg at the end of a leg, then the commands given.
+    3. The fence: the place where the aircraft stops stays inside, else the way home.
+    4. W, the wind, by `_with_wind`: what holds the aircraft back is drag in a wind.
+    5. The climb rate by the altitude, as of an airplane.
+
+    a_ff and v_ff are those of the path `lead` ahead, for the tilt comes later by as much.
+    """
+    own = _own(params)
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    state = _begin(state, inputs, pose, params)
+    dt = seconds(inputs.t_ns - state.t_ns)
+    state = _with_attitude(state, inputs, pose, dt, params)
+    state, missed = _with_commands(state, inputs.commands, pose, route, params)
+    state = _with_wind(state, pose, dt, params)
+    state, escape = _within_fence(state, pose, params)
+    flies = state.mode is Mode.ENGAGED
+    speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
+    state = state._replace(V_c=slewed(state.V_c, speed, own.braking, dt))
+    wanted = _wanted(state, pose, route, escape, params)
+    if flies and state.lateral is not Lateral.PHI:
+        state = state._replace(V_c=min(state.V_c, math.hypot(*wanted.velocity)))
+    phi_c, theta_c, limited = _attitude_for(state, pose, wanted, params)
+    state, climb_limited = _with_climb(state, pose, dt, params)
+    rates = _rates(state, phi_c, theta_c, own)
+    name = vertical(params.outputs)
+    values = rates | {name: VERTICAL[name] * state.climb_c}
+    u_m = tuple(
+        slewed(before, values[channel], rate, dt)
+        for channel, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
+    )
+    commands = Commands(
+        phi_c,
+        theta_c,
+        wanted.error.e,
+        wanted.to_go,
+        wanted.error.track,
+        missed,
+        escape.clearance,
+        escape.predicted,
+        bank_limited=limited,
+        theta_limited=limited,
+        climb_limited=climb_limited,
+        V_limited=flies and speed != state.target.V,
+        slew_limited=any(
+            values[channel] != value for channel, value in zip(params.outputs, u_m, strict=True)
+        ),
+    )
+    return state._replace(t_ns=inputs.t_ns, u_m=u_m), commands
+
+
+def _begin(
+    state: GuidanceState | None,
+    inputs: Inputs,
+    pose: Mapping[str, float],
+    params: GuidanceParams,
+) -> GuidanceState:
+    """The state before a step; where the filters begin, that of a hover where the aircraft
+    stops.
+    """
+    if state is not None and inputs.begin is Begin.NO:
+        return state
+    held = GuidanceState(
+        inputs.t_ns - params.period_ns,
+        Mode.ENGAGED,
+        Lateral.PLACE,
+        Vertical.ALTITUDE,
+        Target(V=params.speed)._replace(**hold(pose, inputs.y, params)),
+        0,
+        pose["phi"],
+        pose["theta"],
+        alpha=0.0,
+        alpha_trim=0.0,
+        slip=0.0,
+        climb_c=pose["climb"],
+        V_c=math.hypot(*_velocity(pose)),
+        u_m=(0.0,) * len(params.outputs),
+        psi=pose["psi"],
+        wind=_wind_in_hover(pose, _own(params)),
+        velocity=_velocity(pose),
+    )
+    if state is None or inputs.begin is Begin.HOLD:
+        return held
+    kept = {
+        name: getattr(state, name)
+        for name in ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "wind")
+    }
+    again = held._replace(**kept)
+    return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
+
+
+def _with_attitude(
+    state: GuidanceState,
+    inputs: Inputs,
+    pose: Mapping[str, float],
+    dt: float,
+    params: GuidanceParams,
+) -> GuidanceState:
+    """Mode, and attitude from pose or by dead reckoning. A pose that returns after a loss begins a
+    hover, or the way home.
+    """
+    age_ns = inputs.pose_age_ns
+    since = dt
+    if age_ns <= params.max_age_ns:
+        if state.mode is Mode.POSE_LOST:
+            state = _begin(None, inputs, pose, params)
+            if params.home.after_loss:
+                state = state._replace(target=state.target._replace(**home(pose, params)))
+        state = state._replace(
+            mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"], psi=pose["psi"]
+        )
+        since = min(seconds(age_ns), LONGEST_LEAD)
+    else:
+        lost = age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+    p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
+    phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
+    psi = state.psi + since * heading_rate(state.phi, state.theta, q, r)
+    return state._replace(
+        phi=math.remainder(state.phi + since * phi_dot, 2.0 * math.pi),
+        theta=state.theta + since * theta_dot,
+        psi=math.remainder(psi, 2.0 * math.pi),
+    )
+
+
+def _with_commands(
+    state: GuidanceState,
+    commands: Mapping[str, float],
+    pose: Mapping[str, float],
+    route: Route | None,
+    params: GuidanceParams,
+) -> tuple[GuidanceState, float]:
+    """The modes and commands in force, and the distance from the end of a leg that ends here and is
+    missed, m.
+    """
+    lateral = params.channels.lateral
+    missed = 0.0
+    moved = lateral.keys() & commands.keys()
+    if state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and route and not moved:
+        state, missed = _along_route(state, pose, route)
+    state = state._replace(target=state.target._replace(**commands))
+    if state.fence >= HOME and moved:
+        state = state._replace(fence=0.0)
+    for name in commands:
+        state = state._replace(
+            lateral=lateral.get(name, state.lateral),
+            vertical=params.channels.vertical.get(name, state.vertical),
+        )
+    if "leg" in commands and route is not None:
+        held = state.vertical
+        state = on_leg(state, int(commands["leg"]), route)._replace(joining=1.0)
+        joined = {"along": 0.0} | dict(commands)
+        state = state._replace(target=state.target._replace(**joined))
+        if params.channels.vertical.keys() & commands.keys():
+            state = state._replace(vertical=held)
+    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
+        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
+    return on_profile(state, pose, route), missed
+
+
+def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> bool:
+    away = math.dist(place, (pose["north"], pose["east"]))
+    return away <= NEAR * max(float(state.target.V), 1.0)
+
+
+def _stops(route: Route, number: int) -> bool:
+    """Whether an aircraft stops at the end of a leg: before the last place, and where a corner has
+    no fillet.
+    """
+    following = next(iter(route.legs[number + 1 :]), None)
+    leg = route.legs[number]
+    return bool(path.turns_back(leg, following)) or number + 2 == len(route.legs)
+
+
+def _along_route(
+    state: GuidanceState, pose: Mapping[str, float], route: Route
+) -> tuple[GuidanceState, float]:
+    """The state on the leg once its start is reached, or on the next leg once the leg is passed;
+    and the distance missed by, m.
+    """
+    position = (pose["north"], pose["east"])
+    leg = route.legs[state.leg]
+    if state.joining:
+        start, _ = route.start(state.leg, state.target.along)
+        is_last = path.is_orbit(leg)
+        joins = is_last or _is_near(state, pose, start)
+        return (on_leg(state, state.leg, route) if joins else state), 0.0
+    if leg.end is None:
+        return state, 0.0
+    ends = path.passed(leg, position)
+    if _stops(route, state.leg):
+        ends = ends or _is_near(state, pose, leg.end)
+    if not ends:
+        return state, 0.0
+    distance = math.dist(leg.end, position)
+    missed = distance if distance > route.near(state.leg) else 0.0
+    return on_leg(state, state.leg + 1, route), missed
+
+
+def _within_fence(
+    state: GuidanceState, pose: Mapping[str, float], params: GuidanceParams
+) -> tuple[GuidanceState, Escape]:
+    """The state with the action of the fence; home is the target from the begin of the action on.
+
+    The action begins where the way to a stop comes nearer to the fence than MARGIN of flight.
+    """
+    fence = params.fence
+    if fence is None or state.mode is not Mode.ENGAGED:
+        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+    here = (np.float64(pose["north"]), np.float64(pose["east"]))
+    margin = MARGIN * max(math.hypot(*_velocity(pose)), 1.0)
+    now = float(clearance(fence.zones, *here))
+    predicted = float(line_clearance(fence, *here, *_stop(pose, _own(params))))
+    action = _action(fence, here, now)
+    begins = state.fence == 0.0 and predicted < margin
+    if begins:
+        target = state.target._replace(**home(pose, params))
+        state = state._replace(
+            lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+        )
+    flown = action if begins or state.fence != 0.0 else 0.0
+    return state._replace(fence=flown), Escape(flown, begins, now, predicted, 0.0)
+
+
+def _action(fence: Fence, here: tuple[Any, Any], now: float) -> float:
+    """The action of a fence that acts: home in a straight line or around, or back inside."""
+    if now < 0.0:
+        return BACK
+    return HOME if bool(ways(fence).aim(fence, *here)[2]) else AROUND
+
+
+def _wanted(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    route: Route | None,
+    escape: Escape,
+    params: GuidanceParams,
+) -> Wanted:
+    """What the lateral mode asks for; the way around a fence in its place."""
+    own = _own(params)
+    target = state.target
+    place = (target.north, target.east)
+    if state.mode is not Mode.ENGAGED or state.lateral is Lateral.PHI:
+        return Wanted((0.0, 0.0), (0.0, 0.0))
+    if escape.action in {AROUND, BACK} and params.fence is not None:
+        here = (np.float64(pose["north"]), np.float64(pose["east"]))
+        north, east, _ = ways(params.fence).aim(params.fence, *here)
+        place = (float(north), float(east))
+    elif state.lateral is Lateral.COURSE:
+        velocity = _along(target.course, state.V_c)
+        return Wanted(velocity, velocity, error=PathError(0.0, target.course, 0.0))
+    elif state.lateral is Lateral.ROUTE and route is not None:
+        leg = route.legs[state.leg]
+        if not state.joining and not path.is_orbit(leg):
+            return _on_path(state, pose, route, own)
+        place = route.start(state.leg, target.along)[0]
+    return _to_place(place, state, pose, own)
+
+
+def _along(course: float, speed: float) -> Vector:
+    return speed * math.cos(course), speed * math.sin(course)
+
+
+def _approach(distance: float, speed: float, own: MulticopterParams) -> tuple[float, float]:
+    """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s: `climb_for`
+    with `k_p`, which falls by `braking`.
+    """
+    params = VerticalParams(own.k_p, 2.0 * own.braking, speed, speed, 0.0)
+    allowed = float(climb_for(distance, params))
+    slope = min(own.k_p, own.braking / max(allowed, 1e-6))
+    return allowed, 0.0 if allowed >= speed else slope
+
+
+def _to_place(
+    place: Point, state: GuidanceState, pose: Mapping[str, float], own: MulticopterParams
+) -> Wanted:
+    """Towards a place, with the deceleration of the way."""
+    north = place[0] - pose["north"]
+    east = place[1] - pose["east"]
+    distance = math.hypot(north, east)
+    course = math.atan2(east, north)
+    speed, slope = _approach(distance, state.V_c, own)
+    velocity = _along(course, speed)
+    closing = pose["v_north"] * math.cos(course) + pose["v_east"] * math.sin(course)
+    brake = _along(course, -slope * closing)
+    error = PathError(distance, course, 0.0)
+    return Wanted(velocity, velocity, brake, error, distance)
+
+
+def _on_path(
+    state: GuidanceState, pose: Mapping[str, float], route: Route, own: MulticopterParams
+) -> Wanted:
+    """Along a line or a fillet of the route."""
+    leg = route.legs[state.leg]
+    position = (pose["north"], pose["east"])
+    error = path.error(leg, position)
+    to_go = path.to_go(leg, position)
+    speed, slope = state.V_c, 0.0
+    if _stops(route, state.leg):
+        speed, slope = _approach(max(to_go, 0.0), state.V_c, own)
+    across = -clip(own.k_p * error.e, ACROSS * speed)
+    along = math.sqrt(speed**2 - across**2)
+    velocity = _turned((along, across), error.track)
+    later = (
+        position[0] + own.lead * pose["v_north"],
+        position[1] + own.lead * pose["v_east"],
+    )
+    entered = leg
+    if path.passed(leg, later) and not _stops(route, state.leg):
+        entered = route.legs[state.leg + 1]
+    there = path.error(entered, later)
+    bend = speed**2 * there.curvature
+    ahead = _turned((along, across), there.track)
+    acceleration = _turned((-slope * speed, bend), there.track)
+    return Wanted(velocity, ahead, acceleration, error, to_go)
+
+
+def _turned(vector: Vector, track: float) -> Vector:
+    """A vector along and to the right of a track, to the north and to the east."""
+    sine = math.sin(track)
+    cosine = math.cos(track)
+    return vector[0] * cosine - vector[1] * sine, vector[0] * sine + vector[1] * cosine
+
+
+def _wind_in_hover(pose: Mapping[str, float], own: MulticopterParams) -> Vector:
+    """The wind in which a tilt keeps the velocity of now, m/s: v - (g + d climb) tan(tilt) / d."""
+    *level, up = thrust_axis(tilt(pose["phi"]), tilt(pose["theta"]), pose["psi"])
+    lift = _lift(pose, own) / (own.drag * up)
+    north, east = (v - lift * a for v, a in zip(_velocity(pose), level, strict=True))
+    return north, east
+
+
+def _with_wind(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
+) -> GuidanceState:
+    """The state with the wind of a step later, m/s.
+
+        W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
+
+    A low-pass of the wind that explains the acceleration of the pose. The tilt is that of the
+    pose, so commands that are not flown move no wind. W is within what the largest tilt holds.
+    """
+    own = _own(params)
+    v = _velocity(pose)
+    if state.mode is not Mode.ENGAGED:
+        return state._replace(velocity=v)
+    *level, up = thrust_axis(tilt(state.phi), tilt(state.theta), state.psi)
+    gain = 1.0 / (own.drag * WIND_TIME)
+    limit = GRAVITY * math.tan(params.limits.bank) / own.drag
+    lift = _lift(pose, own) / up
+    north, east = (
+        clip(w + gain * (now - before + dt * (own.drag * (now - w) - lift * a)), limit)
+        for w, now, before, a in zip(state.wind, v, state.velocity, level, strict=True)
+    )
+    return state._replace(wind=(float(north), float(east)), velocity=v)
+
+
+def _lift(pose: Mapping[str, float], own: MulticopterParams) -> float:
+    """Vertical part of the thrust in steady flight, g + d climb, m/s^2, at least half of g."""
+    return max(GRAVITY + own.drag * pose["climb"], GRAVITY / 2.0)
+
+
+def _attitude_for(
+    state: GuidanceState, pose: Mapping[str, float], wanted: Wanted, params: GuidanceParams
+) -> tuple[float, float, bool]:
+    """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
+    own = _own(params)
+    largest = params.limits.bank
+    if state.mode is not Mode.ENGAGED:
+        return 0.0, 0.0, False
+    if state.lateral is Lateral.PHI:
+        angle = math.hypot(state.target.phi, state.target.theta)
+        share = min(1.0, largest / max(angle, 1e-6))
+        return share * state.target.phi, share * state.target.theta, share < 1.0
+    columns = (wanted.acceleration, wanted.velocity, wanted.ahead, _velocity(pose), state.wind)
+    north, east = (
+        a + own.k_v * (v_c - v) + own.drag * (v_ff - w)
+        for a, v_c, v_ff, v, w in zip(*columns, strict=True)
+    )
+    lift = _lift(pose, own)
+    most = lift * math.tan(largest)
+    share = min(1.0, most / max(math.hypot(north, east), 1e-6))
+    ahead, right = _turned((share * north, share * east), -state.psi)
+    return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), share < 1.0
+
+
+def _with_climb(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
+) -> tuple[GuidanceState, bool]:
+    """The state with the commanded climb rate, and whether the altitudes limit the rate."""
+    vertical_params = params.vertical
+    wanted = 0.0
+    permitted = 0.0
+    if state.mode is Mode.ENGAGED:
+        wanted = state.target.climb
+        if state.vertical is not Vertical.CLIMB:
+            profile = wanted if state.vertical is Vertical.PROFILE else 0.0
+            wanted = profile + climb_for(state.target.altitude - pose["altitude"], vertical_params)
+        least = climb_for(params.limits.lowest - pose["altitude"], vertical_params)
+        most = climb_for(params.limits.highest - pose["altitude"], vertical_params)
+        permitted = float(min(max(wanted, least), most))
+    climb_c = slewed(state.climb_c, permitted, vertical_params.acceleration, dt)
+    return state._replace(climb_c=float(climb_c)), bool(permitted != wanted)
+
+
+def _rates(
+    state: GuidanceState, phi_c: float, theta_c: float, own: MulticopterParams
+) -> dict[str, float]:
+    """Body rates that turn the thrust into its direction by the shortest way, and the heading about
+    the body axis, rad/s.
+
+        [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
+
+    with d, the direction [phi_c, theta_c] in body axes: the reduced quaternion error, without a
+    singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea, Tilt-prioritized
+    quadrocopter attitude control, IEEE Trans. Control Systems Technology 28 (2020).
+    """
+    if state.mode is Mode.POSE_LOST:
+        return dict.fromkeys("pqr", 0.0)
+    x = -math.cos(phi_c) * math.sin(theta_c)
+    z = -math.cos(phi_c) * math.cos(theta_c)
+    ahead = math.cos(state.theta) * x - math.sin(state.theta) * z
+    down = math.sin(state.theta) * x + math.cos(state.theta) * z
+    right = math.cos(state.phi) * math.sin(phi_c) + math.sin(state.phi) * down
+    down = math.cos(state.phi) * down - math.sin(state.phi) * math.sin(phi_c)
+    sine = math.hypot(ahead, right)
+    rate = min(own.k_tilt * math.atan2(sine, -down), own.tilt_rate) / max(sine, 1e-9)
+    turn = 0.0
+    if state.mode is Mode.ENGAGED:
+        turn = own.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
+    return {"p": rate * right, "q": -rate * ahead, "r": float(clip(turn, own.yaw_rate))}
