@@ -225,11 +225,10 @@ class Link:
     def problem(self, name: str = "") -> str:
         """What is wrong with the link, or with a message of it."""
         now = time.monotonic()
-        if now - max(self._alive, self._began) > SILENCE:
-            silence = (
-                f"no message of system {self._config.system} over {self._config.url} for "
-                f"{SILENCE:g} s"
-            )
+        silent = now - max(self._alive, self._began) > SILENCE
+        if silent or (self._refused and not self._alive):
+            silence = f"no message of system {self._config.system} over {self._config.url}"
+            silence += f" for {SILENCE:g} s" if silent else " is taken"
             systems = ", ".join(map(str, sorted(self._systems)))
             known = f"an autopilot is system {systems} there: set link.system" if systems else ""
             return sentences(silence, known, self._refused, self.conflict)
@@ -380,13 +379,13 @@ class Link:
                 "autopilot does not sign"
             )
         behind = 1e-5 * (signing.timestamp - int.from_bytes(packet[-12:-6], "little"))
+        before = "the last ones" if self._alive else "the clock of this computer"
         restart = (
-            "the autopilot has started again without the time, which a GPS or a ground "
-            "station gives"
+            "the autopilot has started without the time, which a GPS or a ground station gives"
         )
         return (
-            f"messages with the right passphrase come, signed {behind:.0f} s before the last "
-            f"ones: {restart}"
+            f"messages with the right passphrase come, signed {behind:.0f} s before {before}: "
+            f"{restart}"
         )
 
     def _take(self, message: Any, address: Address, received_ns: int) -> None:

@@ -6,7 +6,7 @@ a channel map.
 
 import os
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -458,11 +458,12 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):
             return
         stale = self._bridge.stale(now_ns)
-        causes: dict[str, None] = {}
+        causes = defaultdict[str, list[str]](list)
         for subscription, rows in self._readers:
             if any(name in stale for name, _ in rows):
-                causes[f"{subscription.name}: {self._cause(subscription)}"] = None
-        raise FlightEnded(f"no y after {limit:g} s: {'; '.join(causes)}")
+                causes[self._cause(subscription)].append(subscription.name)
+        sentences = (f"{', '.join(names)}: {cause}" for cause, names in causes.items())
+        raise FlightEnded(f"no y after {limit:g} s: {'; '.join(sentences)}")
 
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""

@@ -54,6 +54,7 @@ NO_CLOCK = "/clock: no message of a simulator"
 # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 DISCOVERY_TIME = 0.5
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
+BEFORE_END = 0.8  # of the duration: a short flight ends with the bridge's reason, too
 FIRST_U = 5.0  # s, from t = 0 to the first u that the aircraft takes
 LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
 POLL_PERIOD = 0.005  # s, while nodes start
@@ -300,7 +301,8 @@ class FlightProcesses:
             autopilot=self.autopilot,
         )
         if node is BRIDGE:
-            overrides = {**overrides, "first_y": FIRST_Y}
+            first_y = min(FIRST_Y, BEFORE_END * self.scenario.flight.duration)
+            overrides = {**overrides, "first_y": first_y}
         self.processes.append(
             NodeProcess(node, self.scenario.path, overrides, log, self._namespace)
         )
