@@ -220,6 +220,7 @@ def test_gains_of_a_file_make_the_observer_of_the_example(tmp_path: Path) -> Non
         return observed(*begin, uncertain=False, weights=path)[0].observer
 
     observer = designed(file)
+    assert shipped is not None
     assert pytest.approx(shipped.L, rel=1e-4, abs=1e-4) == observer.L
     assert pytest.approx(shipped.F, rel=1e-4, abs=1e-4) == observer.F
     edited = tmp_path / "weights.yaml"
