@@ -212,7 +212,7 @@ def test_gains_of_a_file_make_the_observer_of_the_example(tmp_path: Path) -> Non
     folder = REPOSITORY / "examples" / "px4_airplane"
     airframe = load_airframe(str(folder / "rates_airframe.yaml"))
     scenario = find_scenario(str(folder / "rates_observer.yaml"))
-    shipped = scenario.rise_di().observer
+    shipped: Any = scenario.rise_di().observer
     file = folder / "rates_weights.yaml"
     begin = scenario.rise_di(), scenario, airframe, 0.01, STABLE
 

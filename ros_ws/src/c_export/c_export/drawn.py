@@ -77,9 +77,8 @@ def drawn_calls(
         with suppress(ChannelError):
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
-                for distance in (0.3, 0.02, 0.0)[
-                    2 - int(3.0 * draw[5]) :
-                ]:  # closer than a slope of y_m takes, too
+                first = 2 - int(3.0 * draw[5])
+                for distance in (0.3, 0.02, 0.0)[first:]:  # closer than a slope of y_m takes, too
                     stamp_m_ns = now_ns - round(period_ns * (late + distance))
                     recorder.take_y_m(
                         StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
@@ -172,28 +171,25 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
     m = len(reference.outputs)
     bounds = reference.live_params().bounds
     size = np.where(np.isfinite(bounds), bounds, 1.0)
-    events: list[tuple[int, int, int, int, int, FloatArray, FloatArray]] = [
-        (START, 0, 0, 0, 0, np.zeros(m), np.zeros(m))
-    ]
+    none = np.zeros(m)
+    events: list[tuple[Any, ...]] = [(START, 0, 0, 0, 0, none, none)]
     refused = []
     reals = []
     silence = 0
     for k in range(steps):
-        silence = (
-            int(rng.exponential(2.0 * reference.live.max_age * reference.rate))
-            if rng.random() < 0.02
-            else silence - 1
-        )
+        silence -= 1
+        if rng.random() < 0.02:
+            silence = int(rng.exponential(2.0 * reference.live.max_age * reference.rate))
         refused.append(0)
         if silence <= 0:
             stamp_ns = max(k + round(rng.uniform(-1.5, 0.5)), 0) * model.period_ns
             u_m = rng.uniform(-1.1, 1.1) * size * rng.uniform(0.2, 1.0, m)
-            events.append((TAKE_U_M, 0, stamp_ns, 0, 0, u_m, np.zeros(m)))
+            events.append((TAKE_U_M, 0, stamp_ns, 0, 0, u_m, none))
             try:
                 model.take(stamp_ns, u_m)
             except ChannelError:
                 refused[-1] = 1
-        events.append((STEP_REFERENCE, 0, 0, 0, 0, np.zeros(m), np.zeros(m)))
+        events.append((STEP_REFERENCE, 0, 0, 0, 0, none, none))
         reals.append(np.concatenate([model.sample(k + 1), model.x_m]))
     names = ("refused", *numbered({"y_m": m, "x_m": len(model.x_m)}))
     integers = np.array(refused, dtype=np.int64)[:, None]

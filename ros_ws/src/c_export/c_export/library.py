@@ -227,6 +227,21 @@ def _variable(
     )
 
 
+DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName={name} guid="{guid}" generationTool="rise-di export" variableNamingConvention="structured">
+<CoSimulation modelIdentifier="rise_di" canHandleVariableCommunicationStepSize="true" canGetAndSetFMUstate="true" canSerializeFMUstate="true">
+<SourceFiles><File name="fmu.c"/></SourceFiles>
+</CoSimulation>
+{units}
+<DefaultExperiment startTime="0" stepSize="{step!r}"/>
+<ModelVariables>
+{variables}
+</ModelVariables>
+<ModelStructure><Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure>
+</fmiModelDescription>
+"""  # noqa: E501 - a text as it is written
+
+
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
     """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode;
     parameters TUNABLE; a step is a tick.
@@ -235,30 +250,14 @@ def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> 
     begin = 2 * len(controller.outputs) + 1
     outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
-    model_attributes = (
-        f"modelName={quoteattr(printable(f'RISE-DI {scenario}'))} "
-        f'guid="{controller.digest():012x}" '
-        'generationTool="rise-di export" variableNamingConvention="structured"'
+    return DESCRIPTION.format(
+        name=quoteattr(printable(f"RISE-DI {scenario}")),
+        guid=f"{controller.digest():012x}",
+        units="\n".join(_definitions(units)),
+        step=1.0 / controller.rate,
+        variables="\n".join([*variables, *_parameters(controller)]),
+        unknowns=unknowns,
     )
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<fmiModelDescription fmiVersion="2.0" {model_attributes}>',
-        (
-            '<CoSimulation modelIdentifier="rise_di" canHandleVariableCommunicationStepSize="true" '
-            'canGetAndSetFMUstate="true" canSerializeFMUstate="true">'
-        ),
-        '<SourceFiles><File name="fmu.c"/></SourceFiles>',
-        "</CoSimulation>",
-        *_definitions(units),
-        f'<DefaultExperiment startTime="0" stepSize="{1.0 / controller.rate!r}"/>',
-        "<ModelVariables>",
-        *variables,
-        *_parameters(controller),
-        "</ModelVariables>",
-        f"<ModelStructure><Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure>",
-        "</fmiModelDescription>",
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def build_fmu(
