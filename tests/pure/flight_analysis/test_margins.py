@@ -19,6 +19,7 @@ from flight_analysis.closed_loop.loop_margins import law_order, loop_of, margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray
+from rise_di_controller import linear_loop
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.margins import (
     Margins,
@@ -72,6 +73,24 @@ def test_integrator_has_its_closed_forms(k: float) -> None:
     assert found.disk[0] == approx(2.0 * (2.0 - kT) / (2.0 + kT))
     assert [found.sensitivity_all, found.disk_all] == approx([found.sensitivity[0], found.disk[0]])
     assert found.damping == 1.0  # its pole 1 - kT is real
+
+
+@pytest.mark.parametrize("near", [0.001, 0.05, 0.0625, 0.09])
+def test_delay_margin_is_found_from_another_one(near: float) -> None:
+    law = proportional(np.array([[20.0]]))
+    margin = delay_margin(INTEGRATOR, law, NO_LAG)
+    assert margin == approx(math.pi / 40.0 - 0.005, abs=1e-3)  # pi / 2k, half a period in the hold
+    assert delay_margin(INTEGRATOR, law, NO_LAG, near=near) == margin
+    above = delay_margin(INTEGRATOR, law, NO_LAG, above=near)
+    assert above == (margin if margin > near else 0.0)
+
+
+def test_law_is_linearised_at_all_values_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tuned = find_scenario("osprey_observer").controller.tuned_law()
+    at_once = linear_law(tuned, 4, 0.01)
+    monkeypatch.setattr(linear_loop, "_takes_columns", lambda _: False)
+    for matrix, column_by_column in zip(at_once, linear_law(tuned, 4, 0.01), strict=True):
+        assert_array_equal(matrix, column_by_column)
 
 
 def test_unstable_plant_has_a_gain_decrease() -> None:
