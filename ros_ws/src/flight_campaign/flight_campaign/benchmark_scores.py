@@ -89,18 +89,13 @@ def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
         next(iter(not_flown.values()), ""),
         "an entry that flies one set at least",
     )
-    sets = flights.sets
-    values: dict[str, Any] = {
-        "version": VERSION,
-        "digest": sets.digest(),
-        "release": sets.release,
-        "aircraft": aircraft,
-    }
+    values: dict[str, Any] = {key: getattr(entry, key) for key in ("sees", "knows", "source")}
     values |= {
+        "version": VERSION,
+        "digest": flights.sets.digest(),
+        "release": flights.sets.release,
+        "aircraft": aircraft,
         "entry": entry.name,
-        "sees": entry.sees,
-        "knows": entry.knows,
-        "source": entry.source,
         "stack": stack,
         "not_flown": not_flown,
     }
@@ -147,18 +142,10 @@ class Benchmark:
         """The scores of all sets, and their file."""
         definition = self.definition
         scored = {name: self._scores(number, name) for number, name in enumerate(SETS)}
-        benchmark = {
-            "version": definition.version,
-            "digest": definition.digest,
-            "release": definition.release,
-            "aircraft": definition.aircraft,
-        }
-        entry = {
-            "name": definition.entry,
-            "sees": definition.sees,
-            "knows": definition.knows,
-            "source": definition.source,
-        }
+        stated = definition.model_dump()
+        benchmark = {key: stated[key] for key in ("version", "digest", "release", "aircraft")}
+        entry = {"name": definition.entry}
+        entry |= {key: stated[key] for key in ("sees", "knows", "source")}
         scores = {"benchmark": benchmark, "entry": entry, "stack": definition.stack, "sets": scored}
         with writing("--output", self.folder, "a folder that can"):
             write_file(self.folder / SCORES, json.dumps(scores, indent=1, allow_nan=False) + "\n")
@@ -340,11 +327,7 @@ class _FunctionController(Controller):
 
 def _fly_alone(entry: BenchmarkEntry, prepared: _Prepared) -> Chunk:
     """Fly the aircraft of the scenario in one process."""
-    law = (
-        prepared.law
-        if isinstance(prepared.law, ControllerConfig)
-        else entered(entry, prepared.task)
-    )
+    law = entered(entry, prepared.task)
     if isinstance(law, ControllerConfig) or law is None:
         tape = simulate(prepared.scenario)
     else:

@@ -13,7 +13,6 @@ import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
-from flight_analysis.closed_loop.guarantee import Guarantee
 from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
@@ -58,6 +57,8 @@ WIND_EFFECTS: dict[WindEffect, str] = {
 }
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 ENTRIES_SHOWN = 6
+STATED = ("aircraft", "uncertainty", "entries", "distribution", "score_units", "wind", "seed")
+"""Keys of the definition in the summary."""
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 OF_LEARNER = {
@@ -100,37 +101,26 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
     tallies = [campaign.tally(case) for case in range(definition.cases)]
     margins = [campaign.margins(case) for case in range(definition.cases)]
     with writing("", campaign.folder, "a folder and a disk that can"):
-        cases = [
-            {
-                "factor": definition.factor(case),
-                **tally.summary(),
-                "fly_again": _write_worst(campaign, case, tally),
-            }
-            | {"margins": None if loop_margins is None else margins_as_json(loop_margins)}
-            | {"guarantee": _guarantee_as_json(campaign.guarantee(case))}
-            | {"influence": _influence(campaign, case, tally)}
-            for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True))
-        ]
-        figures = {
-            "scenario": definition.name,
-            "aircraft": definition.aircraft,
-            "uncertainty": definition.uncertainty,
-            "entries": definition.entries,
-            "distribution": definition.distribution,
-            "score_units": definition.score_units,
-            "wind": definition.wind,
-            "seed": definition.seed,
-            "sweep": None if definition.sweep is None else definition.sweep.parameter,
-            "cases": cases,
-        }
+        cases = []
+        for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True)):
+            promise = campaign.guarantee(case)
+            cases.append(
+                {
+                    "factor": definition.factor(case),
+                    **tally.summary(),
+                    "fly_again": _write_worst(campaign, case, tally),
+                    "margins": None if loop_margins is None else margins_as_json(loop_margins),
+                    "guarantee": None if promise is None else guarantee_as_json(promise),
+                    "influence": _influence(campaign, case, tally),
+                }
+            )
+        stated = {key: getattr(definition, key) for key in STATED}
+        sweep = None if definition.sweep is None else definition.sweep.parameter
+        figures = {"scenario": definition.name} | stated | {"sweep": sweep, "cases": cases}
         figures = finite_or_null(figures)
         write_file(campaign.folder / SUMMARY, json.dumps(figures, indent=1))
         write_page(campaign.folder / REPORT, definition, tallies, cases, margins)
     return figures, overview(definition, tallies, margins)
-
-
-def _guarantee_as_json(promise: Guarantee | None) -> dict[str, Any] | None:
-    return None if promise is None else guarantee_as_json(promise)
 
 
 def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
