@@ -59,7 +59,8 @@ from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_u
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from flight_design.learning import learner, scenario_learner
+from flight_design.identification.model_identification import identify
+from flight_design.learning import scenario_learner
 from rise_di import CampaignResult
 from rise_di_controller import divergence
 from rise_di_controller.margins import loop_margins
@@ -373,21 +374,20 @@ def test_flight_that_falls_back_is_that_of_the_single_process(
 def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found: list[Any] = []
-    identify = learner.identify
+    identified: list[Any] = []
 
     def kept(*arguments: Any, **options: Any) -> Any:
-        found.append(identify(*arguments, **options))
-        return found[-1]
+        identified.append(identify(*arguments, **options))
+        return identified[-1]
 
-    monkeypatch.setattr(learner, "identify", kept)
+    monkeypatch.setattr("flight_design.learning.learner.identify", kept)
     scenario = learning(11.5, updates=[10.0])
     campaign = flown_rows(tmp_path / "real", scenario, scenario_learner.quick_learner, 1)
     row = campaign.rows().collect().row(0, named=True)
     assert (row["first_model"], row["models"]) == (10.5, 1)
     alone = flown_alone(campaign, 0, scenario_learner.learner)
     # the searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations
-    for near, thorough in zip(*(each.entries for each in found), strict=True):
+    for near, thorough in zip(*(each.entries for each in identified), strict=True):
         assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
     # the searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %
     assert {name: row[name] for name in alone} == approx(alone, rel=1e-2)

@@ -224,12 +224,10 @@ def identify(
     def step() -> None:
         progress(completed=next(step_count), total=total)
 
-    fits = []
-    parts = []
-    for search in (study.search(model, block) for block in every):
-        fit, part = study.fit(search, used, step, flown, quick=quick)
-        fits.append((search, fit))
-        parts.append(part)
+    searches = [study.search(model, block) for block in every]
+    fitted = [study.fit(search, used, step, flown, quick=quick) for search in searches]
+    fits = [(search, fit) for search, (fit, _) in zip(searches, fitted, strict=True)]
+    parts = [part for _, part in fitted]
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
     follows = [
