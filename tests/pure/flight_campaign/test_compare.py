@@ -210,19 +210,8 @@ def test_the_command_writes_what_it_shows(
     gains_file: Path, brief_file: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "compared.json"
-    arguments = [
-        "--laws",
-        "rise,l1",
-        "--aircraft",
-        "2",
-        "--uncertainty",
-        "0.3",
-        "--tuning",
-        "gust",
-        "--set",
-        f"gains={gains_file}",
-    ]
-    arguments += ["--set", "wind=published"]
+    options = "--laws rise,l1 --aircraft 2 --uncertainty 0.3 --tuning gust --set wind=published"
+    arguments = [*options.split(), "--set", f"gains={gains_file}"]
     result = CliRunner().invoke(app, ["compare", str(brief_file), *arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text())
@@ -286,17 +275,8 @@ def test_interrupted_tuning_resumes_with_missing_laws(
         return initial(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
-    arguments = [
-        "compare",
-        str(brief_file),
-        "--laws",
-        "rise,pi,l1",
-        "--aircraft",
-        "1",
-        "--tune",
-        "--set",
-        f"gains={path}",
-    ]
+    options = "--laws rise,pi,l1 --aircraft 1 --tune --set"
+    arguments = ["compare", str(brief_file), *options.split(), f"gains={path}"]
     CliRunner().invoke(app, arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
     result = CliRunner().invoke(app, arguments)
