@@ -20,6 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_log.tape_writer import write_run
@@ -45,11 +46,12 @@ def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[Param
     return pytest.raises(ParameterError, match=sentence)
 
 
-def invoke(command: str, *words: str, **options: Any) -> Result:
+def invoke(*words: object, **options: Any) -> Result:
     """Run a command of rise-di in this process."""
     from flight_cli.cli import application  # noqa: PLC0415 - the tests of nodes need no command
 
-    return CliRunner().invoke(application([command]), [command, *words], **options)
+    texts = [str(word) for word in words]
+    return CliRunner().invoke(application(texts[:1]), texts, **options)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -91,6 +93,14 @@ def osprey_gust() -> Scenario:
 def tape(osprey_gust: Scenario) -> Tape:
     """Two seconds of the default scenario in one process."""
     return simulate(osprey_gust.vary(flight={"duration": 2.0}))
+
+
+@pytest.fixture(scope="session")
+def flight(osprey_gust: Scenario) -> RecordedFlight:
+    """Three seconds of the default scenario, as a report reads them."""
+    scenario = osprey_gust.vary(flight={"duration": 3.0})
+    tape = simulate(scenario)
+    return RecordedFlight("run", scenario, tape, summarise(tape, scenario))
 
 
 @pytest.fixture(scope="session")

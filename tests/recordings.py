@@ -14,7 +14,7 @@ from mcap.summary import Summary
 from numpy.typing import ArrayLike
 from rosbags.highlevel import AnyReader
 
-from flight_core.tape import Signal
+from flight_core.tape import Signal, Tape
 
 MS = 1_000_000  # ns
 # ns, a stamp of today, which float64 cannot hold to the ns; in seconds it resolves 0.2 us
@@ -77,3 +77,11 @@ def messages(run: Path) -> list[tuple[str, int, bytes]]:
 def count_messages(run: Path) -> Counter[str]:
     """The number of messages in a log, by topic."""
     return Counter(topic for topic, _, _ in messages(run))
+
+
+def require_equal_bits(recorded: Tape, flown: Tape) -> None:
+    """Require that a log has every signal of a flight, to the last bit."""
+    for name, signal in flown.signals.items():
+        assert signal.names == recorded[name].names
+        assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
+        assert signal.values.tobytes() == recorded[name].values.tobytes(), name

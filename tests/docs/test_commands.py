@@ -19,8 +19,7 @@ from unittest.mock import patch
 import pytest
 import typer
 from tests import launch_stand_in
-from tests.conftest import REPOSITORY
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke
 
 from flight_cli.cli import COMMANDS, application
 
@@ -166,6 +165,6 @@ def test_quick_commands_of_pages_run_as_they_stand(
     quick = sorted(words for words in found if words[0] in QUICK)
     assert {words[0] for words in quick} == QUICK
     for words in quick:
-        done = CliRunner().invoke(application([words[0]]), words)
+        done = invoke(*words)
         differs = words[0] == "replay" and "--set" in words  # status 1: other gains give another u
         assert done.exit_code == int(differs), f"{' '.join(words)}\n{done.output}"

@@ -15,14 +15,12 @@ import scipy.signal
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
-from tests.conftest import REPOSITORY, refusing
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke, refusing
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.airframe_import import import_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di.own_airframe import new_airframe
@@ -402,7 +400,7 @@ def test_command_writes_airframe_and_scenario(
         "--set",
         "thrust",
     ]
-    result = CliRunner().invoke(application(["airframes"]), arguments, catch_exceptions=False)
+    result = invoke(*arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert "elevator (rad, positive: nose down)" in result.stdout
     read: Airframe = load_airframe("navion.yaml")

@@ -8,11 +8,9 @@ from typing import Any
 
 import pytest
 import yaml
-from tests.conftest import REPOSITORY
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke
 
 from autopilot_bridge.params import LIBRARY
-from flight_cli.cli import application
 
 DOCKER = REPOSITORY / "docker"
 AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load((DOCKER / "autopilot.yaml").read_text())[
@@ -113,5 +111,5 @@ def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> No
     assert words[0] == "rise-di"
     assert "--send" not in words
     assert (LIBRARY / f"{words[words.index('--bridge') + 1]}.yaml").is_file()
-    done = CliRunner().invoke(application(["fly"]), words[1:])
+    done = invoke(*words[1:])
     assert str(done.exception).startswith("scenario"), done.output  # no option is unknown

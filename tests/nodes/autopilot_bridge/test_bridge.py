@@ -26,11 +26,10 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool, Trigger
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, invoke
 from tests.maps import MAP_FILES, named_map
 from tests.nodes.world import INPUTS, OUTPUTS, World, parameters, world_of
 from tests.ros.autopilot import Autopilot
-from typer.testing import CliRunner
 
 from autopilot_bridge.channel_map import (
     message_type,
@@ -46,7 +45,6 @@ from autopilot_bridge.node import (
     BridgeNode,
 )
 from autopilot_bridge.params import LIBRARY
-from flight_cli.cli import COMMANDS, application
 from flight_core.channels import UNKNOWN
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.modes import Mode
@@ -55,8 +53,6 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from reference_model.node import ReferenceModelNode
 from rise_di_controller.node import ControllerNode
-
-app = application([*COMMANDS])
 
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 RELEASE_AFTER = 3.0  # s, RC_OVERRIDE_TIME of ArduPilot
@@ -673,9 +669,7 @@ def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Pat
         "sign": sign * content["inputs"]["elevator"].get("sign", 1)
     }
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
-    check = CliRunner().invoke(
-        app, ["check", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)]
-    )
+    check = invoke("check", tmp_path / "map.yaml", "--scenario", SCENARIO)
     assert (check.exit_code == 0) is (sign > 0), check.output
     words = (
         "fly",
@@ -687,7 +681,7 @@ def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Pat
         f"runs={tmp_path / 'runs'}",
     )
     if sign < 0:
-        refused = CliRunner().invoke(app, words)
+        refused = invoke(*words)
         assert "D of q and elevator is -1, the controller has +1" in str(refused.exception)
 
 

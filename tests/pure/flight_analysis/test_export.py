@@ -7,23 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-import pytest
 from matplotlib.image import imread
 from tests.recordings import EPOCH
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.data_frame import data_frame
 from flight_analysis.report.export import write_csv, write_parquet, write_png
-from flight_analysis.report.summary import RecordedFlight, summarise
+from flight_analysis.report.summary import RecordedFlight
 from flight_core.tape import Signal, Tape
-
-
-@pytest.fixture(scope="module")
-def flight(osprey_gust: Scenario) -> RecordedFlight:
-    scenario = osprey_gust.vary(flight={"duration": 3.0})
-    tape = simulate(scenario)
-    return RecordedFlight("run", scenario, tape, summarise(tape, scenario))
 
 
 def test_table_has_row_per_instant_and_null_without_sample() -> None:

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pytest import approx
-from tests.conftest import refusing
-from typer.testing import CliRunner
+from tests.conftest import invoke, refusing
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.guarantee import guarantee
@@ -21,7 +20,6 @@ from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import guarantee_text
-from flight_cli.cli import application
 from flight_core.vectors import FloatArray
 from rise_di_controller import structured_value
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
@@ -281,7 +279,7 @@ def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_pat
     folder = tmp_path / "first"
     arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75", "--json"]
     arguments += ["--set", f"worst={folder}", "--set", "samples=1"]
-    result = CliRunner().invoke(application(["gains"]), arguments)
+    result = invoke(*arguments)
     assert result.exit_code == 1, result.output
     promise = json.loads(result.stdout)["guarantee"]
     assert not promise["holds"]
@@ -304,7 +302,7 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     inputs, and an aircraft of it is unstable earlier.
     """
     words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
-    done = CliRunner().invoke(application(["gains"]), [*words, "--set", "samples=2"])
+    done = invoke(*words, "--set", "samples=2")
     assert done.exit_code == 1
     promise = guarantee(boxed("x8_elevons"))
     assert json.loads(done.output)["guarantee"]["stable"] == approx(promise.stable)

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.joint_states import parameter_event
 from tests.recordings import EPOCH, MS, scenario_file, truncate
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay
@@ -29,7 +29,6 @@ from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import COMMANDS, application
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
@@ -45,7 +44,6 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
 
-app = application([*COMMANDS])
 GUST = find_scenario("osprey_gust", 4.0).vary(
     aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
 )
@@ -440,7 +438,7 @@ def run(tape: Tape, tmp_path: Path) -> Path:
 
 
 def command(*arguments: str) -> Result:
-    return CliRunner().invoke(app, ["replay", *arguments])
+    return invoke("replay", *arguments)
 
 
 def test_the_command_counts_the_ticks(run: Path) -> None:

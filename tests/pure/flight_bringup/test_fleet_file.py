@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
-from typer.testing import CliRunner
+from tests.conftest import invoke
 
 from flight_bringup.fleet import Fleet, Flown, read_fleet
 from flight_cli import fleet
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 
 FLEET = """
@@ -87,7 +86,7 @@ def test_interrupt_before_flight_leaves_no_folder(
     without_ros.setattr("flight_cli.watch.watched", interrupted)
     file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fly"] else []
     arguments = [*words, *file, "--watch", "--set", f"runs={tmp_path / 'runs'}"]
-    assert CliRunner().invoke(application([words[0]]), arguments).exit_code == 130
+    assert invoke(*arguments).exit_code == 130
     assert list((tmp_path / "runs").iterdir()) == []
 
 
@@ -111,7 +110,7 @@ def test_interrupt_of_reports_shows_what_was_flown(
         f"runs={tmp_path / 'runs'}",
         "--json",
     ]
-    result = CliRunner().invoke(application(["fly"]), arguments)
+    result = invoke(*arguments)
     assert result.exit_code == 130
     outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}
     assert outcomes["one"] == "never flew: no sample"

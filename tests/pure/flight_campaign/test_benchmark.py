@@ -15,8 +15,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from tests.conftest import REPOSITORY, refusing
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke, refusing
 
 from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -25,7 +24,6 @@ from flight_campaign.benchmark_course import build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Enter, Task, find_entry, task_of
 from flight_campaign.benchmark_scores import CHUNKS, SCORES, Benchmark, Definition, Flights, define
 from flight_campaign.benchmark_sets import SCENARIOS, SETS, UNCERTAINTY, VERSION, Sets, seed_of
-from flight_cli.cli import application
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.laws import AnyLaw
@@ -184,9 +182,7 @@ def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Set
 )
 def test_command_refuses_with_a_sentence(words: list[str], sentence: str) -> None:
     with refusing(sentence):
-        CliRunner().invoke(
-            application(["benchmark"]), ["benchmark", *words], catch_exceptions=False
-        )
+        invoke("benchmark", *words, catch_exceptions=False)
 
 
 def test_function_flies_an_aircraft_of_jsbsim_as_its_law() -> None:

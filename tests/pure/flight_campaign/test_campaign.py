@@ -30,8 +30,7 @@ from hypothesis.extra.numpy import arrays
 from pytest import approx
 from scipy.stats import spearmanr
 from tests.closed_loop import error
-from tests.conftest import refusing
-from typer.testing import CliRunner
+from tests.conftest import invoke, refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
@@ -56,7 +55,6 @@ from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.identification.model_identification import identify
@@ -573,7 +571,7 @@ def made_up(score: FloatArray) -> bytes:
 
 def refusal(*words: str) -> str:
     """The sentence with which the command ends."""
-    result = CliRunner().invoke(application(["campaign"]), ["campaign", *words])
+    result = invoke("campaign", *words)
     assert isinstance(result.exception, ParameterError), result.exception
     return str(result.exception)
 
@@ -589,7 +587,7 @@ def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, conte
 
 def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campaign) -> None:
     words = ["campaign", str(flown.folder)]
-    shown = CliRunner().invoke(application(["campaign"]), words).stdout
+    shown = invoke(*words).stdout
     assert "B[p,aileron]" in shown
     ranked = json.loads((flown.folder / SUMMARY).read_text())["cases"][0]["influence"]
     published = find_scenario("osprey_servo").aircraft.load()[0].matrix_b()[5, 2]
@@ -614,7 +612,7 @@ def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campa
 def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
     words = ["campaign", str(flown.folder), "--rows", str(path), "--json"]
-    assert CliRunner().invoke(application(["campaign"]), words).exit_code == 0
+    assert invoke(*words).exit_code == 0
     assert pl.read_parquet(path).equals(
         CampaignResult(flown.folder, flown.folder / REPORT, {}).rows()
     )

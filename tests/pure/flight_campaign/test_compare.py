@@ -15,9 +15,8 @@ import yaml
 from numpy.testing import assert_allclose
 from pytest import approx
 from tests.closed_loop import error
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.other_laws import SECTIONS
-from typer.testing import CliRunner
 
 from aircraft_sim.turbulence import MODERATE
 from control_laws.catalogue import LAWS, Gains, initial_gains
@@ -29,7 +28,6 @@ from flight_analysis.metrics import error_metrics
 from flight_campaign import batch, law_comparison, registered_laws, tuned_controller, tuning
 from flight_campaign.law_margins import nominal_margins
 from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
-from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_design.gains import tuned_gains
 from flight_design.gains.gain_yaml import section_yaml
@@ -41,7 +39,6 @@ from rise_di_controller.margins import Margins
 
 pytestmark = pytest.mark.slow
 
-app = application([*COMMANDS])
 SHIPPED = sorted(path.stem for path in tuned_gains.TUNED.glob("*.yaml"))
 
 
@@ -180,7 +177,7 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
     ],
 )
 def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
-    result = CliRunner().invoke(app, ["compare", "osprey_servo", *arguments])
+    result = invoke("compare", "osprey_servo", *arguments)
     assert isinstance(result.exception, ParameterError)
     assert words in str(result.exception)
 
@@ -212,7 +209,7 @@ def test_the_command_writes_what_it_shows(
     path = tmp_path / "compared.json"
     options = "--laws rise,l1 --aircraft 2 --uncertainty 0.3 --tuning gust --set wind=published"
     arguments = [*options.split(), "--set", f"gains={gains_file}"]
-    result = CliRunner().invoke(app, ["compare", str(brief_file), *arguments, "--json", str(path)])
+    result = invoke("compare", brief_file, *arguments, "--json", path)
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text())
     assert found["wind"] == "published"
@@ -277,9 +274,9 @@ def test_interrupted_tuning_resumes_with_missing_laws(
     monkeypatch.setattr(tuning, "tune", tune)
     options = "--laws rise,pi,l1 --aircraft 1 --tune --set"
     arguments = ["compare", str(brief_file), *options.split(), f"gains={path}"]
-    CliRunner().invoke(app, arguments)
+    invoke(*arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
-    result = CliRunner().invoke(app, arguments)
+    result = invoke(*arguments)
     assert result.exit_code == 0, result.output
     assert list(tuned_gains.load(path)) == ["rise", "pi", "l1"]
     assert tuned == ["rise", "pi", "pi", "l1"]

@@ -9,8 +9,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tests.conftest import REPOSITORY
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke
 
 from flight_cli.cli import application
 
@@ -33,22 +32,22 @@ def test_flight_inside_px4_replays_to_the_bit(
     scenario = str(log.parent / "rates.yaml")
     run = str(tmp_path / "run")
     options = ["import", str(log), "--scenario", scenario, "--output", run]
-    imported = CliRunner().invoke(app, options)
+    imported = invoke(*options)
     assert imported.exit_code == 0, imported.output
     assert "239 of 239 ticks have the u of Python to the bit" in imported.output
-    replayed = CliRunner().invoke(app, ["replay", run, "--json"])
+    replayed = invoke("replay", run, "--json")
     assert replayed.exit_code == 0, replayed.output
     answer = json.loads(replayed.stdout)
     assert answer["differing"] == 0
     other = str(tmp_path / "other.yaml")
     text = Path(scenario).read_text("utf-8").replace("k_g: 22.0", "k_g: 22.5")
     Path(other).write_text(text, "utf-8")
-    refused = CliRunner().invoke(app, ["import", str(log), "--scenario", other])
+    refused = invoke("import", log, "--scenario", other)
     assert refused.exit_code != 0
 
 
 @pytest.mark.parametrize("options", [[], ["--map", "px4", "--scenario", "osprey_servo"]])
 def test_import_takes_a_map_or_a_scenario(log: Path, options: list[str]) -> None:
-    result = CliRunner().invoke(app, ["import", str(log), *options])
+    result = invoke("import", log, *options)
     assert result.exit_code == 2
     assert "--map MAP or --scenario SCENARIO" in result.output

@@ -18,13 +18,12 @@ import yaml
 from numpy.testing import assert_array_equal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pytest import approx
-from tests.conftest import REPOSITORY, refusing
+from tests.conftest import REPOSITORY, invoke, refusing
 from tests.maps import named_map
 from tests.vehicle_logs import Changes, write_dataflash, write_tlog, write_ulog
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from autopilot_bridge.params import ChannelMap
-from flight_cli.cli import COMMANDS, application
 from flight_cli.log_options import warn_of_lacks_in
 from flight_core import isolated
 from flight_core.vectors import FloatArray
@@ -37,7 +36,6 @@ from flight_view.flight import Flight as View
 
 pytestmark = pytest.mark.slow
 
-app = application([*COMMANDS])
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
 OMEGA = np.array([40.0, 8.0, 80.0, 30.0])  # SI, by channel
 DAMPING = np.array([6.0, 0.3, 8.0, 3.0])  # 1/s
@@ -279,9 +277,7 @@ def ulog_of_2020(path: Path, flight: Flight) -> Path:
 
 def imported(log: Path, bag: Path, *options: str, map_name: str = "ardupilot") -> Result:
     """`rise-di import`."""
-    return CliRunner().invoke(
-        app, ["import", str(log), "--map", map_name, "--output", str(bag), *options]
-    )
+    return invoke("import", log, "--map", map_name, "--output", bag, *options)
 
 
 WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
@@ -461,7 +457,7 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
             ["check", str(path), "--run", str(bag)],
             ["identify", "--bridge", str(path), *identify],
         ):
-            refused = str(CliRunner().invoke(app, arguments).exception)
+            refused = str(invoke(*arguments).exception)
             assert f"found inputs.elevator.{key} " in refused
             assert refused.endswith(
                 f"expected {value}, that of the map ardupilot: import the log again, with --map"
@@ -474,7 +470,7 @@ def test_gains_from_imported_log_state_for_which_link_they_are(
     bag = tmp_path / "bag"
     assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
     identify = ["identify", str(bag), "--bridge", "ardupilot", "--speed", "25", "--set", "accept"]
-    result = CliRunner().invoke(app, [*identify, "--write", str(tmp_path / "found")])
+    result = invoke(*identify, "--write", tmp_path / "found")
     assert "for 50 ms of further delay over the link (link_delay)" in result.output
     assert result.exit_code == 0
 
@@ -562,9 +558,7 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(
 ) -> None:
     bag = tmp_path / "bag"
     assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
-    result = CliRunner().invoke(
-        app, ["report", str(bag), "--png", str(tmp_path / "flight.png"), "--json"]
-    )
+    result = invoke("report", bag, "--png", tmp_path / "flight.png", "--json")
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output)
     assert (summary["outcome"], summary["scenario"], summary["errors"]) == ("imported", None, {})
@@ -597,7 +591,7 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(
             ),
         ),
     ):
-        assert sentence in str(CliRunner().invoke(app, command).exception)
+        assert sentence in str(invoke(*command).exception)
 
 
 def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ import yaml
 from numpy.testing import assert_allclose
 from pytest import approx
 from scipy.signal import cont2discrete, dlsim
-from tests.conftest import REPOSITORY, refusing
+from tests.conftest import REPOSITORY, invoke, refusing
 from tests.maps import MAP_FILES
-from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
@@ -26,7 +25,6 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
-from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
@@ -326,7 +324,7 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
         ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),
     ):
         arguments = ["identify", "--bridge", name, "--speed", "25", "--write", str(folder)]
-        result = CliRunner().invoke(application([*COMMANDS]), arguments)
+        result = invoke(*arguments)
         assert isinstance(result.exception, ParameterError)
         assert str(result.exception).startswith(sentence)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tests.conftest import REPOSITORY, refusing
+from tests.conftest import REPOSITORY, invoke, refusing
 from tests.maps import MAP_FILES, named_map
-from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
-from flight_cli.cli import COMMANDS, application
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -30,7 +28,6 @@ from rise_di_controller.laws import AnyLaw
 
 pytestmark = pytest.mark.slow
 
-app = application([*COMMANDS])
 MAPS = sorted(MAP_FILES)
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 AIRFRAME = load_airframe("osprey")
@@ -51,7 +48,7 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 
 @pytest.mark.parametrize("name", MAPS)
 def test_shipped_maps_fit_controller_of_osprey(name: str) -> None:
-    result = CliRunner().invoke(app, ["check", str(MAP_FILES[name]), "--json"])
+    result = invoke("check", MAP_FILES[name], "--json")
     assert result.exit_code == 0
     channels = [
         (channel["output"], channel["input"], channel["D"])
@@ -108,7 +105,7 @@ def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
     # lists in place of tuples, for YAML
     content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))
     path.write_text(yaml.safe_dump(content, sort_keys=False))
-    result = CliRunner().invoke(app, ["check", str(path)])
+    result = invoke("check", path)
     assert result.exit_code == 1
     sentence = (
         "error: with the map ardupilot D of q and elevator is -1, the controller has +1: "

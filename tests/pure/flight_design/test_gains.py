@@ -18,13 +18,12 @@ import yaml
 from numpy.testing import assert_allclose
 from pytest import approx
 from tests.closed_loop import law_params
-from tests.conftest import refusing
-from typer.testing import CliRunner, Result
+from tests.conftest import invoke, refusing
+from typer.testing import Result
 
 from aircraft_sim.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions, ideal_control
@@ -399,7 +398,7 @@ def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    return CliRunner(env={"COLUMNS": "80"}).invoke(application(arguments[:1]), arguments)
+    return invoke(*arguments, env={"COLUMNS": "80"})
 
 
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:

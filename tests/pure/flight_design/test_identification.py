@@ -15,12 +15,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pytest import approx
-from typer.testing import CliRunner, Result
+from tests.conftest import invoke
+from typer.testing import Result
 
 from aircraft_sim.jsbsim_aircraft import FlightCondition
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import application
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
@@ -258,7 +258,7 @@ def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
 
 def rise_di(*arguments: str) -> Result:
     """`rise-di identify` in this process."""
-    return CliRunner().invoke(application(["identify"]), ["identify", *arguments])
+    return invoke("identify", *arguments)
 
 
 @pytest.mark.parametrize(

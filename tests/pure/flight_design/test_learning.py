@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from pytest import approx
 from scipy import stats
-from tests.conftest import refusing
-from typer.testing import CliRunner
+from tests.conftest import invoke, refusing
 
 import rise_di
 from aircraft_sim.airframe import Airframe, load_airframe
@@ -28,7 +27,6 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_in_process
-from flight_cli.cli import application
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -184,9 +182,7 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
     flown: Flown, tmp_path: Path
 ) -> None:
     model = tmp_path / "model.yaml"
-    result = CliRunner().invoke(
-        application(["learn"]), ["learn", str(flown.run), "--write", str(model)]
-    )
+    result = invoke("learn", flown.run, "--write", model)
     assert result.exit_code == 0, result.output
     assert flown.lines[-1].partition(" flies ")[2] in " ".join(result.output.split())
     B, of_file = load_airframe(model).matrix_b(), load_airframe("osprey").matrix_b()
@@ -204,9 +200,7 @@ def test_log_teaches_with_other_settings(flown: Flown) -> None:
     """The flight has other parameters than what this learner proposes: it knows no refusal, and
     identifies once a window.
     """
-    result = CliRunner().invoke(
-        application(["learn"]), ["learn", str(flown.run), "--set", "controller.learn.updates=[10]"]
-    )
+    result = invoke("learn", flown.run, "--set", "controller.learn.updates=[10]")
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
     assert first.startswith("t = 10.00 s: B["), result.output
     assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output

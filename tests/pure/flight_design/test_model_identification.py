@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
-from tests.conftest import refusing
-from typer.testing import CliRunner
+from tests.conftest import invoke, refusing
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
@@ -27,7 +26,6 @@ from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import application
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
@@ -383,7 +381,7 @@ def run_folder(folder: Path) -> Path:
 
 
 def command(*arguments: Any) -> Any:
-    return CliRunner().invoke(application(["identify"]), ["identify", *map(str, arguments)])
+    return invoke("identify", *arguments)
 
 
 def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None:

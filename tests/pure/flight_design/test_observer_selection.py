@@ -14,15 +14,13 @@ import pytest
 import yaml
 from tests.builders import rms
 from tests.closed_loop import PROTOTYPE_SERVO
-from tests.conftest import REPOSITORY, refusing
-from typer.testing import CliRunner
+from tests.conftest import REPOSITORY, invoke, refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_search
@@ -80,9 +78,7 @@ def Omega() -> FloatArray:  # noqa: N802 - the paper's name
 
 def test_shipped_scenarios_have_observer_that_command_writes(tmp_path: Path) -> None:
     written = tmp_path / "gains.yaml"
-    result = CliRunner().invoke(
-        application(["gains"]), ["gains", "osprey", "--observer", "--write", str(written)]
-    )
+    result = invoke("gains", "osprey", "--observer", "--write", written)
     assert result.exit_code == 0, result.output
     assert "gains of a search in osprey_servo" in result.output
     section = yaml.safe_load(written.read_text())["/**/controller"]["ros__parameters"]
@@ -183,9 +179,7 @@ def test_command_refuses_options_that_contradict_each_other(
     arguments: list[str], sentence: str
 ) -> None:
     with pytest.raises(ParameterError) as refused:
-        CliRunner().invoke(
-            application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False
-        )
+        invoke("gains", "osprey", *arguments, catch_exceptions=False)
     assert f"error: {refused.value}".startswith(sentence)
 
 

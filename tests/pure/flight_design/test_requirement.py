@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 import yaml
 from pytest import approx
-from tests.conftest import refusing
-from typer.testing import CliRunner, Result
+from tests.conftest import invoke, refusing
+from typer.testing import Result
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, linear_loop, margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
-from flight_cli.cli import application
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains import requirement as requirement_module
@@ -286,7 +285,7 @@ def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    return CliRunner(env={"COLUMNS": "150"}).invoke(application(arguments[:1]), arguments)
+    return invoke(*arguments, env={"COLUMNS": "150"})
 
 
 def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:

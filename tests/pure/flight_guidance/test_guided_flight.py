@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from pytest import approx
 from rosbags.rosbag2 import StoragePlugin, Writer
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.joint_states import path
-from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
@@ -22,7 +21,6 @@ from flight_analysis.closed_loop.scenario_library import find_scenario, with_rou
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided_figures import flown_routes
 from flight_bringup.graph import GUIDANCE, second_stage
-from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
@@ -498,7 +496,7 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     ],
 )
 def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: str) -> None:
-    result = CliRunner().invoke(application([*COMMANDS]), words)
+    result = invoke(*words)
     assert isinstance(result.exception, ParameterError)
     assert sentence in str(result.exception)
 

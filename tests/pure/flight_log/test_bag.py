@@ -25,7 +25,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_types_from_msg
 from tests.conftest import refusing
 from tests.joint_states import JOINT_STATE, STORE, vector
-from tests.recordings import summary_of, truncate
+from tests.recordings import require_equal_bits, summary_of, truncate
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import NANOSECONDS
@@ -46,10 +46,7 @@ def test_written_tape_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
     back = read_run(recorded).tape
     assert set(back.signals) == set(tape.signals)
     assert back.notes == ()
-    for name, signal in tape.signals.items():
-        assert back[name].names == signal.names
-        assert (back[name].stamp_ns == signal.stamp_ns).all()
-        assert back[name].values.tobytes() == signal.values.tobytes()
+    require_equal_bits(back, tape)
 
 
 def test_log_has_bytes_that_library_writes_by_itself(

@@ -21,15 +21,13 @@ from tests.bags import (
     whole_bags,
     write_mcap,
 )
-from tests.conftest import refusing
+from tests.conftest import invoke, refusing
 from tests.joint_states import JOINT_STATE, STORE, vector
 from tests.recordings import EPOCH, MS
-from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.run_folder import read_flight
-from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_log.disk import try_lock
 from flight_log.playback import read_playback
@@ -111,7 +109,7 @@ COMMANDS = {
 def refusal(command: str, *words: str) -> str:
     """The sentence of a command that refuses."""
     line = [*COMMANDS[command], *words]
-    result = CliRunner().invoke(application(line[:1]), line)
+    result = invoke(*line)
     assert isinstance(result.exception, ParameterError), (result.output, result.exception)
     return str(result.exception)
 
@@ -189,10 +187,7 @@ def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
             command, str(tmp_path / "bag"), *given, "--remap", "y=/sensors/y"
         )
         results = [
-            CliRunner().invoke(
-                application([command]),
-                [command, str(tmp_path / folder), *given, *options, "--json"],
-            )
+            invoke(command, tmp_path / folder, *given, *options, "--json")
             for folder, options in (("plain", []), ("bag", words))
         ]
         assert results[1].stdout == results[0].stdout.replace(

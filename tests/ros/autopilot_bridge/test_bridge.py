@@ -22,22 +22,18 @@ import yaml
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 from std_msgs.msg import UInt8
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, invoke
 from tests.maps import MAP_FILES
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer, stamp_ns
 from tests.ros.waiting import HostDelays
-from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from flight_cli.cli import COMMANDS, application
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
-
-app = application([*COMMANDS])
 
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -326,7 +322,5 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     # 20 ms are late. 40 %: a loop with a phase margin of 54 degrees bears a factor of 2.
     assert abs(gain) == pytest.approx(abs(true), rel=0.4)
     (folder,) = tmp_path.rglob("found")
-    check = CliRunner().invoke(
-        app, ["check", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")]
-    )
+    check = invoke("check", folder / "map.yaml", "--scenario", folder / "scenario.yaml")
     assert check.exit_code == 0, check.output

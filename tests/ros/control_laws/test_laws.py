@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.conftest import invoke
 from tests.other_laws import EXAMPLE, SECTIONS
+from tests.recordings import require_equal_bits
 from tests.ros.conftest import Start
 from tests.ros.flight_bringup.test_lockstep import TOPICS, payloads
-from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.cli import COMMANDS, application
 from flight_log.tape_reader import read_run
 from rise_di_controller import laws
 
@@ -103,9 +103,6 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
             assert first[topic] == payload[topic], topic
     tape, recorded = simulate(load_scenario(scenario)), read_run(runs[0]).tape
     assert tape["u"].values.any(axis=0).all()
-    for name, signal in tape.signals.items():
-        assert signal.names == recorded[name].names
-        assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
-        assert signal.values.tobytes() == recorded[name].values.tobytes(), name
-    replay = CliRunner().invoke(application([*COMMANDS]), ["replay", str(runs[0])])
+    require_equal_bits(recorded, tape)
+    replay = invoke("replay", runs[0])
     assert (replay.exit_code, replay.stdout) == (0, "201 ticks, every bit equal\n")
