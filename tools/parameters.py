@@ -23,7 +23,8 @@ from rise_di_controller.params import ControllerConfig
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
 
-For you who write or change a scenario file: every key, by section. A key that is not here is refused. Two sections of a file:
+For you who write or change a scenario file: every key, by section. [Get started](../get-started.md) has those that you meet first. A
+key that is not here is refused. Two sections of a file:
 
 ```yaml
 /**/flight: {ros__parameters: {duration: 60.0}}
@@ -35,25 +36,6 @@ without *optional* is required. A list has an entry a channel. No number is abov
 instant `.inf` is never. `examples/scenarios/` has files that set the rarer keys. The node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this
 page: `python -m tools.parameters`.
 """  # noqa: E501 - a text as it is written
-MET = (
-    "flight.duration",
-    "aircraft.airframe",
-    "aircraft.gusts",
-    "aircraft.turbulence",
-    "aircraft.actuators",
-    "aircraft.sensors",
-    "reference_model.second_order",
-    "reference_model.pulses",
-    "guidance.route",
-    "controller.law",
-    "controller.D",
-    "controller.input_scale",
-    "controller.k_g",
-    "controller.Lambda",
-    "controller.beta",
-)
-"""The keys that a first scenario of a user changes; `rise-di gains` writes those of the
-controller."""
 SHARED = {
     "lockstep": "run in lockstep with the other nodes",
     "start_time": "system time of t = 0, s; 0: at once; -1: by the topic `start`",
@@ -83,16 +65,9 @@ HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 def page() -> str:
     """The text of the page."""
-    parts = [LEAD, "## The keys that you meet first", "", *HEAD]
-    known = {
-        f"{section}.{row[0]}": row for section, schema in SECTIONS.items() for row in _rows(schema)
-    }
-    known |= {f"controller.{row[0]}": row for row in _rows(laws.schema("rise_di"))}
-    parts += [f"| `{key}` | {known[key][1]} | {known[key][2]} |" for key in MET]
-    parts += ["", "## Keys of several sections", "", *HEAD]
-    parts += [
-        f"| `{key}` | {known[f'aircraft.{key}'][1]} | {text} |" for key, text in SHARED.items()
-    ]
+    known = {key: value for key, value, _ in _rows(AircraftConfig)}
+    parts = [LEAD, "## Keys of several sections", "", *HEAD]
+    parts += [f"| `{key}` | {known[key]} | {text} |" for key, text in SHARED.items()]
     parts += [""]
     parts += [_section(f"`{name}`", schema) for name, schema in SECTIONS.items()]
     for name in laws.names():
