@@ -27,23 +27,18 @@ def write_dataflash(
     """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and
     parameters before them.
     """
-    packets: list[tuple[int, bytes]] = [
-        (
-            -1,
-            FMT.pack(
-                HEAD + b"\x80", 0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
-            ),
-        )
-    ]
+
+    def format_of(identity: int, size: int, name: bytes, types: bytes, labels: bytes) -> None:
+        packet = FMT.pack(HEAD + b"\x80", identity, size, name, types, labels)
+        packets.append((-1, packet))
+
+    packets: list[tuple[int, bytes]] = []
+    format_of(0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     text = struct.Struct("<3sQ64s")
-    packets.append(
-        (-1, FMT.pack(HEAD + b"\x80", 0x7F, text.size, b"MSG", b"QZ", b"TimeUS,Message"))
-    )
+    format_of(0x7F, text.size, b"MSG", b"QZ", b"TimeUS,Message")
     packets.append((0, text.pack(HEAD + b"\x7f", 0, firmware.encode())))
     row = struct.Struct("<3sQ16sf")
-    packets.append(
-        (-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value"))
-    )
+    format_of(0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value")
     records = [*((0, name, value) for name, value in parameters.items()), *changes]
     packets += [
         (stamp, row.pack(HEAD + b"\x81", stamp, name.encode(), value))
@@ -52,19 +47,7 @@ def write_dataflash(
     for identity, (name, (fields, rows)) in enumerate(messages.items(), start=0x82):
         packet = struct.Struct(f"<3sQ{len(fields)}f")
         labels = ",".join(("TimeUS", *fields)).encode()
-        packets.append(
-            (
-                -1,
-                FMT.pack(
-                    HEAD + b"\x80",
-                    identity,
-                    packet.size,
-                    name.encode(),
-                    b"Q" + b"f" * len(fields),
-                    labels,
-                ),
-            )
-        )
+        format_of(identity, packet.size, name.encode(), b"Q" + b"f" * len(fields), labels)
         packets += [
             (stamp, packet.pack(HEAD + bytes([identity]), stamp, *values)) for stamp, values in rows
         ]

@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_log"],
-    package_data={"flight_log": ["py.typed"]},
+    package_data={"flight_log": ["py.typed", "*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_log"]),
         ("share/flight_log", ["package.xml"]),

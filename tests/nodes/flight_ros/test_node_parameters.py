@@ -43,11 +43,6 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
         (["-p", "k_g:=-1.0"], "controller.k_g: found -1.0, expected greater than 0"),
         (["-p", "max_agee:=1.0"], "controller.max_agee: unknown key, expected max_age perhaps"),
         (
-            ["-p", "beta:=[1.0,2.0]"],
-            "controller.beta: found 2 values, expected 4, one for each of q, p, r, V",
-        ),
-        (["-p", "D:=[1,1,1,0]"], "controller.D[3]: found 0, expected 1 or -1"),
-        (
             ["-r", "__node:=rise"],
             "rise: found no parameters, expected a section for /rise in a file of --params-file",
         ),

@@ -16,6 +16,7 @@ from flight_analysis.metrics import Transient
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.timing import tick_metrics
 from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
 
@@ -53,6 +54,11 @@ def test_a_span_extends_beyond_its_end() -> None:
     ]
 
 
+def instants_by_part(t: FloatArray, transients: list[Transient]) -> dict[str, list[float]]:
+    masks = metrics.part_masks(t, transients, settle=1.0)
+    return {part: t[mask].tolist() for part, mask in masks.items()}
+
+
 def test_each_instant_belongs_to_one_part_of_flight() -> None:
     transients = [
         Transient("engagement", "", 0.0, 0.0),
@@ -60,11 +66,7 @@ def test_each_instant_belongs_to_one_part_of_flight() -> None:
         Transient("gust", "vertical", 3.5, 4.0),
     ]
     t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
-    masks = {
-        part: t[mask].tolist()
-        for part, mask in metrics.part_masks(t, transients, settle=1.0).items()
-    }
-    assert masks == {
+    assert instants_by_part(t, transients) == {
         "whole": t.tolist(),
         "calm": [1.5, 5.5],  # 0 and 0.5 belong to the engagement
         "command": [3.0, 3.4],
@@ -79,11 +81,7 @@ def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
         Transient("gust", "vertical", 3.5, 4.0),
     ]
     t = np.array([0.5, 1.5, 2.2, 2.9, 3.8, 6.0])
-    masks = {
-        part: t[mask].tolist()
-        for part, mask in metrics.part_masks(t, transients, settle=1.0).items()
-    }
-    assert masks == {
+    assert instants_by_part(t, transients) == {
         "whole": t.tolist(),
         "calm": [0.5, 6.0],
         "capture": [1.5, 2.2],

@@ -30,7 +30,6 @@ from rise_di_controller import laws
 # Replacement in the text of the default scenario -> the sentence of the error.
 BAD = {
     ("k_g: 1.0", "k_g: -1.0"): "controller.k_g: found -1.0, expected greater than 0",
-    ("k_g: 1.0", "k_g: true"): "controller.k_g: found True, expected a number",
     (
         "    beta:",
         "    betta:",
@@ -39,16 +38,10 @@ BAD = {
         "    Lambda: [5.0, 5.0, 3.0, 0.5]",
         "    #",
     ): "controller.Lambda: missing, expected the diagonal of Lambda (4), 1/s",
-    ("D: [1, 1, 1, 1]", "D: [1, 1, 2, 1]"): "controller.D[2]: found 2, expected 1 or -1",
     (
         "D: [1, 1, 1, 1]",
         "D: [1, 1, 1]",
     ): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
-    ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
-    (
-        "k_d: [16.0, 16.0, 7.0]",
-        "k_d: [16.0, .nan, 7.0]",
-    ): "controller.k_d[1]: found nan, expected a finite number",
     (
         "damping: [0.9, 1.0,",
         "damping: [0.9, -1.0,",
@@ -93,19 +86,10 @@ BAD = {
         "/**/recorder:\n  ros__parameters:",
         "/**/recorder:\n  parameters:",
     ): "recorder: found no parameters under",
-    ("duration: 60.0", "duration: 060"): "flight.duration: found '060', expected a number",
     (
         "duration: 60.0",
         "duration: 60.0\n    duration: 50.0",
     ): "bad.yaml: not valid YAML (found the key duration twice",
-    ("duration: 60.0", "duration: 60.0\n    2: 60.0"): "flight: found the key 2, expected a name",
-    ("step: 0.002", "sensors: {seed: 340282366920938463463374607431768211456}\n    step: 0.002"): (
-        "aircraft.sensors.seed: found 340282366920938463463374607431768211456, expected less than"
-    ),
-    ("start: [10.0], stop: [30.0], value: [1.5]", "start: [], stop: [30.0], value: [1.5]"): (
-        "reference_model.pulses.V.start: found 0 values, expected at least 1 value"
-    ),
-    ("delay: 0.003", "delay: 1.01"): "controller.delay: found 1.01 s, expected at most 1 s",
 }
 
 

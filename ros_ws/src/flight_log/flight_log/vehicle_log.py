@@ -8,14 +8,15 @@ PX4 guide, ULog file format, and PX4's msg/*.msg. pymavlink and pyulog decode th
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from flight_core import isolated
@@ -84,95 +85,29 @@ class Format(NamedTuple):
     torques: Sources = MappingProxyType({})
 
 
-def _sources(**places: tuple[Source, ...] | Source) -> Sources:
-    return MappingProxyType(
-        {
-            name: (source,) if isinstance(source, Source) else source
-            for name, source in places.items()
-        }
+def _source(place: str) -> Source:
+    message, field, *factors = place.split()
+    return Source(message, field, *(DEGREE if text == "deg" else float(text) for text in factors))
+
+
+def _sources(places: Mapping[str, Sequence[str]]) -> Sources:
+    return {name: tuple(map(_source, listed)) for name, listed in places.items()}
+
+
+def _format(rows: Mapping[str, Any]) -> Format:
+    return Format(
+        sources=_sources(rows["sources"]),
+        sticks=_source(rows["sticks"]),
+        servos=_source(rows["servos"]),
+        mode=tuple(map(_source, rows["mode"])),
+        torques=_sources(rows.get("torques", {})),
     )
 
 
-def _estimator(field: str, scale: float = 1.0) -> tuple[Source, ...]:
-    # EKF3, EKF2, EKF2 of old releases
-    return tuple(Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1"))
-
-
-DATAFLASH = Format(
-    sources=_sources(
-        q=Source("IMU", "GyrY"),
-        p=Source("IMU", "GyrX"),
-        r=Source("IMU", "GyrZ"),
-        V=(
-            Source("ARSP", "Airspeed"),
-            Source("CTUN", "As"),
-            Source("CTUN", "Aspd"),
-        ),  # equivalent: _true_airspeed
-        phi=Source("ATT", "Roll", DEGREE),
-        theta=Source("ATT", "Pitch", DEGREE),
-        psi=Source("ATT", "Yaw", DEGREE),
-        north=_estimator("PN"),
-        east=_estimator("PE"),
-        altitude=_estimator("PD", -1.0),
-        v_north=_estimator("VN"),
-        v_east=_estimator("VE"),
-        climb=_estimator("VD", -1.0),
-    ),
-    sticks=Source("RCIN", "C{}"),
-    servos=Source("RCOU", "C{}"),
-    mode=(Source("MODE", "ModeNum"), Source("MODE", "Mode")),
-    torques=_sources(
-        q=Source("RATE", "POut"),
-        p=Source("RATE", "ROut"),
-        r=Source("RATE", "YOut"),
-        climb=Source("RATE", "AOut"),
-    ),
-)
-TLOG = Format(
-    sources=_sources(
-        q=Source("ATTITUDE", "pitchspeed"),
-        p=Source("ATTITUDE", "rollspeed"),
-        r=Source("ATTITUDE", "yawspeed"),
-        V=Source("VFR_HUD", "airspeed"),
-        phi=Source("ATTITUDE", "roll"),
-        theta=Source("ATTITUDE", "pitch"),
-        psi=Source("ATTITUDE", "yaw"),
-        north=Source("LOCAL_POSITION_NED", "x"),
-        east=Source("LOCAL_POSITION_NED", "y"),
-        altitude=Source("LOCAL_POSITION_NED", "z", -1.0),
-        v_north=Source("LOCAL_POSITION_NED", "vx"),
-        v_east=Source("LOCAL_POSITION_NED", "vy"),
-        climb=Source("LOCAL_POSITION_NED", "vz", -1.0),
-    ),
-    sticks=Source("RC_CHANNELS", "chan{}_raw"),
-    servos=Source("SERVO_OUTPUT_RAW", "servo{}_raw"),
-    mode=(Source("HEARTBEAT", "custom_mode"),),
-)
-
-
-def _rate(axis: int) -> tuple[Source, ...]:
-    # before 1.10
-    return Source("vehicle_angular_velocity", f"xyz[{axis}]"), Source(
-        "sensor_combined", f"gyro_rad[{axis}]"
-    )
-
-
-ULOG_SOURCES = _sources(
-    q=_rate(1),
-    p=_rate(0),
-    r=_rate(2),
-    V=(Source("airspeed_validated", "true_airspeed_m_s"), Source("airspeed", "true_airspeed_m_s")),
-    phi=Source("vehicle_attitude", "phi"),
-    theta=Source("vehicle_attitude", "theta"),
-    psi=Source("vehicle_attitude", "psi"),
-    north=Source("vehicle_local_position", "x"),
-    east=Source("vehicle_local_position", "y"),
-    altitude=Source("vehicle_local_position", "z", -1.0),
-    v_north=Source("vehicle_local_position", "vx"),
-    v_east=Source("vehicle_local_position", "vy"),
-    climb=Source("vehicle_local_position", "vz", -1.0),
-)
-
+_PLACES = yaml.safe_load(Path(__file__).with_name("vehicle_logs.yaml").read_text(encoding="utf-8"))
+DATAFLASH = _format(_PLACES["dataflash"])
+TLOG = _format(_PLACES["tlog"])
+ULOG_SOURCES = _sources(_PLACES["ulog"]["sources"])
 
 ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
     {
