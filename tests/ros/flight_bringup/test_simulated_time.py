@@ -79,11 +79,12 @@ def test_same_errors_at_any_speed_and_in_lockstep(
             until(lambda ended=node: ended.popen.poll() is not None, "the end")  # type: ignore[misc]
         start("flight_cli.cli", "replay", str(run)).wait_for("every bit equal")
         errors[speed] = error(run)
+    exact = errors.get(0.0, errors[1.0])  # lockstep: no delay of the host
     for speed, rms in errors.items():
         # A millisecond of the host is three of the simulation at 3 times real time, and the delay
         # of u raises the error: 2.0 % were seen on a host with one busy core.
-        bound = 0.04 if speed > 1.0 else 0.02
-        assert rms == pytest.approx(errors[1.0], rel=bound), errors
+        bound = 0.05 if speed > 1.0 else 0.02
+        assert rms == pytest.approx(exact, rel=bound), errors
     assert errors[1.0] > 0.0
 
 
