@@ -160,22 +160,27 @@ def select_gains(
     selection = gain_selection.select_gains(studied, setting)
     if not observer:
         return selection
-    needed = setting.requirement._replace(
-        phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase)
-    )
-    as_given = weights is not None and accept
+    needed = _beside_observer(setting.requirement, as_read=weights is not None and accept)
     controller, origin = observed(
         selection.chosen,
         chosen,
         through_allocation(known_model, setting.base),
         margin,
-        STABLE if as_given else needed,
-        uncertain=not as_given,
+        needed,
         speeds=pair,
         weights=weights,
         progress=progress,
     )
     return replace(selection, chosen=controller, origin=origin)
+
+
+def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
+    """A requirement for a loop with an observer; `as_read` from a file, the gains need no more than
+    a stable loop.
+    """
+    if as_read:
+        return STABLE
+    return required._replace(phase=min(required.phase, OBSERVER_REQUIREMENT.phase))
 
 
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
