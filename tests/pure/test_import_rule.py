@@ -12,6 +12,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+import yaml
 from tests.conftest import REPOSITORY
 
 SOURCES = REPOSITORY / "ros_ws" / "src"
@@ -21,78 +22,10 @@ CLIENTS = {"client.py", "control_client.py", "monitor.py", "player.py"}
 ROS_FILES = {"node.py", "main.py"} | CLIENTS  # nodes, their executables, and clients of nodes
 ROS_FOLDERS = {"flight_ros", "launch"}
 IMPORTS: dict[str, set[str]] = {
-    "flight_core": set(),
-    "flight_log": {"flight_core"},
-    "flight_ros": {"flight_core"},
-    "reference_model": {"flight_core"},
-    "aircraft_sim": {"flight_core"},
-    "rise_di_controller": {"flight_core"},
-    "flight_guidance": {"flight_core"},
-    "autopilot_bridge": {"flight_core", "flight_log"},
-    "flight_recorder": {"flight_core", "flight_log"},
-    "control_laws": {"flight_core", "rise_di_controller"},
-    "flight_analysis.closed_loop": {
-        "aircraft_sim", "flight_core", "flight_guidance", "flight_log", "flight_recorder",
-        "reference_model",
-        "rise_di_controller",
-    },
-    "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
-    "flight_analysis.report": {
-        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core",
-        "flight_guidance",
-        "flight_log", "rise_di_controller",
-    },
-    "c_export": {"flight_analysis.closed_loop", "flight_core", "flight_log", "reference_model",
-    "rise_di_controller"},
-    "flight_design.gains": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
-        "reference_model", "rise_di_controller",
-    },
-    "flight_design.identification": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop",
-        "flight_analysis.metrics",
-        "flight_core", "flight_design.gains", "flight_log", "reference_model", "rise_di_controller",
-    },
-    "flight_design.learning": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_core",
-        "flight_design.gains",
-        "flight_design.identification", "flight_log", "rise_di_controller",
-    },
-    "flight_campaign": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
-        "flight_analysis.report",
-        "flight_core", "flight_design.gains", "flight_guidance", "reference_model",
-        "rise_di_controller",
-    },
-    "flight_bringup": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core",
-        "flight_guidance",
-        "flight_log", "rise_di_controller",
-    },
-    "flight_view": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_core",
-        "flight_log", "flight_guidance", "rise_di_controller",
-    },
-    "rise_di": {
-        "aircraft_sim", "c_export", "flight_analysis.closed_loop", "flight_analysis.metrics",
-        "flight_analysis.report",
-        "flight_bringup", "flight_campaign", "flight_core", "flight_design.gains",
-        "flight_design.learning", "flight_log",
-        "reference_model", "rise_di_controller",
-    },
-    "flight_cli": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop",
-        "flight_analysis.metrics",
-        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core",
-        "flight_design.gains",
-        "flight_design.identification", "flight_design.learning", "flight_guidance", "flight_log",
-        "flight_view", "rise_di",
-        "rise_di_controller",
-    },
-}  # fmt: skip
-"""Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside
-these."""
+    unit: set(units)
+    for unit, units in yaml.safe_load(Path(__file__).with_name("imports.yaml").read_text()).items()
+}
+"""Which units of the stack a unit imports."""
 
 
 def imported_modules(path: Path) -> set[str]:
