@@ -32,7 +32,7 @@ from flight_guidance.route_file import Waypoint
 from flight_guidance.vertical import path_angle
 
 LAWS = ("guidance", "L1", "L1 + lead")
-WINDS = (0.0, 0.2)  # of V0, to the east
+WINDS = (0.0, 0.2, 0.6)  # of V0, to the east
 OFFSETS = (0.3, 0.6, 0.9)  # radii to the side of the line
 WITHIN = 0.1  # s of flight at V0: what counts as captured
 STEEPEST_L1 = math.sin(math.radians(45.0))

@@ -64,10 +64,10 @@ def test_radius_too_small_for_wind_refused() -> None:
 
 
 def test_a_period_below_the_rule_is_refused() -> None:
-    sentence = refusal(CORNER, roll_rate=0.15)  # 11 * 30 deg / 0.15 = 38.40
+    sentence = refusal(CORNER, roll_rate=0.15)  # 9.3 * 30 deg / 0.15 = 32.46
     assert (
         sentence
-        == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
+        == "guidance.period: found 14 s, expected at least 32.5 s at this speed, bank and roll rate"
     )
     assert flyable(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
 

@@ -90,6 +90,13 @@ def test_roll_rate_and_load_are_limited() -> None:
     assert (rates.p, rates.q) == approx((0.3, 0.5 * GRAVITY / SPEED))
 
 
+def test_yaw_rate_leads_the_bank() -> None:
+    led = HOLD._replace(turn_lead=0.5)
+    ahead = 0.5 * HOLD.k_phi * 0.1
+    flat = body_rates(0.1, 0.0, 0.0, 0.0, 0.0, 0.0, SPEED, led)
+    assert flat.r == approx(GRAVITY * math.sin(ahead) / SPEED)
+
+
 def test_sideslip_to_right_turns_nose_right() -> None:
     assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == approx(
         0.1
@@ -332,7 +339,7 @@ def test_rules_of_radius_and_period() -> None:
     bank = math.radians(30.0)
     # A circle of the least radius asks for 0.8 of the bank at the speed with the wind from behind.
     assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == approx(0.8 * bank)
-    assert least_period(46.0, bank, 0.15) == approx(11.0 * bank / 0.15)
+    assert least_period(46.0, bank, 0.15) == approx(9.3 * bank / 0.15)
     assert least_period(25.0, bank, 1.0) == 14.0
 
 

@@ -28,6 +28,7 @@ class AttitudeParams(NamedTuple):
     load: float  # largest change of the load factor, 1
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
     k_beta: float  # 1/s, 0 where beta is not measured
+    turn_lead: float = 0.0  # s, by which r leads the bank
 
 
 class BodyRates(NamedTuple):
@@ -53,20 +54,22 @@ def body_rates(
 
         phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
             theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
-        r_m = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi) + k_beta beta,
-            psi_dot = g tan(phi) / V
+        r_m = psi_dot cos(phi_l) cos(theta) - theta_dot_c sin(phi_l) + k_beta beta,
+            psi_dot = g tan(phi_l) / V,  phi_l = phi + turn_lead phi_dot_c
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    with the measured r where r is not tracked exactly. The last term of q_m leads the angle of
-    attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W. Beard, T. W.
-    McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
+    with the measured r where r is not tracked exactly. `turn_lead` makes up for the lag of the turn
+    behind the bank, by the reference model of r and by the sideslip of a roll. The last term of q_m
+    leads the angle of attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W.
+    Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """  # noqa: D400, D415 - what follows is an equation
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
     lead = phi_dot * array_namespace(phi).tan(tilt(phi)) / params.n_alpha
     p, q = inverse(phi, theta, phi_dot, theta_dot + lead, r)
-    return BodyRates(p, q, turn_rate(phi, theta, theta_dot, speed) + params.k_beta * beta)
+    turn = turn_rate(phi + params.turn_lead * phi_dot, theta, theta_dot, speed)
+    return BodyRates(p, q, turn + params.k_beta * beta)
 
 
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:

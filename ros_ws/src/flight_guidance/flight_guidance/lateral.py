@@ -131,7 +131,7 @@ def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
 
 
 def least_period(speed: float, bank: float, roll_rate: float) -> float:
-    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 11 phi_max / p_max).
+    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 9.3 phi_max / p_max).
 
     The last term is `reach.least_period`.
     """

@@ -60,6 +60,10 @@ ALTITUDE_GAIN = 0.2
 ALPHA_TIME = 2.0
 """1/s and s, for a flight path that follows the pitch within two seconds."""
 
+TURN_LEAD = 2.4
+"""r leads the bank by this over the frequency of the reference model of r: 1.8 is the lag of the
+model with a damping of 0.9, the rest that of the sideslip in a roll of the osprey."""
+
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
 
@@ -139,7 +143,7 @@ class GuidanceConfig(NodeConfig):
         default=None, description="period of path following, s; none: by rule"
     )
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(
-        default=0.75, description="damping of path following, 1"
+        default=0.8, description="damping of path following, 1"
     )
     capture: Annotated[float, Field(gt=0, le=math.pi / 2.0)] = Field(
         default=math.radians(60.0), description="largest angle at which a path is approached, rad"
@@ -247,7 +251,7 @@ class GuidanceConfig(NodeConfig):
         )
         least = math.ceil(self.least_period() * 10.0) / 10.0
         fits = self.period is None or self.period >= least
-        rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
+        rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 9.3 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
         fastest = self._largest_speed()
         require(
@@ -404,7 +408,9 @@ class GuidanceConfig(NodeConfig):
             period_ns=period_ns(self.rate, "rate"),
             speed=self.speed,
             k_chi=roll / 3.5,
-            attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta()),
+            attitude=AttitudeParams(
+                roll, pitch, roll_rate, self.load, 20.0, self.k_beta(), TURN_LEAD / frequency["r"]
+            ),
             vertical=self._vertical(climb, sink),
             path=PathParams(self.period or self.least_period(), self.damping, self.capture),
             limits=Limits(

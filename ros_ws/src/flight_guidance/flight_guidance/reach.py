@@ -16,9 +16,9 @@ CLIMB = 0.7
 SINK = 0.5
 """Parts of the throttle's authority for a climb and a sink; the rest holds the airspeed."""
 
-REVERSALS = 11.0
+REVERSALS = 9.3
 """Least period of path following over bank / roll rate. A bank reversal takes 2 bank / roll rate.
-With a period of 3.5 reversals the osprey cycled in turbulence; 5.5 are asked for."""
+With a period of 3.5 reversals the osprey cycled in turbulence; 4.65 are asked for."""
 
 
 LEAST = 1e-3
