@@ -6,6 +6,7 @@ The heading is apart: no lateral mode needs a nose. As `modes.step`, the step ha
 hidden state.
 """
 
+import cmath
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -58,15 +59,13 @@ WIND_TIME = 3.0
 LONGEST_LEAD = 0.5
 """s. Largest age of a pose over which its attitude is brought to now."""
 
-Vector = tuple[float, float]  # to the north and to the east
-
 
 class Wanted(NamedTuple):
-    """What a lateral mode asks for."""
+    """What a lateral mode asks for. Complex numbers are vectors: north and i east."""
 
-    velocity: Vector  # m/s, over ground
-    ahead: Vector  # m/s, the velocity once the tilt has followed
-    acceleration: Vector = (0.0, 0.0)  # m/s^2, of the way itself
+    velocity: complex = 0.0  # m/s, over ground
+    ahead: complex = 0.0  # m/s, the velocity once the tilt has followed
+    acceleration: complex = 0.0  # m/s^2, of the way itself
     error: PathError = PathError(0.0, 0.0, 0.0)
     to_go: float = 0.0  # m
 
@@ -82,19 +81,27 @@ def hold(
     """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead, with the heading and the
     altitude of now.
     """
-    north, east = _stop(pose, _own(params))
-    return {"north": north, "east": east, "heading": pose["psi"], "altitude": pose["altitude"]}
+    stop = _stop(pose, _own(params))
+    there = {"north": stop.real, "east": stop.imag}
+    return there | {"heading": pose["psi"], "altitude": pose["altitude"]}
 
 
-def _velocity(pose: Mapping[str, float]) -> Vector:
-    return pose["v_north"], pose["v_east"]
+def _velocity(pose: Mapping[str, float]) -> complex:
+    return complex(pose["v_north"], pose["v_east"])
 
 
-def _stop(pose: Mapping[str, float], own: MulticopterParams) -> Point:
+def _place(pose: Mapping[str, float]) -> complex:
+    return complex(pose["north"], pose["east"])
+
+
+def _parts(vector: complex) -> tuple[float, float]:
+    return vector.real, vector.imag
+
+
+def _stop(pose: Mapping[str, float], own: MulticopterParams) -> complex:
     """Where the aircraft stops, m."""
     v = _velocity(pose)
-    time = own.lead + math.hypot(*v) / (2.0 * own.braking)
-    return pose["north"] + time * v[0], pose["east"] + time * v[1]
+    return _place(pose) + (own.lead + abs(v) / (2.0 * own.braking)) * v
 
 
 def step(
@@ -128,7 +135,7 @@ def step(
     state = state._replace(V_c=slewed(state.V_c, speed, own.braking, dt))
     wanted = _wanted(state, pose, route, escape, params)
     if flies and state.lateral is not Lateral.PHI:
-        state = state._replace(V_c=min(state.V_c, math.hypot(*wanted.velocity)))
+        state = state._replace(V_c=min(state.V_c, abs(wanted.velocity)))
     phi_c, theta_c, limited = _attitude_for(state, pose, wanted, params)
     state, climb_limited = _with_climb(state, pose, dt, params)
     rates = _rates(state, phi_c, theta_c, own)
@@ -169,6 +176,7 @@ def _begin(
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
+    own = _own(params)
     held = GuidanceState(
         inputs.t_ns - params.period_ns,
         Mode.ENGAGED,
@@ -182,11 +190,11 @@ def _begin(
         alpha_trim=0.0,
         slip=0.0,
         climb_c=pose["climb"],
-        V_c=math.hypot(*_velocity(pose)),
+        V_c=abs(_velocity(pose)),
         u_m=(0.0,) * len(params.outputs),
         psi=pose["psi"],
-        wind=_wind_in_hover(pose, _own(params)),
-        velocity=_velocity(pose),
+        wind=_parts(_velocity(pose) - _by_tilt(pose, pose, own) / own.drag),
+        velocity=_parts(_velocity(pose)),
     )
     if state is None or inputs.begin is Begin.HOLD:
         return held
@@ -268,8 +276,7 @@ def _with_commands(
 
 
 def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> bool:
-    away = math.dist(place, (pose["north"], pose["east"]))
-    return away <= NEAR * max(float(state.target.V), 1.0)
+    return abs(complex(*place) - _place(pose)) <= NEAR * max(float(state.target.V), 1.0)
 
 
 def _stops(route: Route, number: int) -> bool:
@@ -317,9 +324,9 @@ def _within_fence(
     if fence is None or state.mode is not Mode.ENGAGED:
         return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
     here = (np.float64(pose["north"]), np.float64(pose["east"]))
-    margin = MARGIN * max(math.hypot(*_velocity(pose)), 1.0)
+    margin = MARGIN * max(abs(_velocity(pose)), 1.0)
     now = float(clearance(fence.zones, *here))
-    predicted = float(line_clearance(fence, *here, *_stop(pose, _own(params))))
+    predicted = float(line_clearance(fence, *here, *_parts(_stop(pose, _own(params)))))
     action = _action(fence, here, now)
     begins = state.fence == 0.0 and predicted < margin
     if begins:
@@ -350,24 +357,20 @@ def _wanted(
     target = state.target
     place = (target.north, target.east)
     if state.mode is not Mode.ENGAGED or state.lateral is Lateral.PHI:
-        return Wanted((0.0, 0.0), (0.0, 0.0))
+        return Wanted()
     if escape.action in {AROUND, BACK} and params.fence is not None:
         here = (np.float64(pose["north"]), np.float64(pose["east"]))
         north, east, _ = ways(params.fence).aim(params.fence, *here)
         place = (float(north), float(east))
     elif state.lateral is Lateral.COURSE:
-        velocity = _along(target.course, state.V_c)
+        velocity = cmath.rect(state.V_c, target.course)
         return Wanted(velocity, velocity, error=PathError(0.0, target.course, 0.0))
     elif state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         if not state.joining and not path.is_orbit(leg):
             return _on_path(state, pose, route, own)
         place = route.start(state.leg, target.along)[0]
-    return _to_place(place, state, pose, own)
-
-
-def _along(course: float, speed: float) -> Vector:
-    return speed * math.cos(course), speed * math.sin(course)
+    return _to_place(complex(*place), state, pose, own)
 
 
 def _approach(distance: float, speed: float, own: MulticopterParams) -> tuple[float, float]:
@@ -381,19 +384,15 @@ def _approach(distance: float, speed: float, own: MulticopterParams) -> tuple[fl
 
 
 def _to_place(
-    place: Point, state: GuidanceState, pose: Mapping[str, float], own: MulticopterParams
+    place: complex, state: GuidanceState, pose: Mapping[str, float], own: MulticopterParams
 ) -> Wanted:
     """Towards a place, with the deceleration of the way."""
-    north = place[0] - pose["north"]
-    east = place[1] - pose["east"]
-    distance = math.hypot(north, east)
-    course = math.atan2(east, north)
+    distance, course = cmath.polar(place - _place(pose))
     speed, slope = _approach(distance, state.V_c, own)
-    velocity = _along(course, speed)
-    closing = pose["v_north"] * math.cos(course) + pose["v_east"] * math.sin(course)
-    brake = _along(course, -slope * closing)
-    error = PathError(distance, course, 0.0)
-    return Wanted(velocity, velocity, brake, error, distance)
+    velocity = cmath.rect(speed, course)
+    closing = (_velocity(pose) * cmath.rect(1.0, -course)).real
+    brake = cmath.rect(-slope * closing, course)
+    return Wanted(velocity, velocity, brake, PathError(distance, course, 0.0), distance)
 
 
 def _on_path(
@@ -404,39 +403,30 @@ def _on_path(
     position = (pose["north"], pose["east"])
     error = path.error(leg, position)
     to_go = path.to_go(leg, position)
-    speed, slope = state.V_c, 0.0
+    speed = state.V_c
+    slope = 0.0
     if _stops(route, state.leg):
-        speed, slope = _approach(max(to_go, 0.0), state.V_c, own)
+        speed, slope = _approach(max(to_go, 0.0), speed, own)
     across = -clip(own.k_p * error.e, ACROSS * speed)
-    along = math.sqrt(speed**2 - across**2)
-    velocity = _turned((along, across), error.track)
-    later = (
-        position[0] + own.lead * pose["v_north"],
-        position[1] + own.lead * pose["v_east"],
-    )
+    velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
+    later = _parts(_place(pose) + own.lead * _velocity(pose))
     entered = leg
     if path.passed(leg, later) and not _stops(route, state.leg):
         entered = route.legs[state.leg + 1]
     there = path.error(entered, later)
-    bend = speed**2 * there.curvature
-    ahead = _turned((along, across), there.track)
-    acceleration = _turned((-slope * speed, bend), there.track)
-    return Wanted(velocity, ahead, acceleration, error, to_go)
+    track = cmath.rect(1.0, there.track)
+    bend = complex(-slope * speed, speed**2 * there.curvature)
+    now = velocity * cmath.rect(1.0, error.track)
+    return Wanted(now, velocity * track, bend * track, error, to_go)
 
 
-def _turned(vector: Vector, track: float) -> Vector:
-    """A vector along and to the right of a track, to the north and to the east."""
-    sine = math.sin(track)
-    cosine = math.cos(track)
-    return vector[0] * cosine - vector[1] * sine, vector[0] * sine + vector[1] * cosine
-
-
-def _wind_in_hover(pose: Mapping[str, float], own: MulticopterParams) -> Vector:
-    """The wind in which a tilt keeps the velocity of now, m/s: v - (g + d climb) tan(tilt) / d."""
-    *level, up = thrust_axis(tilt(pose["phi"]), tilt(pose["theta"]), pose["psi"])
-    lift = _lift(pose, own) / (own.drag * up)
-    north, east = (v - lift * a for v, a in zip(_velocity(pose), level, strict=True))
-    return north, east
+def _by_tilt(
+    attitude: Mapping[str, float], pose: Mapping[str, float], own: MulticopterParams
+) -> complex:
+    """Acceleration by an attitude, (g + d climb) tan(tilt), m/s^2."""
+    angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
+    north, east, up = thrust_axis(*angles)
+    return _lift(pose, own) / up * complex(north, east)
 
 
 def _with_wind(
@@ -452,16 +442,17 @@ def _with_wind(
     own = _own(params)
     v = _velocity(pose)
     if state.mode is not Mode.ENGAGED:
-        return state._replace(velocity=v)
-    *level, up = thrust_axis(tilt(state.phi), tilt(state.theta), state.psi)
-    gain = 1.0 / (own.drag * WIND_TIME)
+        return state._replace(velocity=_parts(v))
+    wind = complex(*state.wind)
+    attitude = {"phi": state.phi, "theta": state.theta, "psi": state.psi}
+    unexplained = own.drag * (v - wind) - _by_tilt(attitude, pose, own)
+    wind += (v - complex(*state.velocity) + dt * unexplained) / (own.drag * WIND_TIME)
     limit = GRAVITY * math.tan(params.limits.bank) / own.drag
-    lift = _lift(pose, own) / up
-    north, east = (
-        clip(w + gain * (now - before + dt * (own.drag * (now - w) - lift * a)), limit)
-        for w, now, before, a in zip(state.wind, v, state.velocity, level, strict=True)
-    )
-    return state._replace(wind=(float(north), float(east)), velocity=v)
+    return state._replace(wind=_parts(_within(wind, limit)), velocity=_parts(v))
+
+
+def _within(vector: complex, largest: float) -> complex:
+    return vector * min(1.0, largest / max(abs(vector), 1e-6))
 
 
 def _lift(pose: Mapping[str, float], own: MulticopterParams) -> float:
@@ -478,19 +469,18 @@ def _attitude_for(
     if state.mode is not Mode.ENGAGED:
         return 0.0, 0.0, False
     if state.lateral is Lateral.PHI:
-        angle = math.hypot(state.target.phi, state.target.theta)
-        share = min(1.0, largest / max(angle, 1e-6))
-        return share * state.target.phi, share * state.target.theta, share < 1.0
-    columns = (wanted.acceleration, wanted.velocity, wanted.ahead, _velocity(pose), state.wind)
-    north, east = (
-        a + own.k_v * (v_c - v) + own.drag * (v_ff - w)
-        for a, v_c, v_ff, v, w in zip(*columns, strict=True)
+        asked = complex(state.target.phi, state.target.theta)
+        angles = _within(asked, largest)
+        return angles.real, angles.imag, angles != asked
+    needed = (
+        wanted.acceleration
+        + own.k_v * (wanted.velocity - _velocity(pose))
+        + own.drag * (wanted.ahead - complex(*state.wind))
     )
     lift = _lift(pose, own)
-    most = lift * math.tan(largest)
-    share = min(1.0, most / max(math.hypot(north, east), 1e-6))
-    ahead, right = _turned((share * north, share * east), -state.psi)
-    return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), share < 1.0
+    level = _within(needed, lift * math.tan(largest))
+    ahead, right = _parts(level * cmath.rect(1.0, -state.psi))
+    return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), level != needed
 
 
 def _with_climb(
