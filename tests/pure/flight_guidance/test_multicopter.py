@@ -92,7 +92,7 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
     # 0.07 m flown, with noise; a tilt that is late by its lag of 0.4 s would be beside by 0.3 m
     assert np.max(np.abs(log["xtrack"][on_lines])) < 0.15
     assert log["xtrack"][-1] < 1.0  # hovers at the last waypoint
-    assert np.max(np.abs(log["pose.psi"])) < math.radians(6.0)  # the nose stays
+    assert np.max(np.abs(log["pose.psi"])) < math.radians(3.0)  # the nose stays
     first = (log["leg"] == 0) & (tape.time("guidance") > 5.0)
     assert np.mean(np.hypot(log["pose.v_north"], log["pose.v_east"])[first]) == approx(3.0, abs=0.1)
     # the drag of a steady flight holds against the tilt: g tan(tilt) = d v

@@ -505,8 +505,8 @@ def _with_climb(
 def _rates(
     state: GuidanceState, phi_c: float, theta_c: float, own: MulticopterParams
 ) -> dict[str, float]:
-    """Body rates that turn the thrust into its direction by the shortest way, and the heading about
-    the body axis, rad/s.
+    """Body rates that turn the thrust into its direction by the shortest way, and the heading at
+    its rate, the inverse of `kinematics.heading_rate`, rad/s.
 
         [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
 
@@ -524,7 +524,10 @@ def _rates(
     down = math.cos(state.phi) * down - math.sin(state.phi) * math.sin(phi_c)
     sine = math.hypot(ahead, right)
     rate = min(own.k_tilt * math.atan2(sine, -down), own.tilt_rate) / max(sine, 1e-9)
+    q = -rate * ahead
     turn = 0.0
     if state.mode is Mode.ENGAGED:
         turn = own.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
-    return {"p": rate * right, "q": -rate * ahead, "r": float(clip(turn, own.yaw_rate))}
+    phi = tilt(state.phi)
+    r = (clip(turn, own.yaw_rate) * math.cos(state.theta) - q * math.sin(phi)) / math.cos(phi)
+    return {"p": rate * right, "q": q, "r": float(r)}
