@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import yaml
-from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
+from geometry_msgs.msg import TwistStamped, Vector3, Vector3Stamped
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -27,17 +27,13 @@ from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool, Trigger
 from tests.conftest import REPOSITORY, invoke
-from tests.maps import MAP_FILES, named_map
+from tests.maps import MAP_FILES
 from tests.nodes.world import INPUTS, OUTPUTS, World, parameters, world_of
 from tests.ros.autopilot import Autopilot
 
 from autopilot_bridge.channel_map import (
-    message_type,
     no_publisher,
     read_raw,
-    set_field,
-    to_channel,
-    to_raw,
 )
 from autopilot_bridge.node import (
     ACTIVATION_TIMEOUT_NS,
@@ -692,42 +688,6 @@ def serialised(message: Any) -> Any:
     return deserialize_message(serialize_message(message), type(message))
 
 
-@pytest.mark.parametrize(
-    "name, message, expected",
-    [
-        (
-            "ardupilot_2024",
-            TwistStamped(twist=Twist(angular=RATES)),
-            {"q": 0.2, "p": 0.3, "r": 0.1},
-        ),
-        ("ardupilot_2024", AIRSPEED, {"V": 2.0}),
-        ("odometry", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
-    ],
-    ids=("twist", "airspeed", "imu"),
-)
-def test_outputs_are_read_from_real_messages(
-    name: str, message: Any, expected: dict[str, float]
-) -> None:
-    message = serialised(message)
-    for channel, value in expected.items():
-        row = named_map(name).outputs[channel]
-        assert message_type(row.type) is type(message)
-        assert to_channel(read_raw(message, row.field, row.function), row.line) == approx(value)
-
-
 def test_a_real_pressure_gives_the_speed() -> None:
     message = serialised(FluidPressure(fluid_pressure=0.5 * 1.225 * 30.0**2))
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == approx(30.0)
-
-
-def test_inputs_are_written_into_a_real_joy() -> None:
-    channel_map = named_map("ardupilot_2024")
-    message = Joy()
-    for path, value in channel_map.messages["joy"].values.items():
-        set_field(message, path, value)
-    for row, u in zip(channel_map.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
-        set_field(message, row.field, to_raw(row.trim + u, row.line))
-    # RC1 to 4
-    assert list(serialised(message).axes) == approx(
-        [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5
-    )

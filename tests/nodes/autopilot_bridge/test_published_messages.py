@@ -119,7 +119,7 @@ class Px4:
         self._world = world
         # nose up and 2 m/s fast
         odometry, airspeed = (
-            fill(types.VehicleOdometry(), RATES["px4"]),
+            fill(types.VehicleOdometry(q=[1.0, 0.0, 0.0, 0.0]), RATES["px4"]),
             fill(types.AirspeedValidated(), AIRSPEED["px4"]),
         )
         self._status = types.VehicleStatus(arming_state=self.ARMED, nav_state=self.HOLD)
