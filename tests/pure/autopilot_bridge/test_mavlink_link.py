@@ -604,7 +604,7 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
         made._refused,
     )
     assert "the autopilot has started without the time" in made._refused
-    # a replay: the true sender goes on, and nobody is refused
+    # a replay: the true sender goes on, and no problem is told
     signing.timestamp += 1200 * 100_000
     until(lambda: len(queue) > 2, peer.beat)
     assert "signed" not in made.problem()

@@ -27,9 +27,9 @@ LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
 versions had none."""
 
-TILTED = math.radians(10.0)
-TILTED_TIME = 0.1
-"""rad and s. A multicopter beyond its largest tilt by as much for as long does not follow."""
+TILTED = math.radians(8.0)
+"""A multicopter beyond its largest tilt by as much does not follow: a step of the command to the
+largest tilt, 30 deg, overshoots by 1 deg."""
 
 STALE_TIME = 2.0
 """The same for a pose older than its limit, s."""
@@ -117,7 +117,7 @@ class Notices:
         largest_tilt: float = math.inf,
     ) -> None:
         self._largest_tilt = largest_tilt
-        self._tilted = _Lasting(TILTED_TIME)
+        self._tilted = _Lasting(0.0)
         self._reach = reach
         self._authority = Authority()
         self._reached = ""
