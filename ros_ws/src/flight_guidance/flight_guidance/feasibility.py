@@ -74,7 +74,7 @@ def flyable(
     times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a
     leg too short for the fillets. phi_max is the largest bank at V for the stall speed.
     """
-    _require_bounds(waypoints, can)
+    require_bounds(waypoints, can)
     flown = speeds(waypoints, can.speed)
     least = 0.0
     slowest = 0.0
@@ -89,6 +89,41 @@ def flyable(
     ]
     remaining, notes = _without_short_legs(named, radius, least)
     return _with_circles(dict(remaining), notes, radius, least, can)
+
+
+def as_route(
+    legs: tuple[Leg, ...],
+    waypoints: Sequence[Waypoint],
+    speed: float,
+    *,
+    slopes: bool,
+    notes: tuple[str, ...] = (),
+) -> Route:
+    """The route of legs through waypoints. `speed`: m/s where no waypoint names one.
+
+    A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the
+    altitude at its waypoint.
+    """
+    flown = speeds(waypoints, speed)
+    numbers = path.leads(legs)
+    before = [max(k - 1, 0) for k in numbers]
+    altitude = []
+    departures = []
+    for leg, to, start in zip(legs, numbers, before, strict=True):
+        orbit = path.is_orbit(leg)
+        departures.append(waypoints[to].altitude if orbit else waypoints[start].departure)
+        end = waypoints[to].departure if orbit else waypoints[to].altitude
+        is_fillet = not isinstance(leg, Line) and not orbit
+        altitude.append(departures[-1] if is_fillet and slopes else end)
+    return Route(
+        legs,
+        tuple(altitude),
+        tuple(flown[k] for k in numbers),
+        tuple(departures),
+        tuple(flown[k] for k in before),
+        slopes,
+        notes,
+    )
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[Leg, ...]:
@@ -205,7 +240,7 @@ def _with_circles(
             return FlyableRoute(legs, tuple(waypoints), tuple(sentences))
 
 
-def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
+def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
     """Raise ParameterError for a waypoint, an altitude or an airspeed out of bounds."""
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]

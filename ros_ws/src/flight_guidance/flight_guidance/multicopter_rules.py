@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from flight_core.parameters import require
 from flight_core.units import GRAVITY
 from flight_guidance import path, reach
-from flight_guidance.feasibility import speeds
-from flight_guidance.guidance_state import LARGEST, MulticopterParams
+from flight_guidance.feasibility import Performance, as_route, require_bounds, speeds
+from flight_guidance.guidance_state import MulticopterParams
 from flight_guidance.path import Arc, Route
 from flight_guidance.route_file import Waypoint
 
@@ -52,51 +52,24 @@ def gains(
 
 
 def route_through(
-    waypoints: Sequence[Waypoint],
-    speed: float,
-    radius: float | None,
-    braking: float,
-    bounds: tuple[float, float, float],
+    waypoints: Sequence[Waypoint], radius: float | None, braking: float, can: Performance
 ) -> Route:
     """Lines with fillets through waypoints, and a hover at the last one: its leg is a circle of the
     radius of the fillets within which the place counts as reached.
 
-    `speed`: over ground where a waypoint names none, m/s; `bounds`: least and largest altitude, m,
-    and largest speed, m/s. Altitudes change along the lines. Raises ParameterError for a waypoint
-    beyond the bounds, and for circles and waits, which a multicopter does not fly.
+    Altitudes change along the lines. `braking`, m/s^2, bounds the curvature. Raises ParameterError
+    for a waypoint beyond the bounds, and for circles and waits, which a multicopter does not fly.
     """
-    lowest, highest, fastest = bounds
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
-    flown = speeds(waypoints, speed)
-    for k, (waypoint, fast) in enumerate(zip(waypoints, flown, strict=True)):
-        key = f"route[{k}]"
-        known = max(abs(waypoint.north), abs(waypoint.east)) <= LARGEST
-        place = f"north {waypoint.north:g}, east {waypoint.east:g} m"
-        require(known, key, place, f"finite values, at most {LARGEST:g} m either way")
-        fits = lowest <= waypoint.altitude <= highest
-        expected = f"{lowest:g} to {highest:g} m"
-        require(fits, f"{key}.altitude", f"{waypoint.altitude:g} m", expected)
-        require(fast <= fastest, f"{key}.V", f"{fast:g} m/s", f"at most {fastest:g} m/s")
-        circles = waypoint.loiters or waypoint.departure != waypoint.altitude
-        expected = "none: a multicopter hovers at the last waypoint alone"
-        require(not circles, key, "turns, a wait or a leave", expected)
-    least = max(flown) ** 2 / braking
-    radius = radius or float(math.ceil(10.0 * least) / 10.0)
-    expected = f"at least {least:.1f} m at {max(flown):g} m/s"
+    require_bounds(waypoints, can)
+    expected = "none: a multicopter hovers at the last waypoint alone"
+    for k, waypoint in enumerate(waypoints):
+        require(not waypoint.loiters, f"route[{k}]", "turns, a wait or a leave", expected)
+    fastest = max(speeds(waypoints, can.speed))
+    least = fastest**2 / braking
+    radius = radius or math.ceil(10.0 * least) / 10.0
+    expected = f"at least {least:.1f} m at {fastest:g} m/s"
     require(radius >= 0.99 * least, "radius", f"{radius:g} m", expected)
     points = [waypoint.point for waypoint in waypoints]
     legs = (*path.filleted(points, radius), Arc(points[-1], radius))
-    numbers = path.leads(legs)
-    before = [max(k - 1, 0) for k in numbers]
-    ends = []
-    for leg, to, start in zip(legs, numbers, before, strict=True):
-        level = isinstance(leg, Arc) and leg.end is not None
-        ends.append(waypoints[start if level else to].altitude)
-    return Route(
-        legs,
-        tuple(ends),
-        tuple(flown[k] for k in numbers),
-        tuple(waypoints[k].altitude for k in before),
-        tuple(flown[k] for k in before),
-        slopes=True,
-    )
+    return as_route(legs, waypoints, can.speed, slopes=True)

@@ -28,7 +28,7 @@ from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from flight_guidance import multicopter_rules, protection, reach
 from flight_guidance.attitude import AttitudeParams
-from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
+from flight_guidance.feasibility import Performance, as_route, flyable, require_inside, speeds
 from flight_guidance.fence import MARGIN, Motion, room_at_home
 from flight_guidance.guidance_state import (
     MULTICOPTER,
@@ -42,7 +42,7 @@ from flight_guidance.landing import Lander, Landing, landing_at
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.multicopter_rules import route_through
 from flight_guidance.notices import Notices
-from flight_guidance.path import Arc, Route, is_orbit, leads
+from flight_guidance.path import Route
 from flight_guidance.route_file import Waypoint
 from flight_guidance.sections import HomeConfig, LandingConfig, RouteConfig, Steps, ZoneConfig
 from flight_guidance.targets import reach_sentence, read_target
@@ -495,9 +495,11 @@ class GuidanceConfig(NodeConfig):
         if self.drag is None:
             route = self._airplane_route(waypoints)
         else:
-            bounds = (*self._altitudes(), self._largest_speed())
+            no_limits = (0.0,) * 4  # of roll, climb, sink and wind
+            bounds = (self._largest_speed(), *self._altitudes())
+            can = Performance(self.speed, 0.0, self.bank, *no_limits, *bounds)
             braking = self._gains(self.drag).braking
-            route = route_through(waypoints, self.speed, self.radius, braking, bounds)
+            route = route_through(waypoints, self.radius, braking, can)
         if (fence := self.fence_zones()) is not None:
             require_inside(route, fence, max(map(self.fence_margin, route.V)))
         return route
@@ -534,30 +536,7 @@ class GuidanceConfig(NodeConfig):
             self.period or self.least_period(),
             can,
         )
-        flown = speeds(waypoints, self.speed)
-        numbers = leads(legs)
-        # A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes
-        # the altitude at its waypoint.
-        before = [max(k - 1, 0) for k in numbers]
-        slopes = self.profile == "slope"
-        altitude = []
-        departures = []
-        for leg, to, start in zip(legs, numbers, before, strict=True):
-            fillet = isinstance(leg, Arc) and not is_orbit(leg)
-            departures.append(
-                waypoints[to].altitude if is_orbit(leg) else waypoints[start].departure
-            )
-            end = waypoints[to].departure if is_orbit(leg) else waypoints[to].altitude
-            altitude.append(departures[-1] if fillet and slopes else end)
-        return Route(
-            legs,
-            tuple(altitude),
-            tuple(flown[k] for k in numbers),
-            tuple(departures),
-            tuple(flown[k] for k in before),
-            slopes,
-            notes,
-        )
+        return as_route(legs, waypoints, self.speed, slopes=self.profile == "slope", notes=notes)
 
     def landing_on(self, route: Route) -> Landing | None:
         """The landing at the end of a line of a route; None without one.
