@@ -182,10 +182,10 @@ class Notices:
                 f"{wind:.1f} m/s"
             )
         if self._strong.due(t, holds=wind > largest):
-            consequence = (
-                f"above {largest:.1f} m/s circles of the least radius take more than "
-                "the largest bank"
-            )
+            lacks = "circles of the least radius take more than the largest bank"
+            if self._largest_tilt < math.inf:
+                lacks = "the largest tilt does not hold the speed"
+            consequence = f"above {largest:.1f} m/s {lacks}"
             texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {consequence}")
         return [Notice(t, text) for text in texts]
 
