@@ -112,6 +112,24 @@ def test_line_captured_without_overshoot() -> None:
     assert beyond < 0.5
 
 
+def test_flying_wing_without_rudder_flies_route() -> None:
+    """The X8 has elevons and a throttle: r follows the bank."""
+    wing = find_scenario("x8_elevons").vary(
+        flight={"duration": 32.0},
+        aircraft={"kinematics": "euler", "gusts": {}},
+        reference_model={"pulses": {}, "live": {"speed": 18.0}},
+        guidance={},
+    )
+    places = ((0.0, 0.0), (225.0, 0.0), (225.0, 225.0), (0.0, 225.0))
+    tape = simulate(with_route(wing, [Waypoint(north, east, 0.0) for north, east in places]))
+    leg, xtrack, beta = channels(tape["guidance"], "leg", "xtrack", "pose.beta")
+    assert np.unique(leg).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert np.abs(xtrack).max() < 0.5 * 18.0  # half a second of flight, the claim in wind
+    assert np.degrees(np.abs(beta).max()) < 5.0  # the sideslip that no rudder takes away
+    with refusing("found r, expected some of phi"):
+        wing.vary(guidance={"program": program(phi=0.1, r=0.05)})
+
+
 def test_small_corner_flown_with_small_bank() -> None:
     """A corner of half a degree takes a bank of about a degree."""
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the

@@ -92,7 +92,7 @@ def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     assert np.abs(model.sample(8000)).max() < 1e-6
 
 
-@pytest.mark.parametrize("outputs", [["q", "V", "p"], ["pitch", "V", "p", "r"]])
+@pytest.mark.parametrize("outputs", [["q", "p", "r"], ["pitch", "V", "p", "r"]])
 def test_levelling_needs_the_rates_and_the_speed(outputs: list[str]) -> None:
     n = len(outputs)
     section = SECTION | {
@@ -103,6 +103,19 @@ def test_levelling_needs_the_rates_and_the_speed(outputs: list[str]) -> None:
         ReferenceModelConfig.validate_mapping(
             section | {"live": {"speed": 25.0}}, "reference_model"
         )
+
+
+def test_wings_are_levelled_without_rudder() -> None:
+    section = SECTION | {
+        "outputs": ["q", "V", "p"],
+        "second_order": {"natural_frequency": [4.0, 0.5, 5.0], "damping": [0.9, 1.0, 0.9]},
+        "live": {"speed": 25.0},
+    }
+    model = Reference(ReferenceModelConfig.validate_mapping(section, "reference_model"))
+    model.take(0, np.zeros(3), np.array([0.4, 0.0]))
+    rolled = sum(model.sample(k)[2] for k in range(2000)) / RATE  # 10 s
+    # phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)), and theta stays small
+    assert rolled == pytest.approx(-0.4, abs=0.02)
 
 
 def test_in_lockstep_u_m_comes_at_instants_of_reference() -> None:

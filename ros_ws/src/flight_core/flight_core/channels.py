@@ -7,6 +7,9 @@ from collections.abc import Sequence
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
+WITHOUT_RUDDER = RATES_AND_SPEED[:3]
+"""Those of an aircraft without rudder, such as a flying wing: r follows the bank."""
+
 VERTICAL = {"vertical_speed": 1.0, "w": -1.0}
 """Channels that a multicopter has in place of V, with the climb in m/s by 1 m/s of the channel."""
 

@@ -138,7 +138,7 @@ class Lander:
             return self._go_around(pose, route)
         ahead = height + self._params.vertical.alpha_time * pose["climb"]
         given = {"climb": flare_climb(ahead, path_sink, landing), "V": landing.V}
-        if height > landing.decrab:
+        if height > landing.decrab or "r" not in self._params.outputs:
             return given
         return given | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 

@@ -136,14 +136,17 @@ def follow(
 
     `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered`
     holds for the position a mean lag ahead. The mean lag of a change of the bank d is abs(d) / (2
-    p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
+    p_max) + 1 / (2 k_phi), a ramp, then the loop of the bank; without rudder and the lag of the
+    turn behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
     change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(
         ground_speed**2 * -error.curvature / GRAVITY
     )
-    lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
+    attitude = params.attitude
+    lag = abs(change) / (2.0 * attitude.roll_rate) + 0.5 / attitude.k_phi
+    lag = lag + max(params.turn_lag - attitude.turn_lead, 0.0)
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
     error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
     acceleration = path_acceleration(error, course, ground_speed, params.path) + slip

@@ -15,7 +15,7 @@ from operator import or_
 from typing import Any
 
 from flight_core.channels import POSE
-from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
+from flight_core.kinematics import clip, euler_rates, heading_rate, tilt, turn_rate
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
@@ -131,6 +131,11 @@ def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
     return array_namespace(V).maximum(params.speed + V, params.speed / 2.0)
 
 
+def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
+    """The measured r, or that of a coordinated turn for an aircraft without rudder, rad/s."""
+    return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
+
+
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, Commands]:
@@ -231,7 +236,8 @@ def command(
     V_wanted = permitted_speed(V_asked, params)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 
-    rates = _wanted_rates(state, pose, y["r"], phi_c, theta_c, speed, params)
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    rates = _wanted_rates(state, pose, r, phi_c, theta_c, speed, params)
     wanted = {"V": V_c - params.speed, **rates._asdict()}
     u_m = tuple(
         wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)
@@ -262,7 +268,8 @@ def _with_estimates(
     """The state with new estimates of the angle of attack, the slip and the wind."""
     alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
     turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
-    flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    flown = speed * heading_rate(state.phi, state.theta, y["q"], r)
     rolling = abs(y["p"]) / params.attitude.roll_rate
     slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
     return state._replace(
@@ -296,11 +303,12 @@ def _with_attitude(
         lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
         state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
         since = dt
-    p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
-    phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
+    y = dict(zip(params.outputs, inputs.y, strict=True))
+    r = yaw_rate(y, state.phi, state.theta, airspeed(inputs.y, params))
+    phi_dot, theta_dot = euler_rates(state.phi, state.theta, y["p"], y["q"], r)
     phi = state.phi + since * phi_dot
     theta = state.theta + since * theta_dot
-    psi_dot = heading_rate(state.phi, state.theta, q, r)
+    psi_dot = heading_rate(state.phi, state.theta, y["q"], r)
     measured = pose["psi"] + since * psi_dot if state.mode is Mode.ENGAGED else None
     psi = heading_estimate(state.psi, measured, psi_dot, dt)
     return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
@@ -318,7 +326,8 @@ def motion_of(
     """
     bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
     lag = 0.5 / params.attitude.k_phi
-    phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], y["r"])
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], r)
     return Motion(
         pose["north"],
         pose["east"],

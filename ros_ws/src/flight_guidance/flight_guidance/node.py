@@ -28,6 +28,7 @@ from flight_core.vectors import ChannelError, StampedVector, select
 from flight_guidance import path
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Mode
+from flight_guidance.modes import yaw_rate
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY as AUTHORITY_CHANNELS
@@ -360,7 +361,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(placed.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
-        for key, value in zip("xyz", (y["p"], -y["q"], -y["r"]), strict=True):
+        r = yaw_rate(y, pose["phi"], pose["theta"], self.parameters.speed + y["V"])
+        for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message
 

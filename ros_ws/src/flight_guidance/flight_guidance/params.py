@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from flight_core.channels import RATES_AND_SPEED, vertical
+from flight_core.channels import RATES_AND_SPEED, WITHOUT_RUDDER, vertical
 from flight_core.fields import Field
 from flight_core.parameters import (
     Names,
@@ -63,6 +63,10 @@ ALPHA_TIME = 2.0
 TURN_LEAD = 2.4
 """r leads the bank by this over the frequency of the reference model of r: 1.8 is the lag of the
 model with a damping of 0.9, the rest that of the sideslip in a roll of the osprey."""
+
+RUDDERLESS = 1.5
+"""Factor on the period without rudder: no lead makes up for the lag of the turn. The X8 cycled with
+the period of an aircraft with rudder, and not with 1.4 times that."""
 
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
@@ -188,10 +192,11 @@ class GuidanceConfig(NodeConfig):
         climbs = vertical(self.outputs)
         expected = ("p", "q", "r", climbs) if climbs else RATES_AND_SPEED
         require(
-            sorted(self.outputs) == sorted(expected),
+            sorted(self.outputs) == sorted(expected)
+            or (not climbs and sorted(self.outputs) == sorted(WITHOUT_RUDDER)),
             "outputs",
             ", ".join(self.outputs),
-            ", ".join(RATES_AND_SPEED),
+            f"{', '.join(RATES_AND_SPEED)}, or without r",
         )
         drag = "g tan(tilt) / V of a steady flight, 1/s" if climbs else "none: an airspeed is flown"
         require((self.drag is not None) == bool(climbs), "drag", self.drag, drag)
@@ -353,7 +358,8 @@ class GuidanceConfig(NodeConfig):
 
     def least_period(self) -> float:
         """Least period of path following, s."""
-        return least_period(self.speed, self.bank, self.largest_roll_rate())
+        lag = 1.0 if "r" in self.outputs else RUDDERLESS
+        return lag * least_period(self.speed, self.bank, self.largest_roll_rate())
 
     def least_radius(self) -> float:
         """Least radius of fillets and orbits, m."""
@@ -395,12 +401,14 @@ class GuidanceConfig(NodeConfig):
         floor, (climb, sink) = self._floor(), self.climb_limits()
         roll = frequency["p"] / 4.0
         pitch = frequency["q"] / 4.0
+        yaw = frequency.get("r", frequency["p"])  # without rudder the turn follows the roll
+        lead = TURN_LEAD / yaw if "r" in frequency else 0.0
         turn = GRAVITY * math.tan(self.bank) / self.speed
         roll_rate = self.largest_roll_rate()
         slew = {
             "p": frequency["p"] * roll_rate,
             "q": frequency["q"] * (self.load * GRAVITY / self.speed + turn * math.sin(self.bank)),
-            "r": frequency["r"] * turn,
+            "r": yaw * turn,
             "V": 0.25 * frequency["V"],
         }
         return GuidanceParams(
@@ -408,9 +416,7 @@ class GuidanceConfig(NodeConfig):
             period_ns=period_ns(self.rate, "rate"),
             speed=self.speed,
             k_chi=roll / 3.5,
-            attitude=AttitudeParams(
-                roll, pitch, roll_rate, self.load, 20.0, self.k_beta(), TURN_LEAD / frequency["r"]
-            ),
+            attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta(), lead),
             vertical=self._vertical(climb, sink),
             path=PathParams(self.period or self.least_period(), self.damping, self.capture),
             limits=Limits(
@@ -426,7 +432,7 @@ class GuidanceConfig(NodeConfig):
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
-            turn_lag=2.0 / frequency["r"],
+            turn_lag=2.0 / yaw,
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),

@@ -110,12 +110,13 @@ def read_target(
     channels = params.channels
     lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
     vertical_modes = {mode for name, mode in channels.vertical.items() if name in values}
-    unknown = [name for name in values if name not in channels.known()]
+    commanded = [name for name in channels.known() if name != "r" or "r" in params.outputs]
+    unknown = [name for name in values if name not in commanded]
     if unknown or not values:
         raise ChannelError(
             "name",
             f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
-            f"{', '.join(channels.known())}",
+            f"{', '.join(commanded)}",
         )
     if len(lateral_modes) > 1 or len(vertical_modes) > 1:
         raise ChannelError(

@@ -25,8 +25,8 @@ class LiveParams(NamedTuple):
     reach: FloatArray  # (m,) largest changes of u_m from step to step
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
     channels: (
-        tuple[int, int, int, int] | None
-    )  # places of q, V, p, r in u_m; None where one is missing
+        tuple[int, int, int, int | None] | None
+    )  # places of q, V, p, r in u_m, of r None without rudder; None where another one is missing
     gain: tuple[float, float]  # of bank and of pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
 
@@ -72,14 +72,16 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
         or params.speed is None
     ):
         return np.zeros_like(live.u_m)
-    at_q, at_v, at_p, at_r = params.channels
+    at_q, _, at_p, at_r = params.channels
     phi, theta = map(tilt, live.attitude)
     phi_dot = min(max(-params.gain[0] * phi, -params.roll_rate), params.roll_rate)
     theta_dot = -params.gain[1] * theta
-    r = turn_rate(phi, theta, theta_dot, max(params.speed + float(y_m[at_v]), params.speed / 2.0))
+    r = _turn(phi, theta, theta_dot, y_m, params)
     p, q = body_rates(phi, theta, phi_dot, theta_dot, r)
     u_m = failsafe_scale(silent_ns, 0, params.levelling_ns) * live.u_m
-    u_m[[at_q, at_p, at_r]] = q, p, r
+    u_m[[at_q, at_p]] = q, p
+    if at_r is not None:
+        u_m[at_r] = r
     return u_m
 
 
@@ -87,13 +89,21 @@ def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams)
     """The state a period later: the attitude moves by Euler's equations with the reference rates,
     as the law tracks them.
     """
-    if live.attitude is None or params.channels is None:
+    if live.attitude is None or params.channels is None or params.speed is None:
         return live
     at_q, _, at_p, at_r = params.channels
     p = float(y_m[at_p])
     q = float(y_m[at_q])
-    r = float(y_m[at_r])
     dt = seconds(period_ns)
     phi, theta = live.attitude
+    r = _turn(phi, theta, 0.0, y_m, params) if at_r is None else float(y_m[at_r])
     phi_dot, theta_dot = euler_rates(phi, theta, p, q, r)
     return live._replace(attitude=(phi + dt * phi_dot, theta + dt * theta_dot))
+
+
+def _turn(phi: float, theta: float, theta_dot: float, y_m: FloatArray, params: LiveParams) -> float:
+    """R of a coordinated turn at the airspeed V0 + V_m, rad/s."""
+    if params.channels is None or params.speed is None:
+        return 0.0
+    speed = max(params.speed + float(y_m[params.channels[1]]), params.speed / 2.0)
+    return float(turn_rate(phi, theta, theta_dot, speed))

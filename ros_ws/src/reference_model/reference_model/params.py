@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from flight_core import parameters
-from flight_core.channels import RATES_AND_SPEED, vertical
+from flight_core.channels import WITHOUT_RUDDER, vertical
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
@@ -155,10 +155,10 @@ class ReferenceModelConfig(NodeConfig):
                 name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}"
             )
         self._check_model()
-        missing = [name for name in RATES_AND_SPEED if name not in self.outputs]
+        missing = [name for name in WITHOUT_RUDDER if name not in self.outputs]
         levels = self.live.speed is None or (not missing and self.second_order is not None)
         expected = (
-            f"none: wings are levelled by {', '.join(RATES_AND_SPEED)} of a second_order model"
+            f"none: wings are levelled by {', '.join(WITHOUT_RUDDER)} of a second_order model"
         )
         require(levels, "live.speed", self.live.speed, expected)
 
@@ -249,7 +249,8 @@ class ReferenceModelConfig(NodeConfig):
         if climbs and {"p", "q", "r"} <= {*self.outputs}:
             speed = math.inf  # a multicopter levels without a turn
         if speed is not None and self.second_order is not None:
-            q, V, p, r = (self.outputs.index(name) for name in ("q", climbs or "V", "p", "r"))
+            q, V, p = (self.outputs.index(name) for name in ("q", climbs or "V", "p"))
+            r = self.outputs.index("r") if "r" in self.outputs else None
             channels = (q, V, p, r)
             frequency = self.second_order.natural_frequency
             gain = (frequency[p] / 4.0, frequency[q] / 4.0)

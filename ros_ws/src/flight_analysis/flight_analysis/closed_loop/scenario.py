@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.arguments import FilePath, as_instance, as_path
-from flight_core.channels import RATES_AND_SPEED, VERTICAL, vertical
+from flight_core.channels import RATES_AND_SPEED, VERTICAL, WITHOUT_RUDDER, vertical
 from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, is_file, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
@@ -263,12 +263,13 @@ def guidance_by_rule(
             f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot"
         )
     climbs = vertical(reference.outputs)
-    missing = [name for name in RATES_AND_SPEED if name not in (*reference.outputs, climbs and "V")]
+    needed = [name for name in RATES_AND_SPEED if name != "V"] if climbs else WITHOUT_RUDDER
+    missing = [name for name in needed if name not in reference.outputs]
     require(
         not missing,
         "guidance",
         f"an aircraft without {', '.join(missing)}",
-        f"one with {', '.join(RATES_AND_SPEED)}, or {' or '.join(VERTICAL)} in place of V",
+        f"one with {', '.join(WITHOUT_RUDDER)}, or p, q, r and {' or '.join(VERTICAL)}",
     )
     values: dict[str, Any] = {
         "outputs": reference.outputs,

@@ -4,7 +4,8 @@
 oscillates, or one that grows. Limits keep all three bounded, and such a flight reaches its end.
 
 - Of the ticks of WINDOW, SATURATED or more have u of an input at a limit, SIDE or more on either
-  side of u_free. A climb at full throttle stays on one side.
+  side of u_free. A climb at full throttle stays on one side. A limit of the rate does not count:
+  noise reaches the rate of a slow engine to either side.
 - e repeats itself over WINDOW, `divergence.period`, with a mean square above `divergence.least`: a
   limit cycle, also of actuators whose limits the controller does not have.
 - The mean square of e over the last WINDOW is above FACTOR^2 times the largest before, and above
@@ -47,7 +48,7 @@ def _between_limits(tape: Tape) -> list[str]:
     u_free = tape["internals"].group("u_free")
     parts = []
     for name in sorted({*limited.names} & {*u.names} & {*u_free.names}, key=limited.names.index):
-        at_limit = limited[name] != Saturation.NO
+        at_limit = limited[name] == Saturation.MAGNITUDE
         above = at_limit & (u_free[name] > u[name])
         below = at_limit & (u_free[name] < u[name])
         share_above = _windowed(limited, above)
