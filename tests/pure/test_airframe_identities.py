@@ -5,11 +5,13 @@ python-control and wrong files.
 """
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import control
 import numpy as np
 import pytest
+import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import refusing
 
@@ -18,43 +20,10 @@ from flight_core.parameters import ParameterError
 from flight_core.units import in_si, quantity, si_per_unit
 from flight_design.gains.airframe_properties import airframe_facts, output_coordinates
 
-NAVION: dict[str, Any] = {
-    "name": "plane",
-    "source": "R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), p. 158, in SI",
-    "speed": 53.64,
-    "states": {"V": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
-    "inputs": {
-        "elevator": {"unit": "rad", "positive": "nose down"},
-        "thrust": {"unit": "1", "positive": "more thrust"},
-    },
-    "outputs": ["q", "V"],
-    "A": [
-        [-0.045, 0.036, 0.0, -9.81],
-        [-0.369, -2.02, 53.64, 0.0],
-        [0.0062, -0.130, -2.948, 0.0],
-        [0.0, 0.0, 1.0, 0.0],
-    ],
-    "B": [[0.0, 9.81], [-8.586, 0.0], [-11.044, 0.0], [0.0, 0.0]],
-}
-F4C: dict[str, Any] = {
-    "name": "f4c",
-    "source": "lateral F-4C of M. V. Cook, Flight Dynamics Principles, example 4.3",
-    "speed": 178.0,
-    "states": {"v": "m/s", "p": "rad/s", "r": "rad/s", "phi": "rad", "psi": "rad"},
-    "inputs": {
-        "aileron": {"unit": "rad", "positive": "roll right"},
-        "rudder": {"unit": "rad", "positive": "nose left"},
-    },
-    "outputs": ["p", "r"],
-    "A": [
-        [-0.0565, 29.072, -175.610, 9.6783, 0.0],
-        [-0.0601, -0.7979, 0.2996, 0.0, 0.0],
-        [0.0093, -0.0179, -0.1339, 0.0, 0.0],
-        [0.0, 1.0, 0.1655, 0.0, 0.0],
-        [0.0, 0.0, 1.0136, 0.0, 0.0],
-    ],
-    "B": [[-0.2678, 2.0092], [4.6982, 0.7703], [0.0887, -1.3575], [0.0, 0.0], [0.0, 0.0]],
-}
+PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(
+    Path(__file__).with_name("published_airframes.yaml").read_text()
+)
+NAVION, F4C = PUBLISHED.values()
 
 
 def airframe(values: Mapping[str, Any]) -> Airframe:
