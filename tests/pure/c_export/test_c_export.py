@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import typer
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.conftest import refusing
@@ -241,110 +242,9 @@ def test_proof_of_another_machine(case: Case) -> None:
         export("osprey_servo", case.code, runner="qemu-of-nothing")
 
 
-MUTANTS: dict[str, tuple[str, str]] = {
-    "lesser": ("return (a < b) ? a : b;", "return (a > b) ? a : b;"),
-    "greater": ("return (a > b) ? a : b;", "return a;"),
-    "clipped": ("(value <= low) ? low : value", "value"),
-    "is_equal": ("(a <= b) && (a >= b)", "(a <= b)"),
-    "magnitude": ("(a < ZERO) ? -a : a", "a"),
-    "rounded": ("(a + ROUNDING) - ROUNDING", "(a + (ONE / TWO) + ROUNDING) - ROUNDING"),
-    "seconds": (
-        "(rise_di_real)time_ns / NANOSECONDS",
-        "(rise_di_real)time_ns * (ONE / NANOSECONDS)",
-    ),
-    "elapsed_ns": ("(later_ns > earlier_ns) ?", "(later_ns < earlier_ns) ?"),
-    "copy": ("to[i] = from[i];", "to[i] = from[0];"),
-    "fill": ("values[i] = value;", "values[i] = value + ONE;"),
-    "is_finite": ("bool finite = true;", "bool finite = false;"),
-    "product": ("int32_t j = 1; j < columns; j++", "int32_t j = columns - 1; j > 0; j--"),
-    "product_transposed": ("(j * columns) + i", "(j * columns) + (columns - 1 - i)"),
-    "least": ("before - reach);", "before + reach);"),
-    "largest": ("before + reach);", "upper);"),
-    "saturate": ("largest(limits->upper[i], before, reach)", "limits->upper[i]"),
-    "control": (
-        "(after->e[i] - after->e_0[i]) + integral",
-        "(after->e[i] + integral) - after->e_0[i]",
-    ),
-    "engage_law": ("law->Pi[i] = ZERO;", "law->Pi[i] = law->e[i];"),
-    "step_law": ("(dt * (e + before->e[i])) / TWO", "dt * e"),
-    "limit_law": ("magnitude(beyond) - (outward ? magnitude(change) : ZERO)", "magnitude(beyond)"),
-    "retune_law": (
-        "control(old, old_scale, law, law, i)",
-        "control(next, next_scale, law, law, i)",
-    ),
-    "target_scale": ("(ratio * ratio)", "ratio"),
-    "scheduled": ("p->input_scale[i] * law->scale[i]", "p->input_scale[i]"),
-    "follow_schedule": ("lesser(dt / p->time, ONE)", "(dt / p->time)"),
-    "predict": ("u[i] - u_trim[i]", "u[i]"),
-    "start_estimates": ("law->sigma = ZERO;", "law->sigma = ONE;"),
-    "correct": ("lesser(law->sigma + (dt * p->fade_rate), ONE)", "ONE"),
-    "same_values": ("same && is_equal(a[i], b[i])", "same"),
-    "same_model": ("same_values(a->F, b->F", "same_values(a->F, a->F"),
-    "sine": (
-        "(k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW)",
-        "(k * (RISE_DI_PI_HIGH + RISE_DI_PI_LOW)))",
-    ),
-    "sines": ("sine(x[i]) : ZERO", "x[i] : ZERO"),
-    "drift": ("linear[i] + pulled[i]", "linear[i] - pulled[i]"),
-    "slope": ("x_dot[i] + forced[i]", "x_dot[i]"),
-    "stage": ("x[i] + (dt * k[i])", "x[i]"),
-    "engage_feedforward": ("state->ticks = ZERO;", "state->ticks = ONE;"),
-    "step_feedforward": (
-        "(k1[i] + (TWO * k2[i])) + (TWO * k3[i])",
-        "k1[i] + (TWO * (k2[i] + k3[i]))",
-    ),
-    "engage_all": ("engage_law(law, y, y_m);", "engage_law(law, y_m, y);"),
-    "tick_law": ("u_trim[i] + begin.u_o[i]", "u_trim[i] - begin.u_o[i]"),
-    "is_inside": ("inside && (u[j] >= low[j])", "(u[j] >= low[j])"),
-    "pass_on": ("inside = false;\n                for", "for"),
-    "moved": ("(part * move[j])", "move[j]"),
-    "take_inside": ("(raised > high[j]) ? high[j] : raised", "low[j]"),
-    "part_of": ("(step > magnitude(room))", "(step < magnitude(room))"),
-    "towards": ("part_of(u[j] - low[j], -step)", "ONE"),
-    "add_by_priority": ("(int32_t)p->order[k]", "k"),
-    "allocate": (
-        "product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);",
-        "copy(change, rest, RISE_DI_P);",
-    ),
-    "reached": ("(u_free[i] < u[i]) ? u[i] : -REAL_MAX", "-REAL_MAX"),
-    "sample_at": ("samples->newest - back", "samples->newest"),
-    "rise_di_append": ("samples->newest + 1)", "samples->newest + 2)"),
-    "align": (">= (uint64_t)p->slope_ns", ">= 1U"),
-    "failsafe_scale": ("silence_ns <= hold_ns", "silence_ns < ((hold_ns * 9) / 10)"),
-    "log_inputs": ("output->dt = dt;", "output->dt = offset;"),
-    "failsafe": ("c->hold_ns = active ? p->hold_ns : 0;", "c->hold_ns = p->hold_ns;"),
-    "engage": ("copy(c->u, c->u_trim, RISE_DI_M);", "fill(c->u_trim, RISE_DI_M, ZERO);"),
-    "step": ("clipped(measured, p->dt_least, p->dt_largest)", "lesser(measured, p->dt_largest)"),
-    "is_fresh": (
-        "elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns",
-        "elapsed_ns(stamp_ns, now_ns) == 0U",
-    ),
-    "are_numbers": ("return is_finite(sum, RISE_DI_M);", "return true;"),
-    "any": ("bool result = false;", "bool result = true;"),
-    "rise_di_guard_tick": ("y->stamp_ns <= c->y_stamp_ns", "y->stamp_ns < c->y_stamp_ns"),
-    "rise_di_start": ("fill(controller->u, RISE_DI_M, ZERO);", ""),
-    "from_bits": ("(rise_di_real)number.value", "ZERO"),
-    "is_rounded_once": (
-        "is_equal(rounded(ONE - (rise_di_real)part), ONE)",
-        "is_equal(rounded((rise_di_real)part), ONE)",
-    ),
-    "is_nan_told": ("(!is_finite(special, 3))", "is_finite(special, 3)"),
-    "checked": ("(uint64_t)c->parameters->max_age_ns", "0U"),
-    "is_near": ("greater(RISE_DI_TIMES * c->change[i], p->y_reach[i])", "p->y_reach[i]"),
-    "compared": ("c->agreeing + 1", "c->agreeing + 2"),
-    "rise_di_take_y": ("&controller->y_samples", "&controller->y_m_samples"),
-    "rise_di_take_y_m": ("&controller->y_m_samples", "&controller->y_samples"),
-    "rise_di_tick": ("<= period_ns", "== 0U"),
-    "rise_di_command": ("controller->effectors", "controller->effectors_failsafe"),
-    "rise_di_retune": ("c->parameters = parameters;", "(void)parameters;"),
-    "rise_di_restart": ("controller->mode = RISE_DI_WAITING;", ""),
-    "rise_di_reference_start": (
-        "fill(reference->x_m, RISE_DI_R, ZERO);",
-        "fill(reference->x_m, RISE_DI_R, ONE);",
-    ),
-    "rise_di_take_u_m": ("reference->parameters->bounds[i]", "REAL_MAX"),
-    "rise_di_reference_step": ("before + p->reach[i]", "REAL_MAX"),
-}
+MUTANTS: dict[str, tuple[str, str]] = yaml.safe_load(
+    Path(__file__).with_name("mutants.yaml").read_text()
+)
 """Of each function of rise_di.c: a text of its body and what a mutant has instead."""
 
 FUNCTION = re.compile(
