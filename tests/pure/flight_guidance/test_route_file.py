@@ -103,16 +103,8 @@ def test_plane_errs_by_4_m() -> None:
     [
         (".geojson", line()),
         (".json", {"type": "Feature", "properties": None, "geometry": line()}),
-        (
-            ".geojson",
-            {
-                "type": "FeatureCollection",
-                "features": [point([0.0, 0.0, 0.0]), {"geometry": line()}],
-            },
-        ),
         (".geojson", {"type": "FeatureCollection", "features": [point(each) for each in SQUARE]}),
         (".KML", kml(KML_POINTS)),
-        (".kml", kml(KML_LINE + KML_POINTS)),
         (
             ".yaml",
             {

@@ -92,19 +92,20 @@ class Notices:
     """
 
     CHANNELS = (
-        *(
-            "leg",
-            "missed",
-            "mode.lateral",
-            "track",
-            "V_c",
-            "pose.v_north",
-            "pose.v_east",
-            "wind.north",
-            "wind.east",
-        ),
-        *("fence.action", "fence.clearance", "age.pose"),
-        *("pose.phi", "pose.theta"),
+        "leg",
+        "missed",
+        "mode.lateral",
+        "track",
+        "V_c",
+        "pose.v_north",
+        "pose.v_east",
+        "wind.north",
+        "wind.east",
+        "fence.action",
+        "fence.clearance",
+        "age.pose",
+        "pose.phi",
+        "pose.theta",
     )
 
     def __init__(

@@ -78,14 +78,8 @@ class RouteConfig(Config):
             self.turns or (0.0,) * count,
             self.wait or (0.0,) * count,
         )
-        rows = zip(
-            self.north,
-            self.east,
-            self.altitude,
-            *columns,
-            self.leave or (None,) * count,
-            strict=True,
-        )
+        places = (self.north, self.east, self.altitude)
+        rows = zip(*places, *columns, self.leave or (None,) * count, strict=True)
         return tuple(Waypoint(*row) for row in rows)
 
 

@@ -93,6 +93,8 @@ DEAD = {"p": "roll rate", "q": "pitch rate"}
 ANGLES = ("phi", "heading", "course", "theta", "r")
 """Channels of Target in rad, and r in rad/s."""
 
+UNITS = {"climb": "m/s", "altitude": "m", "V": "m/s"}
+
 
 def read_target(
     values: Mapping[str, float],
@@ -165,14 +167,7 @@ def _require_limits(
     ):
         if name in values and not least <= values[name] <= largest:
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
-            unit = (
-                ("deg" if degrees else "rad")
-                if name in ANGLES
-                else "m"
-                if name == "altitude"
-                else "m/s"
-            )
-            unit += "/s" * (name == "r")
+            unit = UNITS.get(name, "deg" if degrees else "rad") + "/s" * (name == "r")
             entered = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
             raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
