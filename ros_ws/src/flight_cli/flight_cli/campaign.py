@@ -67,7 +67,7 @@ class Campaign:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a
     scenario, many at once.
 
-    Aircraft with a learner take about eleven seconds of a core each.
+    Aircraft with a learner take about four seconds of a core each.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
