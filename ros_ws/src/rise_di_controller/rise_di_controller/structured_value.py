@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Upper bound of the structured singular value of a loop, over every frequency.
+"""Upper bound of the structured singular value of a loop, over intervals of frequency.
 
 mu(M) is 1 / the size of the least Delta = diag(delta_i) with det(I - M Delta) = 0, delta_i real or
 complex. For any D = diag(exp(t)) and G = diag(g), g_i = 0 at complex channels,
@@ -31,16 +31,9 @@ CENTRED = 0.5  # decrement at a centre
 FALL = 0.3  # of the way from the level to the bound that is left
 STALLED = 1e-3  # part of the bound by which the level is above it at the end
 
-ROOM = 1.002  # factor of the level above a bound that did not hold
 NARROWEST = 1e-8  # part of pi / T: less than LARGEST_G leaves around a frequency of a real M
-PATIENCE = 10  # raises by ROOM, before those by ROOM^2, ROOM^3 and so on
-MAX_RAISES = 400
-MAX_LEVEL = 1e3  # 1 / level beyond it: none
-NEIGHBOURS = 2
-STARTS = 2
-AGAIN = 1.05  # a bound above it is sought from the next start too
-LOWEST = 1e-3  # of the upper end of an interval that begins at 0: where it is split
-LEAST_MODE = 1e-6  # abs(z) of a motion ended within a period
+MEANS_UP_TO = 0.3  # rad a period: up to there the second coefficients count for less than 0.1 %
+TINY = 1e-30
 # abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: what is found
 # too much costs a shorter interval
 ON_CIRCLE = 1e-7
@@ -108,6 +101,30 @@ def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tupl
         level = max(least + FALL * (level - least), wanted)
     g = np.r_[centre.g / centre.d[:real], np.zeros(len(M) - real)]
     return float(np.sqrt(max(least, 0.0))), Scaling(start.t + 0.5 * np.log(centre.d), g)
+
+
+def tightened_at(
+    part: Channels, w: float, scaled: ComplexArray, start: Scaling
+) -> tuple[float, Scaling]:
+    """A bound of a scaled M(w) of a part as by `tightened` to 1: by D and G of the means over a
+    period where these suffice, the D of the second coefficients so that rows and columns balance.
+    """
+    k = len(part.entries)
+    kept = np.r_[0:k, part.uncertain : len(scaled)]
+    few = Scaling(start.t[kept], start.g[kept])
+    _, means = tightened(scaled[np.ix_(kept, kept)], part.real - k, few, 1.0)
+    second = slice(k, part.uncertain)
+    sizes = np.abs(scaled) ** 2 + TINY
+    row = sizes[second, kept] @ np.exp(-2.0 * means.t)
+    column = np.exp(2.0 * means.t) @ sizes[kept, second]
+    scaling = Scaling(np.zeros(len(scaled)), np.zeros(len(scaled)))
+    scaling.t[kept] = means.t
+    scaling.g[kept] = means.g
+    scaling.t[second] = np.log(column / row) / 4.0
+    bound = float(bound_at(scaled, scaling))
+    if bound < 1.0 or w * part.period < MEANS_UP_TO:
+        return bound, scaling
+    return tightened(scaled, part.real, start, 1.0)
 
 
 class Centre(NamedTuple):
@@ -199,113 +216,17 @@ def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray
     return np.asarray(np.sort(np.abs(np.angle(z[on_circle])))) / part.period
 
 
-class Cover(NamedTuple):
-    """A level above the bound at every frequency, and how it was shown."""
-
-    level: float  # infinite: none below MAX_LEVEL
-    peak: float  # rad/s, where the level was raised last
-    intervals: int  # each with one D and one G, together from 0 to pi / T
-
-
-def cover(part: Channels, start: float, *, disks: bool = False) -> Cover:
-    """The least level found, from `start` up, with mu(diag(scale) M) < 1 at every frequency.
-
-    scale is 1 / level in every real channel: the loop is stable for abs(d_i) <= 1 / level. With
-    `disks` it is 1 in the real channels and 1 / level in those of the disks: 1 / level is then the
-    disk of each aircraft with abs(d_i) <= 1. It is 1 in the channels of a delay. One D and one G
-    hold up to the next of the `crossings` on either side; an interval that holds at a level holds
-    above it too.
+def interval_at(
+    part: Channels, w: float, scaling: Scaling, scale: FloatArray
+) -> tuple[float, float] | None:
+    """The frequencies around w at which a D and a G of w hold diag(scale) M below 1, rad/s; None
+    for none.
     """
-    search = _Search(part, start, disks=disks)
-    for w in _modes(part):
-        search.prove(w)
-    while (gap := search.gap()) and search.level < MAX_LEVEL:
-        low, high = gap
-        search.prove(float(np.sqrt(max(low, LOWEST * high) * high)))
-    level = search.level if search.level < MAX_LEVEL else np.inf
-    return Cover(level, search.peak, len(search.proved))
-
-
-def _modes(part: Channels) -> list[float]:
-    """The ends, 0 and pi / T, where M is real and no interval of a neighbour holds, and the
-    frequencies of the modes, rad/s: peaks are near.
-    """
-    z = np.linalg.eigvals(part.A).astype(complex)
-    z = z[np.abs(z) > LEAST_MODE]
-    w = np.abs(np.log(z)) / part.period
+    ends = crossings(part, scaling, scale)
     highest = np.pi / part.period
-    return [0.0, highest, *np.unique(np.round(w[w < highest], 3)).tolist()]
-
-
-class _Search:
-    """The level, and the intervals at which it is proved."""
-
-    def __init__(self, part: Channels, start: float, *, disks: bool) -> None:
-        c = len(part.D) - part.real - part.late
-        self.part = part
-        self.level = start
-        self.peak = 0.0
-        self.moves = np.r_[
-            np.full(part.real, not disks), np.full(part.late, False), np.full(c, True)
-        ]
-        self.proved: list[tuple[float, float]] = []
-        self.scalings: list[tuple[float, Scaling]] = []
-
-    def gap(self) -> tuple[float, float] | None:
-        """The lowest frequencies without a proof, rad/s."""
-        low = 0.0
-        narrowest = NARROWEST * np.pi / self.part.period
-        for begin, end in sorted(self.proved):
-            if begin > low + narrowest:
-                return low, begin
-            low = max(low, end)
-        highest = np.pi / self.part.period
-        return (low, highest) if low < highest - narrowest else None
-
-    def prove(self, w: float) -> None:
-        """Add an interval around w, rad/s; the level rises where it has to."""
-        M = self.part.response(w, RADIUS)
-        starts = self._starts(w, self._scale()[:, None] * M)
-        for raises in range(MAX_RAISES):
-            scaled = self._scale()[:, None] * M
-            bound = np.inf
-            for start in starts:
-                tried, scaling = tightened(scaled, self.part.real, start, 1.0)
-                if tried < bound:
-                    bound = tried
-                    best = scaling
-                if bound < AGAIN:
-                    break
-            if bound < 1.0 and (interval := self._interval(w, best)):
-                self.proved.append(interval)
-                self.scalings.append((w, best))
-                return
-            starts = [best]
-            self.peak = w
-            # beside real channels at their limit the bound says little of the level that is needed
-            self.level *= ROOM ** (1 + raises // PATIENCE) * np.sqrt(max(bound, 1.0))
-            if self.level > MAX_LEVEL:
-                return
-        self.level = np.inf
-
-    def _scale(self) -> FloatArray:
-        return np.where(self.moves, 1.0 / self.level, 1.0)
-
-    def _starts(self, w: float, scaled: ComplexArray) -> list[Scaling]:
-        """D and G of the neighbours and the balanced D, the best first."""
-        near = sorted(self.scalings, key=lambda pair: abs(np.log((pair[0] + 1e-3) / (w + 1e-3))))
-        tried = [Scaling(balanced(scaled), np.zeros(len(scaled)))]
-        tried += [scaling for _, scaling in near[:NEIGHBOURS]]
-        return sorted(tried, key=lambda scaling: float(bound_at(scaled, scaling)))[:STARTS]
-
-    def _interval(self, w: float, scaling: Scaling) -> tuple[float, float] | None:
-        """The frequencies around w at which D and G of w hold, rad/s; None for none."""
-        scale = self._scale()
-        ends = crossings(self.part, scaling, scale)
-        highest = np.pi / self.part.period
-        low = float(np.max(ends[ends <= w], initial=0.0))
-        high = float(np.min(ends[ends > w], initial=highest))
-        inside = np.linspace(low, high, CHECKED + 2)[1:-1].astype(np.float64)
-        M = scale[:, None] * self.part.response(inside, RADIUS)
-        holds = high - low > NARROWEST * highest and (bound_at(M, scaling) < 1.0).all()
-        return (low, high) if holds else None
+    low = float(np.max(ends[ends <= w], initial=0.0))
+    high = float(np.min(ends[ends > w], initial=highest))
+    inside = np.linspace(low, high, CHECKED + 2)[1:-1].astype(np.float64)
+    M = scale[:, None] * part.response(inside, RADIUS)
+    holds = high - low > NARROWEST * highest and (bound_at(M, scaling) < 1.0).all()
+    return (low, high) if holds else None

@@ -10,12 +10,12 @@ The motion is exact in d but for the coefficients left out, an error of the orde
 rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems",
 chapter 10.
 
-u may be late by an unknown time of 0 to `late`, s. Around late / 2 the input of a period changes by
+u may be late by an unknown time of 0 to `late`, s: the input of a period changes by
 
-    w_0 + w_1 ROOT (2 s - 1),  w_0 = d_0 h (u_k - u_k-1),  w_1 = d_1 ROOT g (1 - g) (u_k - u_k-1)
+    w_0 + w_1 ROOT (2 s - 1),  w_0 = -sum_j a_j v_j,  w_1 = sum_j ROOT b_j v_j
 
-with h = late / (2 period), g = min(h, 1/2) and complex abs(d) <= 1: a shift by f periods leaves u_k
-- u_k-1, or u_k+1 - u_k, on a part f of the period, and each further period adds such a term.
+with v_j = u_k-j - u_k-j-1. A shift by j + f periods, 0 <= f < 1, is a_i = 1 for i < j, a_j = f,
+b_j = f (1 - f), 0 beyond. Each coefficient is a real d around the middle of its range.
 """
 
 from typing import NamedTuple
@@ -64,12 +64,14 @@ def aircraft_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
 
 
 class Late(NamedTuple):
-    """2 m complex channels of a delay, those of w_0 first: W_l w, Z_l zeta + V_l v."""
+    """l real channels of a delay, those of w_0 first, j by j with m inputs each: W_l w, Z_l zeta +
+    V_l v.
+    """
 
-    W: FloatArray  # (q, 2 m)
-    D: FloatArray  # (p, 2 m) to the channels of the entries
-    Z: FloatArray  # (2 m, q)
-    V: FloatArray  # (2 m, m)
+    W: FloatArray  # (q, l)
+    D: FloatArray  # (p, l) to the channels of the entries
+    Z: FloatArray  # (l, q)
+    V: FloatArray  # (l, m)
 
 
 class UncertainLoop(NamedTuple):
@@ -83,7 +85,7 @@ class UncertainLoop(NamedTuple):
     V: FloatArray  # (p, m)
     K: FloatArray  # (m, q)
     period: float  # s
-    late: Late | None = None  # the channels of an unknown delay, 2 m; None without one
+    late: Late | None = None  # the channels of an unknown delay; None without one
 
 
 def uncertain_loop(
@@ -101,9 +103,9 @@ def uncertain_loop(
     A[n + k :, n : n + k] = np.eye(k) / loop.period
     B = np.vstack([plant.B, box.G / loop.period, np.zeros((k, m))])
     C = np.hstack([plant.C, np.zeros((len(plant.C), TERMS * k))])
-    extra = np.full(m, late / 2.0)
+    still = np.zeros(m)
     pulled = LinearPlant(A, B, C)
-    sampled = sampled_plant(pulled, loop, extra)
+    sampled = sampled_plant(pulled, loop, still)
 
     steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
     steps[:size, :size] = A
@@ -138,7 +140,7 @@ def uncertain_loop(
     )
     if late == 0.0:
         return exact
-    ramps = sampled_plant(pulled, loop, extra, rising=True)
+    ramps = sampled_plant(pulled, loop, still, rising=True)
     return _with_late(exact, late, _chain(ramps, n, k, len(exact.A)))
 
 
@@ -152,12 +154,12 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
 
 
 class _Chain(NamedTuple):
-    """The states of a delay: w_1 of earlier ticks, c of them, then u of the tick before."""
+    """The states of w_1 of earlier ticks, c of them."""
 
-    on_states: FloatArray  # (q, c + m) of the motion
-    on_entries: FloatArray  # (p, c + m) of the channels of the entries
-    shift: FloatArray  # (c + m, c + m)
-    by_ramp: FloatArray  # (q + c + m, m) by w_1
+    on_states: FloatArray  # (q, c) of the motion
+    on_entries: FloatArray  # (p, c) of the channels of the entries
+    shift: FloatArray  # (c, c)
+    by_ramp: FloatArray  # (q + c, m) by w_1
     ramp_on_entries: FloatArray  # (p, m)
 
 
@@ -166,47 +168,56 @@ def _chain(ramps: SampledPlant, n: int, k: int, q: int) -> _Chain:
     m = ramps.B.shape[1]
     size = n + TERMS * k
     actuated = size + m
-    c = len(ramps.A) - actuated
     effect = ramps.A[:actuated, actuated:]
-    none = np.zeros((m, m))
-    on_states = np.zeros((q, c + m))
-    on_states[: n + m, :c] = np.vstack([effect[:n], effect[size:]])
-    shift = np.zeros((c + m, c + m))
-    shift[:c, :c] = ramps.A[actuated:, actuated:]
+    on_states = np.zeros((q, effect.shape[1]))
+    on_states[: n + m] = np.vstack([effect[:n], effect[size:]])
     beyond = np.zeros((q - n - m, m))
-    moved = (ramps.B[:n], ramps.B[size:actuated], beyond, ramps.B[actuated:], none)
-    on_entries = np.hstack([_coefficients(effect, n, k), np.zeros((TERMS * k, m))])
-    return _Chain(on_states, on_entries, shift, np.vstack(moved), _coefficients(ramps.B, n, k))
+    moved = (ramps.B[:n], ramps.B[size:actuated], beyond, ramps.B[actuated:])
+    return _Chain(
+        on_states,
+        _coefficients(effect, n, k),
+        ramps.A[actuated:, actuated:],
+        np.vstack(moved),
+        _coefficients(ramps.B, n, k),
+    )
 
 
 def _with_late(exact: UncertainLoop, late: float, chain: _Chain) -> UncertainLoop:
-    """A loop with the channels of a delay."""
-    m = len(exact.K)
-    added = len(chain.shift)
-    command = np.zeros((added, len(exact.A)))
-    command[-m:] = exact.K
-    last = np.zeros((added, m))
-    last[-m:] = np.eye(m)
-    half = late / 2.0 / exact.period
-    part = min(half, 0.5)
-    sizes = np.repeat([half, ROOT * part * (1.0 - part)], m)[:, None]
-    before = np.hstack([np.zeros((m, added - m)), np.eye(m)])
-    change = np.hstack([exact.K, -before])
-    none = np.zeros((added, m))
-    widened = exact._replace(
-        A=np.block([[exact.A, chain.on_states], [command, chain.shift]]),
-        W=np.vstack([exact.W, np.zeros((added, exact.W.shape[1]))]),
-        Z=np.hstack([exact.Z, chain.on_entries]),
-        U=np.vstack([exact.U, last]),
-        K=np.hstack([exact.K, np.zeros((m, added))]),
-    )
-    return widened._replace(
-        late=Late(
-            np.hstack([np.vstack([exact.U, none]), chain.by_ramp]),
-            np.hstack([exact.V, chain.ramp_on_entries]),
-            sizes * np.vstack([change, change]),
-            sizes * np.vstack([np.eye(m), np.eye(m)]),
-        )
+    """A loop with the channels of a delay, the middle of their ranges as its own delay."""
+    m, q = exact.K.shape
+    c = len(chain.shift)
+    ticks = int(np.ceil(late / exact.period - 1e-9))
+    parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
+    kept = ticks * m  # u of earlier ticks, the newest first
+    now = np.hstack([exact.K, np.zeros((m, c + kept))])
+    before = np.eye(kept, q + c + kept, q + c)
+    shifted = np.vstack([now, before[:-m]])
+    halves = np.minimum(parts, 0.5)
+    sizes = np.repeat([parts / 2.0, ROOT / 2.0 * halves * (1.0 - halves)], m, axis=1)
+    Z = np.vstack([size[:, None] * (shifted - before) for size in sizes])
+    V = np.zeros((2 * kept, m))
+    V[:m] = np.diag(sizes[0, :m])
+    V[kept : kept + m] = np.diag(sizes[1, :m])
+    none = np.zeros((kept, m))
+    held = np.vstack([exact.U, np.zeros((c, m)), none])
+    W = np.hstack([*[-held] * ticks, *[np.vstack([chain.by_ramp, none])] * ticks])
+    D = np.hstack([*[-exact.V] * ticks, *[chain.ramp_on_entries] * ticks])
+    A = np.zeros((q + c + kept, q + c + kept))
+    A[:q, :q] = exact.A
+    A[:q, q : q + c] = chain.on_states
+    A[q : q + c, q : q + c] = chain.shift
+    A[q + c :] = shifted
+    U = held + W @ V
+    U[q + c : q + c + m] += np.eye(m)
+    reach = np.hstack([exact.Z, chain.on_entries, np.zeros((len(exact.Z), kept))])
+    return exact._replace(
+        A=A + W @ Z,
+        W=np.vstack([exact.W, np.zeros((c + kept, exact.W.shape[1]))]),
+        Z=reach + D @ Z,
+        U=U,
+        V=exact.V + D @ V,
+        K=now,
+        late=Late(W, D, Z, V),
     )
 
 
@@ -219,12 +230,23 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # places of the entries in the box
     period: float
-    late: int = 0  # complex channels of a delay, behind the real ones
+    late: int = 0  # real channels of a delay, behind those of the entries; then disks
+
+    @property
+    def uncertain(self) -> int:
+        """Number of channels of the entries, TERMS an entry."""
+        return TERMS * len(self.entries)
 
     @property
     def real(self) -> int:
-        """Number of real channels, TERMS an entry."""
-        return TERMS * len(self.entries)
+        """Number of real channels."""
+        return self.uncertain + self.late
+
+    @property
+    def parameters(self) -> IntArray:
+        """The number of the parameter of each real channel: entries, then those of a delay."""
+        k = len(self.entries)
+        return np.asarray(np.r_[np.tile(np.arange(k), TERMS), k + np.arange(self.late)])
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
         """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
@@ -237,11 +259,22 @@ class Channels(NamedTuple):
         and right of a change of d.
         """
         wide = np.tile(d, TERMS)
-        p = self.real
+        p = self.uncertain
         inverse = np.linalg.inv(np.eye(p) - self.D[:p, :p] * wide[:, None, :])
         right = inverse @ self.Z[:p]
         left = self.W[:, :p] @ np.linalg.inv(np.eye(p) - wide[:, :, None] * self.D[:p, :p])
         return self.A + (self.W[:, :p] * wide[:, None, :]) @ right, left, right
+
+    def centred(self, c: FloatArray) -> "Channels":
+        """The channels around w = diag(c) z, (p,), in place of w = 0."""
+        inverse = np.linalg.inv(np.eye(len(c)) - self.D * c)
+        Z = inverse @ self.Z
+        return self._replace(
+            A=self.A + (self.W * c) @ Z,
+            W=self.W @ np.linalg.inv(np.eye(len(c)) - c[:, None] * self.D),
+            Z=Z,
+            D=inverse @ self.D,
+        )
 
 
 def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels:

@@ -46,15 +46,62 @@ ROUNDS = 12
 POLISHED = 4  # corners whose entries are flipped one by one
 RESOLUTION = 1e-4  # of the size of an unstable deviation
 NEAR = 2.5  # factor of a frequency within which a mode counts
-FIXED = 5e-7  # abs(z - 1) of an eigenvalue 1 of every aircraft: an angle that integrates y
-SLOW = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
+SLOWEST = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
+REAL = 1e-9  # part of an eigenvalue up to which its imaginary part counts as rounding
 
 
-def first_unstable(
-    part: Channels, frequency: float, entries: int, largest: float
-) -> tuple[float, FloatArray] | None:
-    """The least size of an unstable deviation found near a frequency, rad/s, up to `largest`, and
-    the deviation, (entries,); None for none.
+def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatArray]:
+    """Deviations, (entries,), of unstable aircraft of a part, up to a largest size, each smaller
+    than the one before: by a divergence at 0 rad/s, then by modes at the frequencies up to pi / T.
+    """
+    highest = np.pi / part.period
+    count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
+    windows = highest / NEAR ** (1.0 + 2.0 * np.arange(count))
+    reached = []
+    least = largest
+    for w in (0.0, *windows):
+        size, corner = _oscillation(part, w, least) if w else _divergence(part)
+        if size <= least:
+            d = np.zeros(entries)
+            d[list(part.entries)] = size * corner
+            reached.append(d)
+            least = size
+    return reached
+
+
+def _divergence(part: Channels) -> tuple[float, FloatArray]:
+    """The least size found at which an eigenvalue leaves at z = 1, infinite for none, and its
+    corner.
+
+    det(I - size M diag(s)) = 0 at the largest real eigenvalue 1 / size of M diag(s). Each s goes to
+    the side to which the eigenvalue rises, from STARTS corners. The coefficients beyond the means
+    of a period are left out.
+    """
+    k = len(part.entries)
+    M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
+    corners = np.where(np.random.default_rng(SEED).random((STARTS, k)) < 0.5, -1.0, 1.0)
+    best = np.zeros(STARTS)
+    kept = corners
+    for _ in range(ROUNDS):
+        values, X = np.linalg.eig(M * corners[:, None, :])
+        sizes = np.abs(values)
+        upward = np.where(np.abs(values.imag) <= REAL * sizes, values.real, 0.0)
+        most = np.argmax(upward, axis=1)
+        rows = np.arange(STARTS)
+        rises = upward[rows, most] > best
+        kept = np.where(rises[:, None], corners, kept)
+        best = np.where(rises, upward[rows, most], best)
+        if not rises.any():
+            break
+        slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]  # of log, up to the factor s
+        corners = np.where((slopes.real < 0.0) & rises[:, None], -corners, corners)
+    first = int(np.argmax(best))
+    return (1.0 / best[first] if best[first] > 0.0 else np.inf), kept[first]
+
+
+def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
+    """The least size of an unstable deviation found near a frequency, rad/s, infinite for none,
+    and its corner.
 
     From STARTS corners: up to the size at which a mode near the frequency leaves abs(z) < 1, then
     to the corner to which abs(z) grows, until the size no longer falls.
@@ -75,14 +122,11 @@ def first_unstable(
             break
         corners = np.array(sorted(fresh))
     ranked = sorted(tried, key=lambda corner: (tried[corner], corner))
+    if not np.isfinite(tried[ranked[0]]):
+        return np.inf, np.array(ranked[0])
     flipped = [_flipped(part, np.array(c), frequency, largest) for c in ranked[:POLISHED]]
     best = min(flipped, key=lambda corner: _limit(part, corner, frequency, largest))
-    size = _limit(part, best, frequency, largest)
-    if not np.isfinite(size):
-        return None
-    d = np.zeros(entries)
-    d[list(part.entries)] = size * best
-    return float(size), d
+    return _limit(part, best, frequency, largest), best
 
 
 def _flipped(part: Channels, corner: FloatArray, frequency: float, largest: float) -> FloatArray:
@@ -103,8 +147,8 @@ def _flipped(part: Channels, corner: FloatArray, frequency: float, largest: floa
 def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
     """abs(z) of the modes near a frequency, 0 of the others."""
     w = np.abs(np.angle(z)) / period
-    near = w < SLOW if frequency < SLOW else (w > frequency / NEAR) & (w < frequency * NEAR)
-    return np.asarray(np.where(near & (np.abs(z - 1.0) > FIXED), np.abs(z), 0.0))
+    near = (w > frequency / NEAR) & (w <= frequency * NEAR * (1.0 + REAL))
+    return np.asarray(np.where(near, np.abs(z), 0.0))
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:

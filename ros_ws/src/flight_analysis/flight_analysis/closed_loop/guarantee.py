@@ -6,7 +6,6 @@ margins remain.
 The deviations are constant in time and the loop is linear: no saturation, no rate limit.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,16 +13,27 @@ import numpy as np
 from flight_analysis.closed_loop.loop_margins import LinearLoop
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import closed_loop, is_stable
-from rise_di_controller.structured_value import Cover, cover
-from rise_di_controller.uncertain_loop import UncertainLoop, aircraft_at, parts_of, uncertain_loop
-from rise_di_controller.worst_case import first_unstable
+from rise_di_controller.branch_and_bound import boxes_until_proved
+from rise_di_controller.linear_loop import Loop, closed_loop, is_stable
+from rise_di_controller.uncertain_loop import (
+    Channels,
+    UncertainLoop,
+    aircraft_at,
+    parts_of,
+    uncertain_loop,
+)
+from rise_di_controller.worst_case import first_unstable, worst_in_box
 
 LARGEST = 0.99  # part of an entry up to which an unstable aircraft is sought
-LEAST_LEVEL = 0.1  # of the bound: a loop stable beyond ten times the box counts as stable to there
 WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg
 EXACT = 1.002  # factor on the deviations of an unstable aircraft until the exact loop confirms it
 CONFIRMED = 10  # such factors that are tried
+
+# gaps between what is proved and what was found, from the finest; each is tried with the boxes
+GAPS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
+FIRST_GAP = GAPS.index(0.08)
+BOXES = 1500  # up to the first gap
+FEWER_BOXES = 300  # at the others, and of disks
 
 
 class Unstable(NamedTuple):
@@ -39,7 +49,6 @@ class Guarantee(NamedTuple):
 
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
-    frequency: float  # rad/s, of the limit
     unstable: Unstable | None  # the first one found; None up to LARGEST
     inputs: tuple[str, ...]
     disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
@@ -61,56 +70,83 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     assert box is not None  # noqa: S101 - for mypy
     largest = float(np.max(box.part))
     m = len(linear.inputs)
-    none = Guarantee(largest, 0.0, 0.0, None, linear.inputs, np.zeros(m), 0.0, late)
-    if not is_stable(linear.nominal, linear.law, linear.loop, np.full(m, late / 2.0)):
+    none = Guarantee(largest, 0.0, None, linear.inputs, np.zeros(m), 0.0, late)
+    if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
         return none
     whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
-    parts = parts_of(whole)
-    covers = [cover(part, LEAST_LEVEL) for part in parts]
-    none_coupled = Cover(LEAST_LEVEL, 0.0, 0)
-    limit = max(covers, key=lambda covered: covered.level, default=none_coupled)
-    by_entries = {part.entries: covered for part, covered in zip(parts, covers, strict=True)}
-    found = none._replace(
-        stable=min(float(largest / limit.level), 1.0),
-        frequency=limit.peak,
-        unstable=_first_unstable(linear, late, by_entries),
-    )
-    if not found.holds:
-        return found
-    disk_all = _disk(whole, tuple(range(m)))
+    first = _first_unstable(linear, late)
+    size = (1.0 if first is None else first.deviation) / largest
+    stable = largest * _proved(parts_of(whole), size, disks=False, exact=first is None)
+    promise = none._replace(stable=stable, unstable=first)
+    if not promise.holds:
+        return promise
+    loops = _loops(linear, late)
+    worst = [worst_in_box(linear.nominal, linear.law, loop, box).worst for loop in loops]
+    every = tuple(range(m))
+    disk_all = _disk(whole, every, min(float(least.disk_all) for least in worst))
     # disks in all inputs at once cover a disk in one
-    each = [max(_disk(whole, (i,)), disk_all) for i in range(m)]
-    return found._replace(disk=np.array(each), disk_all=disk_all)
+    disks = [_disk(whole, (i,), min(float(least.disk[i]) for least in worst)) for i in every]
+    return promise._replace(disk=np.maximum(disks, disk_all), disk_all=disk_all)
 
 
-def _first_unstable(
-    linear: LinearLoop, late: float, covers: Mapping[tuple[int, ...], Cover]
-) -> Unstable | None:
-    """The first unstable aircraft found, u in time or late by the whole time, near the peaks of
-    the covers of its entries.
-    """
-    every_peak = [covered.peak for covered in covers.values()]
+def _loops(linear: LinearLoop, late: float) -> list[Loop]:
+    """The loop with u in time, and with u late by the whole time."""
+    loop = linear.loop
+    return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
+
+
+def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
+    """The first unstable aircraft found."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
-    candidates = []
-    for extra in sorted({0.0, late}):
-        loop = linear.loop._replace(delay=linear.loop.delay + extra)
+    largest = LARGEST / float(box.part.max())
+    least: Unstable | None = None
+    for loop in _loops(linear, late):
         delayed = linear._replace(loop=loop)
-        whole = uncertain_loop(linear.nominal, linear.law, loop, box)
-        for part in parts_of(whole):
-            cover_of_part = covers.get(part.entries)
-            peaks = every_peak if cover_of_part is None else [cover_of_part.peak]
-            for w in sorted({*peaks, 0.0}):  # a slow divergence hides beside a peak
-                reached = first_unstable(part, w, len(box.names), LARGEST / float(box.part.max()))
-                confirmed = None if reached is None else _confirmed(delayed, reached[1])
-                candidates += [] if confirmed is None else [confirmed]
-    return min(candidates, key=lambda each: each.deviation, default=None)
+        for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
+            for d in first_unstable(part, len(box.names), largest):
+                reached = _confirmed(delayed, d)
+                if reached is not None and (least is None or reached.deviation < least.deviation):
+                    least = reached
+    return least
 
 
-def _disk(whole: UncertainLoop, inputs: tuple[int, ...]) -> float:
-    """The disk margin of every aircraft of the box, the least of the parts with some inputs."""
-    levels = [cover(part, 1.0 / WIDEST_DISK, disks=True).level for part in parts_of(whole, inputs)]
-    return 1.0 / max(levels, default=1.0 / WIDEST_DISK)
+def _disk(whole: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
+    """The disk margin of every aircraft of the box, with the least one found."""
+    return _proved(parts_of(whole, inputs), min(least, WIDEST_DISK), disks=True)
+
+
+def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = False) -> float:
+    """The largest size proved beside the least one found that is too large, 0 for none: of the
+    deviations, or of the disks beside the whole box. With `exact` least itself may be proved.
+    """
+    if exact and _boxes(parts, least, BOXES, disks=disks) is not None:
+        return least
+    for at, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
+        most = FEWER_BOXES if disks or at > FIRST_GAP else BOXES
+        used = _boxes(parts, least / (1.0 + gap), most, disks=disks)
+        if used is not None:
+            break
+    else:
+        return 0.0
+    proved = gap
+    for finer in reversed(GAPS[:at] if at == FIRST_GAP else ()):
+        if used is None or used > FEWER_BOXES:
+            break
+        used = _boxes(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
+        proved = proved if used is None else finer
+    return least / (1.0 + proved)
+
+
+def _boxes(parts: list[Channels], size: float, most: int, *, disks: bool) -> int | None:
+    """The number of boxes with which each part is proved; None if `most` are not enough."""
+    left = most
+    for part in parts:
+        used = boxes_until_proved(part, *((1.0, size) if disks else (size, 0.0)), left)
+        if used is None:
+            return None
+        left -= used
+    return most - left
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:

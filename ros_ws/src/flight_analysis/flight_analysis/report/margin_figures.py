@@ -202,9 +202,8 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
 def guarantee_text(promise: Guarantee) -> list[str]:
     """A guarantee in sentences."""
     stable = math.floor(1e3 * promise.stable) / 10.0
-    where = f"limit of the bound at {promise.frequency:.2g} rad/s"
-    late = f", u up to {1e3 * promise.late:g} ms late," if promise.late else ""
-    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late} ({where})"]
+    late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
+    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late}"]
     if promise.unstable is None:
         lines.append("no unstable aircraft found within 99 %")
     else:
@@ -238,7 +237,6 @@ def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
         "late": promise.late,
         "holds": promise.holds,
         "stable": promise.stable,
-        "frequency": promise.frequency,
         "unstable": None if promise.unstable is None else promise.unstable._asdict(),
         "disk": dict(zip(promise.inputs, promise.disk.tolist(), strict=True)),
         "disk_all": promise.disk_all,

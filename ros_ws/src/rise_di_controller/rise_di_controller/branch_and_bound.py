@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Proof that each aircraft of a box is stable where one bound of the whole box is too large: the
+box is halved along one parameter, and each half again, over the frequencies that are left.
+
+Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.vectors import FloatArray
+from rise_di_controller.structured_value import (
+    NARROWEST,
+    RADIUS,
+    STALLED,
+    Centre,
+    Scaling,
+    balanced,
+    bound_at,
+    interval_at,
+    tightened_at,
+)
+from rise_di_controller.uncertain_loop import Channels, ComplexArray
+
+
+class Region(NamedTuple):
+    """abs(d - centre) <= half of each parameter, (r,), at the frequencies from low to high."""
+
+    centre: FloatArray
+    half: FloatArray
+    low: float  # rad/s
+    high: float
+    scaling: Scaling | None  # of a larger box or of a neighbouring frequency
+
+    def halves(self, i: int, scaling: Scaling) -> list["Region"]:
+        """Both halves along a parameter."""
+        half = self.half.copy()
+        half[i] /= 2.0
+        step = np.zeros(len(half))
+        step[i] = half[i]
+        narrowed = self._replace(half=half, scaling=scaling)
+        return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
+
+    def outside(
+        self, begin: float, end: float, scaling: Scaling, narrowest: float
+    ) -> list["Region"]:
+        """The frequencies below and above an interval, where wider than rounding, rad/s."""
+        below = self._replace(high=begin, scaling=scaling)
+        above = self._replace(low=end, scaling=scaling)
+        return [side for side in (below, above) if side.high - side.low > narrowest]
+
+
+def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> int | None:
+    """The number of boxes bounded until the loop is proved stable for all abs(d_i) <= size, every
+    delay of the part and complex disks of a size in its channels of disks; None if `most` are not
+    enough.
+
+    The loop of d = 0 is stable. None of the box has a mode on abs(z) = RADIUS, so none leaves.
+    """
+    highest = np.pi / part.period
+    half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
+    disks = np.full(len(part.D) - part.real, disk)
+    regions = [Region(np.zeros(len(half)), half, 0.0, highest, None)]
+    for tried in range(1, most + 1):
+        region = regions.pop()
+        w = _frequency(region, highest)
+        around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(disks))])
+        scale = np.r_[region.half[part.parameters], disks]
+        M = scale[:, None] * around.response(w, RADIUS)
+        bound, scaling = tightened_at(around, w, M, _start(M, region.scaling))
+        interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
+        if interval is None:
+            regions += region.halves(int(np.argmax(_effects(part, M, scaling))), scaling)
+        else:
+            regions += region.outside(*interval, scaling, NARROWEST * highest)
+        if not regions:
+            return tried
+    return None
+
+
+def _frequency(region: Region, highest: float) -> float:
+    """The frequency of a region to bound: the ends 0 and pi / T, where M is real, first."""
+    if region.low == 0.0:
+        return 0.0
+    return highest if region.high == highest else float(np.sqrt(region.low * region.high))
+
+
+def _start(M: ComplexArray, near: Scaling | None) -> Scaling:
+    """The better one of the balanced D and of a D and a G known from nearby."""
+    first = Scaling(balanced(M), np.zeros(len(M)))
+    return first if near is None or bound_at(M, first) < bound_at(M, near) else near
+
+
+def _effects(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
+    """How far the bound of M falls with the half width of each parameter, up to a factor."""
+    scale = np.exp(scaling.t)
+    N = scale[:, None] * M / scale
+    centre = Centre(np.ones(len(N)), scaling.g[: part.real])
+    level = max((1.0 + STALLED) * centre.bound(N), 1.0)
+    P = np.linalg.inv(centre.inequality(N, level))
+    effects = np.diag(N @ P @ N.conj().T).real[: part.real]
+    return np.bincount(part.parameters, effects).astype(np.float64)
