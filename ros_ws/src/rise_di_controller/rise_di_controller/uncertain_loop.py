@@ -141,7 +141,7 @@ def uncertain_loop(
     if late == 0.0:
         return exact
     ramps = sampled_plant(pulled, loop, still, rising=True)
-    return _with_late(exact, late, _chain(ramps, n, k, len(exact.A)))
+    return _with_late(exact, late, ramps, n, k)
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
@@ -153,39 +153,19 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
     return np.concatenate([once, ROOT * (once - 2.0 * twice)])
 
 
-class _Chain(NamedTuple):
-    """The states of w_1 of earlier ticks, c of them."""
+def _with_late(
+    exact: UncertainLoop, late: float, ramps: SampledPlant, n: int, k: int
+) -> UncertainLoop:
+    """A loop, n states of the aircraft and k entries, with the channels of a delay, the middle of
+    their ranges as its own delay, from the motion by w_1.
 
-    on_states: FloatArray  # (q, c) of the motion
-    on_entries: FloatArray  # (p, c) of the channels of the entries
-    shift: FloatArray  # (c, c)
-    by_ramp: FloatArray  # (q + c, m) by w_1
-    ramp_on_entries: FloatArray  # (p, m)
-
-
-def _chain(ramps: SampledPlant, n: int, k: int, q: int) -> _Chain:
-    """The chain of a loop of q states, n of the aircraft, with k entries."""
-    m = ramps.B.shape[1]
-    size = n + TERMS * k
-    actuated = size + m
-    effect = ramps.A[:actuated, actuated:]
-    on_states = np.zeros((q, effect.shape[1]))
-    on_states[: n + m] = np.vstack([effect[:n], effect[size:]])
-    beyond = np.zeros((q - n - m, m))
-    moved = (ramps.B[:n], ramps.B[size:actuated], beyond, ramps.B[actuated:])
-    return _Chain(
-        on_states,
-        _coefficients(effect, n, k),
-        ramps.A[actuated:, actuated:],
-        np.vstack(moved),
-        _coefficients(ramps.B, n, k),
-    )
-
-
-def _with_late(exact: UncertainLoop, late: float, chain: _Chain) -> UncertainLoop:
-    """A loop with the channels of a delay, the middle of their ranges as its own delay."""
+    The states of w_1 of earlier ticks, c of them, and u of earlier ticks follow its own.
+    """
     m, q = exact.K.shape
-    c = len(chain.shift)
+    size = n + TERMS * k
+    moved = np.r_[0:n, size : len(ramps.A)]
+    effect = ramps.A[: size + m, size + m :]
+    c = effect.shape[1]
     ticks = int(np.ceil(late / exact.period - 1e-9))
     parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
     kept = ticks * m  # u of earlier ticks, the newest first
@@ -198,18 +178,19 @@ def _with_late(exact: UncertainLoop, late: float, chain: _Chain) -> UncertainLoo
     V = np.zeros((2 * kept, m))
     V[:m] = np.diag(sizes[0, :m])
     V[kept : kept + m] = np.diag(sizes[1, :m])
-    none = np.zeros((kept, m))
-    held = np.vstack([exact.U, np.zeros((c, m)), none])
-    W = np.hstack([*[-held] * ticks, *[np.vstack([chain.by_ramp, none])] * ticks])
-    D = np.hstack([*[-exact.V] * ticks, *[chain.ramp_on_entries] * ticks])
+    held = np.vstack([exact.U, np.zeros((c + kept, m))])
+    ramp = np.zeros((q + c + kept, m))
+    ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[moved]
+    W = np.hstack([-held] * ticks + [ramp] * ticks)
+    D = np.hstack([-exact.V] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
     A = np.zeros((q + c + kept, q + c + kept))
     A[:q, :q] = exact.A
-    A[:q, q : q + c] = chain.on_states
-    A[q : q + c, q : q + c] = chain.shift
+    A[: n + m, q : q + c] = effect[moved[: n + m]]
+    A[q : q + c, q : q + c] = ramps.A[size + m :, size + m :]
     A[q + c :] = shifted
     U = held + W @ V
     U[q + c : q + c + m] += np.eye(m)
-    reach = np.hstack([exact.Z, chain.on_entries, np.zeros((len(exact.Z), kept))])
+    reach = np.hstack([exact.Z, _coefficients(effect, n, k), np.zeros((len(exact.Z), kept))])
     return exact._replace(
         A=A + W @ Z,
         W=np.vstack([exact.W, np.zeros((c + kept, exact.W.shape[1]))]),
