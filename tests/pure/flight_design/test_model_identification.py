@@ -276,8 +276,10 @@ def test_log_that_shows_no_model_is_refused() -> None:
     tape = flight("gust", 0.5)
     y, u = tape["y"], tape["u"]
     still = Signal(y.stamp_ns, y.names, y.values * [name != "p" for name in y.names])
-    with refusing(r"^the log: found no change of p, expected a flight that excites each output$"):
-        innovation_filters.recording(replace(tape, signals={"y": still, "u": u}), OSPREY)
+    with refusing("^record: found a constant p, expected outputs that move"):
+        signals = {"y": still, "u": u}
+        recorded = innovation_filters.recording(replace(tape, signals=signals), OSPREY)
+        identify(recorded, OSPREY, ACTUATORS)
     late = [
         Signal(of.stamp_ns + 10**15 * (of.stamp_ns > of.stamp_ns.mean()), of.names, of.values)
         for of in (y, u)

@@ -86,10 +86,8 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
             "the opposite sign",
             "the stack's signs",
         )
-    inputs = tuple(driven[motion][0] for motion in moved.values())
-    return ChannelPairing(tuple(moved), inputs), np.array(
-        [float(driven[motion][1]) for motion in moved.values()]
-    )
+    inputs, signs = zip(*(driven[motion] for motion in moved.values()), strict=True)
+    return ChannelPairing(tuple(moved), inputs), np.array(signs, dtype=np.float64)
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:

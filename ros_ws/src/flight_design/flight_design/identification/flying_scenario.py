@@ -46,6 +46,7 @@ from flight_design.identification.manoeuvre import (
     PULSE_P,
     PULSE_V,
     reference_parameters,
+    unit_gains,
 )
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.law import Sign
@@ -197,21 +198,8 @@ class _Identified(NamedTuple):
         """What the gains are selected for; each gain is 1 before."""
         loop = self.loop
         lag = loop.lag.tolist()
-        ones = [1.0] * len(lag)
-        base = RiseDiConfig.validate_mapping(
-            controller_values(self.channel_map, self.pairing)
-            | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
-            | {
-                "k_g": 1.0,
-                "k_d": ones[1:],
-                "D": [1] * len(ones),
-                "sign": "auto",
-                "softening": gain_selection.SOFTENING,
-                "lag": lag,
-                "delay": loop.delay,
-            },
-            "controller",
-        )
+        channels = controller_values(self.channel_map, self.pairing)
+        base = RiseDiConfig.validate_mapping(channels | unit_gains(lag, loop.delay), "controller")
         lags = dict(zip(self.pairing.inputs, lag, strict=True))
         return LoopSetting(
             base,

@@ -4,7 +4,7 @@
 many models side by side.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -90,7 +90,7 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
 
     y is the sample nearest to the instant, within half a period; u is the last one. Raises
     ParameterError for a log without the channels of the airframe, or one shorter than ten times the
-    transient, with gaps beyond MOST_GAPS, or with an output that never changes.
+    transient, or with gaps beyond MOST_GAPS.
     """
     y = tape["y"]
     u = tape["u"]
@@ -131,15 +131,6 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
     measured = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
     measured[lost] = np.nan
-    moves = (
-        np.ptp(measured[~lost], axis=0) > 0.0
-        if not lost.all()
-        else np.zeros(len(airframe.outputs), dtype=bool)
-    )
-    still = ", ".join(
-        name for name, moved in zip(airframe.outputs, moves, strict=True) if not moved
-    )
-    require(not still, "the log", f"no change of {still}", "a flight that excites each output")
     places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
     commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
     return Recording(
@@ -445,6 +436,9 @@ def filter_bank(
     return FilterBank(sampled, L, np.asarray(covariance), each.gravity, model.period)
 
 
+OF_INPUTS = ("input_scale", "D", "lag", "total_lag", "lower", "upper")  # vectors of a model
+
+
 class Block(NamedTuple):
     """Indices of a part of the aircraft that does not couple with the rest."""
 
@@ -455,16 +449,10 @@ class Block(NamedTuple):
 
     def named(self, airframe: Airframe) -> Names:
         """The names of the indices."""
-        every: tuple[Iterable[str], ...] = (
-            airframe.states,
-            airframe.inputs,
-            airframe.outputs,
-            airframe.gusts,
-        )
-        lists = [list(names) for names in every]
+        every = (airframe.states, airframe.inputs, airframe.outputs, airframe.gusts)
         parts = (
-            tuple(names[k] for k in places.tolist())
-            for names, places in zip(lists, self, strict=True)
+            tuple(np.array(list(names), dtype=object)[places].tolist())
+            for names, places in zip(every, self, strict=True)
         )
         return Names(*parts)
 
@@ -483,12 +471,7 @@ class Block(NamedTuple):
             noise=model.noise[y],
             kinematic=model.kinematic[x],
             size=model.size[x],
-            input_scale=model.input_scale[u],
-            D=model.D[u],
-            lag=model.lag[u],
-            total_lag=model.total_lag[u],
-            lower=model.lower[u],
-            upper=model.upper[u],
+            **{name: getattr(model, name)[u] for name in OF_INPUTS},
         )
 
 

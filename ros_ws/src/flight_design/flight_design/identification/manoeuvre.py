@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
+from flight_design.gains.gain_selection import SOFTENING
 
 # Hz, Hz, s: of y, of the law, of the integration
 RATE = 200.0
@@ -106,6 +107,22 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 
 LEAST_SHARE = 0.01
 """Of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
+
+
+def unit_gains(lag: list[float], delay: float) -> dict[str, Any]:
+    """The keys of a controller of channels with lags and a delay, s, whose gains, each 1, are to be
+    selected.
+    """
+    ones = [1.0] * len(lag)
+    return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {
+        "k_g": 1.0,
+        "k_d": ones[1:],
+        "D": [1] * len(lag),
+        "sign": "auto",
+        "softening": SOFTENING,
+        "lag": lag,
+        "delay": delay,
+    }
 
 
 class ManoeuvreResult(NamedTuple):

@@ -94,7 +94,7 @@ class _Ticks:
             for channel in CHANNELS
         }
         u = self._values["u"][flies]
-        is_float = len(u) > 0 and bool((u == u.astype(np.float32)).all()) and bool(u.any())
+        is_float = bool((u == u.astype(np.float32)).all() and u.any())
         require(
             not is_float, STATUS, "u of --float32", "a module in double: Python computes in double"
         )

@@ -18,6 +18,7 @@ Source: B. Etkin, L. D. Reid, "Dynamics of Flight", 1996, 4.9 (the X equation al
 path).
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -204,25 +205,19 @@ def _simulated(
 
 def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) -> Any:
     size = float(np.ptp(values)) / amplitude
+    scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
+    bounds = LOWER[:order], UPPER[:order]
+    search = partial(least_squares, residuals, bounds=bounds, x_scale=scale, max_nfev=60)
     fits = []
     for delay, lag, damping, stiffness, zero in STARTS:
         Omega = damping * size
-        start = np.array([delay, lag, Omega, damping, stiffness, zero * Omega])[:order]
-        scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
-        fits.append(
-            least_squares(
-                residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60
-            )
-        )
+        start = np.array([delay, lag, Omega, damping, stiffness, zero * Omega])
+        fits.append(search(start[:order]))
     best = min(fits, key=lambda fit: float(fit.cost))
     if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
         delay, lag, Omega, damping = best.x
-        start = np.array(
-            [delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag]
-        )  # the same response
-        best = least_squares(
-            residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60
-        )
+        # the same response
+        best = search(np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag]))
     return best
 
 

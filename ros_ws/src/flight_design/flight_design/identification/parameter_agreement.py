@@ -84,18 +84,15 @@ class Stick(NamedTuple):
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
-        ends = {
-            f"{name}_MIN": (low, END_TOLERANCE * half),
-            f"{name}_MAX": (high, END_TOLERANCE * half),
-        }
         trim = {f"{name}_TRIM": (low + half, TRIM_TOLERANCE * half)} if self.is_centred else {}
         is_reversed = self.raw_sign * self.trim_line.sign < 0
-        return (
-            {f"RCMAP_{self.axis}": (float(self.channel), 0.0)}
-            | ends
-            | trim
-            | {f"{name}_REVERSED": (float(is_reversed), 0.0)}
-        )
+        return {
+            f"RCMAP_{self.axis}": (float(self.channel), 0.0),
+            f"{name}_MIN": (low, END_TOLERANCE * half),
+            f"{name}_MAX": (high, END_TOLERANCE * half),
+            **trim,
+            f"{name}_REVERSED": (float(is_reversed), 0.0),
+        }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
         """The raw value of a part of full deflection: -1 to 1 about the middle, for a throttle 0 to

@@ -404,23 +404,24 @@ def _responses(
             fitted_column(t, responses[..., j], j) if usable else no_column(len(outputs))
         )
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
-    counts = (share >= MIN_SHARE) & ~(
-        (share < 1.0) & (np.array([column.delay for column in columns]) < LEAST_DELAY)
+    lag, lag_deviation, delay, delay_deviation, sign_ratio = (
+        np.array([getattr(column, name) for column in columns]) for name in Column._fields[2:]
     )
+    counts = (share >= MIN_SHARE) & ~((share < 1.0) & (delay < LEAST_DELAY))
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
         outputs,
         inputs,
         np.stack([column.Omega for column in columns], axis=1),
         np.stack([column.deviation for column in columns], axis=1),
-        np.array([column.lag for column in columns]),
-        np.array([column.lag_deviation for column in columns]),
-        np.array([column.delay for column in columns]),
-        np.array([column.delay_deviation for column in columns]),
+        lag,
+        lag_deviation,
+        delay,
+        delay_deviation,
         tuple(refusal),
         sum(len(part.y) for part in rows) * layout.period,
         share,
-        np.array([column.sign_ratio for column in columns]) * counted,
+        sign_ratio * counted,
     )
 
 

@@ -4,7 +4,7 @@
 flight.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -179,9 +179,7 @@ def check(
     Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the
     controller's. Raises ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
-    mapped = through(channel_map, Omega)[
-        np.ix_(_places(outputs, channel_map.outputs), _places(inputs, channel_map.inputs))
-    ]
+    mapped = _through(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]
     sentences = [
         f"outputs.{name} of the map {channel_map.name} has the wrong sign:"
@@ -237,9 +235,7 @@ def check_effectors(
     `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is
     the sign of its effect.
     """
-    mapped = through(channel_map, Omega)[
-        np.ix_(_places(outputs, channel_map.outputs), _places(effectors, channel_map.inputs))
-    ]
+    mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
     channels = []
     sentences = []
@@ -257,6 +253,15 @@ def check_effectors(
                 f"{motion_as_channel_grows(channel_map.inputs[name])}"
             )
     return SignCheck(tuple(channels), tuple(sentences), (), 0.0)
+
+
+def _through(
+    channel_map: ChannelMap, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str]
+) -> FloatArray:
+    """`through` the map, between some of its channels."""
+    rows = _places(outputs, channel_map.outputs)
+    columns = _places(inputs, channel_map.inputs)
+    return through(channel_map, Omega)[np.ix_(rows, columns)]
 
 
 def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:

@@ -64,6 +64,7 @@ from flight_design.identification.manoeuvre import (
     fly_all,
     moderate_turbulence,
     reference_parameters,
+    unit_gains,
 )
 from flight_design.identification.sketch import sketch
 from flight_design.identification.step_responses import Responses, step_responses
@@ -401,20 +402,12 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
     """The loop of the gains. The parameters to be selected are 1."""
     inputs = list(INPUTS)
-    ones = [1.0] * len(inputs)
     base = RiseDiConfig.validate_mapping(
-        dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
+        unit_gains(lag.tolist(), DELAY)
         | {
             "rate": CONTROL_RATE,
             "outputs": list(OUTPUTS),
             "inputs": inputs,
-            "k_g": 1.0,
-            "k_d": ones[1:],
-            "D": [1] * len(inputs),
-            "sign": "auto",
-            "lag": lag.tolist(),
-            "delay": DELAY,
-            "softening": gain_selection.SOFTENING,
             "max_age": 0.1,
             "hold": 0.5,
             "ramp": 2.0,

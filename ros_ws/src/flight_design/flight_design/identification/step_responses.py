@@ -101,10 +101,9 @@ def step_responses(
             {min(size, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for size in SIZES}
         ):
             u = step * np.eye(m)[j]
+            window = WINDOWS.get(output, WINDOW)
             try:
-                y = (fly(u, WINDOWS.get(output, WINDOW)) - fly(-u, WINDOWS.get(output, WINDOW))) / (
-                    2.0 * step
-                )
+                y = (fly(u, window) - fly(-u, window)) / (2.0 * step)
             except FlightEnded as error:
                 rejected.append(f"{name} by {step:.3g}: {error}")
                 continue
