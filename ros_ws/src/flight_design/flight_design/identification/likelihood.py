@@ -72,7 +72,7 @@ class Innovations(NamedTuple):
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
     normalised: FloatArray  # (T, m) of covariance I where the model is right
-    log_likelihood: FloatArray  # (T,) of a sample, up to a constant
+    log_likelihood: FloatArray  # (T,) of a sample, up to a constant, see `predicted`
 
 
 class Normalised(NamedTuple):
@@ -379,9 +379,17 @@ class Likelihood:
         return self.innovations(self.models(theta[None], levels), levels)
 
     def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
-        """The innovations of a theta, (p,)."""
+        """The innovations of a theta, (p,).
+
+            log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
+
+        The means s_i are over the samples that fit the model, as in the cost: the noise of the
+        filter is a guess, and a model must not gain by a better guess.
+        """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
-        return Innovations(r, e, -np.sum(e**2, axis=1) / 2.0 - half_log_det)
+        scale = np.mean(e[self.fitted()] ** 2, axis=0)
+        log_likelihood = -np.sum(e**2 / scale + np.log(scale), axis=1) / 2.0 - half_log_det
+        return Innovations(r, e, log_likelihood)
 
     def cost(
         self,
