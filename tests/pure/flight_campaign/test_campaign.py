@@ -379,13 +379,13 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
         return identified[-1]
 
     monkeypatch.setattr("flight_design.learning.learner.identify", kept)
-    scenario = learning(11.5, updates=[10.0])
+    scenario = learning(15.0, updates=[10.0, 14.0])
     campaign = flown_rows(tmp_path / "real", scenario, scenario_learner.quick_learner, 1)
     row = campaign.rows().collect().row(0, named=True)
-    assert (row["first_model"], row["models"]) == (10.5, 1)
+    assert (row["first_model"], row["models"]) == (14.5, 1)
     alone = flown_alone(campaign, 0, scenario_learner.learner)
     # the searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations
-    for near, thorough in zip(*(each.entries for each in identified), strict=True):
+    for near, thorough in zip(*(each.entries for each in identified[::2]), strict=True):
         assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
     # the searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %
     assert {name: row[name] for name in alone} == approx(alone, rel=1e-2)

@@ -51,11 +51,11 @@ class Search(Likelihood):
     """The search of the most probable theta of one block."""
 
     coarse: "Search"
+    progress: Callable[[], None] = staticmethod(lambda: None)  # called before each step
 
     def fit(
         self,
         used: NDArray[np.bool_],
-        progress: Callable[[], None] = lambda: None,
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
@@ -74,14 +74,13 @@ class Search(Likelihood):
         further start.
         """
         if begin is None:
-            ends = self._ends(flown, used, progress)
+            ends = self._ends(flown, used)
         else:
-            free = np.ones(len(begin), dtype=bool)
-            theta = self._started(np.clip(begin, self._lower, self._upper), None, free, progress)
-            ends = [self._refined(theta, None, used, progress)]
+            theta = self._started(np.clip(begin, self._lower, self._upper), None, winds=True)
+            ends = [self._refined(theta, None, used)]
         best = min(ends, key=lambda end: end.cost)
         same = np.full_like(best.levels, np.bincount(best.levels).argmax())
-        steady = self._refined(best.theta, same, used, progress)
+        steady = self._refined(best.theta, same, used)
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
@@ -91,16 +90,14 @@ class Search(Likelihood):
         None where fewer than ALIKE of the spans have the same level.
         """
         coarse = self.coarse
-        free = np.ones(len(self.prior), dtype=bool)
-        free[self._winds] = flown is not None
         begin = np.zeros(len(self.prior)) if flown is None else flown
         turbulent = np.full(len(coarse._spans), TURBULENT)
-        theta = self._started(begin, turbulent, free, lambda: None)
+        theta = self._started(begin, turbulent, winds=flown is not None)
         counts = np.bincount(coarse.levels(theta))
         if counts.max() < ALIKE * counts.sum():
             return None
         same = np.full(len(self._spans), counts.argmax())
-        return self._fit_at(self._refined(theta, same, used, lambda: None), None, used, flown)
+        return self._fit_at(self._refined(theta, same, used), None, used, flown)
 
     def _fit_at(
         self,
@@ -126,49 +123,42 @@ class Search(Likelihood):
         by_flown = None if flown is None else beside(flown)
         return Fit(theta, deviation, beside(0.0), after, best.levels, by_flown)
 
-    def _ends(
-        self, flown: FloatArray | None, used: NDArray[np.bool_], progress: Callable[[], None]
-    ) -> list[End]:
+    def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[End]:
         """The ends of the search from the best starts."""
         coarse = self.coarse
         fitted = coarse.fitted()
-        fixed = np.ones(len(self.prior), dtype=bool)
-        fixed[self._winds] = False
-        candidates = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
-        begins = [(np.zeros(len(self.prior)), level) for level in STARTS]
+        zero = np.zeros(len(self.prior))
+        candidates = [(coarse.cost(zero, fitted), zero)]
+        begins = [(zero, level) for level in STARTS]
         if self._is_sheared:
             # with the wrong sign of the slope's effect the search ends at another model
             for sign in SIGNS:
-                begin = np.zeros(len(self.prior))
+                begin = zero.copy()
                 begin[self._shear.stop - 1] = sign
                 begins.append((begin, TURBULENT))
         for begin, level in begins:
-            theta = self._started(begin, np.full(len(coarse._spans), level), fixed, progress)
+            theta = self._started(begin, np.full(len(coarse._spans), level), winds=False)
             candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
-            theta = self._started(flown, None, np.ones(len(flown), dtype=bool), progress)
+            theta = self._started(flown, None, winds=True)
             candidates.append((coarse.cost(theta, fitted), theta))
         best = sorted(candidates, key=lambda start: start[0])[:REFINED]
         return [
-            self._refined(theta, None, used, progress)
-            for cost, theta in best
-            if cost < best[0][0] + CLOSE
+            self._refined(theta, None, used) for cost, theta in best if cost < best[0][0] + CLOSE
         ]
 
     def _started(
-        self,
-        theta: FloatArray,
-        levels: NDArray[np.int64] | None,
-        free: NDArray[np.bool_],
-        progress: Callable[[], None],
+        self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
         """Theta, (p,), after steps on means over the shortest lag, with the level of a span by
-        theta or with `levels`.
+        theta or with `levels`. `winds`: whether their strengths are free.
         """
+        free = np.ones(len(theta), dtype=bool)
+        free[self._winds] = winds
         coarse = self.coarse
         fitted = coarse.fitted()
         for _ in range(START_STEPS):
-            progress()
+            self.progress()
             theta, _, progressed = coarse._step(
                 theta, coarse.levels(theta) if levels is None else levels, fitted, free
             )
@@ -181,11 +171,10 @@ class Search(Likelihood):
         theta: FloatArray,
         levels: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
-        progress: Callable[[], None],
     ) -> End:
         """The end of the search from a start, with the levels of the spans by theta or given."""
         for iteration in range(STEPS):
-            progress()
+            self.progress()
             flown = self.levels(theta) if levels is None else levels
             counted = used & self._counted(theta, flown) if iteration > 1 else used
             theta, hessian, progressed = self._step(

@@ -81,12 +81,10 @@ class Part(NamedTuple):
     before: Prediction  # of the nominal model
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
-    delay: float  # s, of the input that is latest by two deviations
+    latest: float  # s, the largest delay of an input and two standard deviations
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
-    delay_deviation: float = 0.0  # s, standard deviation of `delay`; 0 for a known delay
     delays: tuple[float, ...] = ()  # s, of each input
-    file_advantage: float = 0.0  # of the nominal model over the one that flies, see `advantage`
-    coupled_advantage: float = 0.0  # of the nominal airframe over one with coupling that flies
+    advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify`
 
 
 class Identification(NamedTuple):
@@ -121,14 +119,18 @@ class _Study(NamedTuple):
     delay: float  # s, of u
     unknown: Unknown
     validating: NDArray[np.bool_]  # (T,)
+    later: NDArray[np.bool_]  # (T,) samples on which the model `flown` is tested
     channels: ChannelPairing
     at_bound: int
+    step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
         """The search of a block."""
-        return Search(
+        search = Search(
             self.recorded, model, block, self.airframe, self.delay, self.unknown, coupled=coupled
         )
+        search.progress = self.step
+        return search
 
     def part(self, search: Search, fit: Fit) -> Part:
         """The model of a block, with the reason why the model must not be used."""
@@ -147,7 +149,6 @@ class _Study(NamedTuple):
         )
         refusal = next(filter(None, sentences), "")
         delays, deviations = search.delays(fit)
-        latest = int(np.argmax(delays + 2.0 * deviations))
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         return Part(
             search.names.inputs,
@@ -155,20 +156,16 @@ class _Study(NamedTuple):
             tuple(entries),
             *predictions,
             refusal,
-            float(delays[latest]),
+            float(np.max(delays + 2.0 * deviations)),
             gusts,
-            float(deviations[latest]),
             tuple(delays.tolist()),
-            0.0
-            if fit.flown is None
-            else advantage(fit.before, fit.flown, span_length(self.recorded)),
+            0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
         )
 
     def fit(
         self,
         search: Search,
         used: NDArray[np.bool_],
-        progress: Callable[[], None],
         flown: Airframe | None,
         *,
         quick: bool,
@@ -180,8 +177,12 @@ class _Study(NamedTuple):
             part = self.part(search, alike)
             if not part.refusal and part.after.whiteness.max() <= MAX_WHITENESS:
                 return alike, part
-        fit = search.fit(used, progress, flown=also)
+        fit = search.fit(used, flown=also)
         return fit, self.part(search, fit)
+
+    def advantage(self, flown: Innovations, nominal: Innovations) -> float:
+        """The advantage of the model `flown` over the nominal one in later samples."""
+        return advantage(flown, nominal, span_length(self.recorded), self.later)
 
 
 def identify(
@@ -194,6 +195,7 @@ def identify(
     unknown: Unknown = KNOWN,
     flown: Airframe | None = None,
     *,
+    after: float = -np.inf,
     may_couple: bool = True,
     quick: bool = False,
 ) -> Identification:
@@ -201,48 +203,48 @@ def identify(
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
     keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
-    bound; `unknown` what else is identified; `flown` the model in flight, a further start;
-    `may_couple` whether parts may become one; `quick` whether the search of a part begins once,
-    where the air is the same in every span and the model may be used; `progress` takes the steps
-    `completed` and their largest number `total`. Raises ParameterError for an output that does not
-    move.
+    bound; `unknown` what else is identified; `flown` the model in flight, a further start, whose
+    advantage over the nominal one is that of the samples `after` a flight time, s; `may_couple`
+    whether parts may become one; `quick` whether the search of a part begins once, where the air is
+    the same in every span and the model may be used; `progress` takes the steps `completed` and
+    their largest number `total`. Raises ParameterError for an output that does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     _require_motion(airframe.outputs, recorded.y[known])
     validating = known & held_out(len(recorded.t), span_length(recorded))
+    used = known & ~validating
+    later = known & (recorded.t > after)
     every = blocks(model)
     step_count = count(1)
     starts = len(STARTS) + len(SIGNS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS)
     total += (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
-    study = _Study(recorded, blown, actuation.delay, unknown, validating, paired, at_bound)
-    used = known & ~validating
 
     def step() -> None:
         progress(completed=next(step_count), total=total)
 
+    study = _Study(
+        recorded, blown, actuation.delay, unknown, validating, later, paired, at_bound, step
+    )
     searches = [study.search(model, block) for block in every]
-    fitted = [study.fit(search, used, step, flown, quick=quick) for search in searches]
+    fitted = [study.fit(search, used, flown, quick=quick) for search in searches]
     fits = [(search, fit) for search, (fit, _) in zip(searches, fitted, strict=True)]
     parts = [part for _, part in fitted]
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
-    follows = [
-        correlation(fit.after.normalised, np.delete(recorded.u, block.inputs, axis=1), known)
-        for (_, fit), block in zip(fits, every, strict=True)
-    ]
+    z = 0.0
     if flown is not None and _couples(flown, airframe):
         search = study.search(model, whole_aircraft(model), coupled=True)
         by_flown = search.flying(search.model_errors(flown), fits)
-        z = advantage(first, by_flown, span_length(recorded))
-        parts = [part._replace(coupled_advantage=z) for part in parts]
-    if may_couple and len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
+        z = study.advantage(by_flown, first)
+        parts = [part._replace(advantage=z) for part in parts]
+    if may_couple and len(every) > 1 and _follows(fits, every, recorded.u, known) > FOLLOWS:
         search = study.search(model, whole_aircraft(model), coupled=True)
-        fit = search.fit(used, step, begin=search.joined(fits))
-        part = study.part(search, fit)
+        fit = search.fit(used, begin=search.joined(fits))
+        part = study.part(search, fit)._replace(advantage=z)
         gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
         white = part.after.whiteness.max() <= MAX_WHITENESS
         if white and not part.refusal and gain * validating.sum() > COUPLED_GAIN:
@@ -250,19 +252,29 @@ def identify(
             first = fit.before
             last = fit.after
     identified = with_entries(airframe, chain.from_iterable(part.entries for part in parts))
-    before = prediction(first, validating)
-    after = prediction(last, validating)
+    predictions = (prediction(first, validating), prediction(last, validating))
     both = (first.r, last.r)
-    return Identification(identified, recorded, validating, both, before, after, tuple(parts))
+    return Identification(identified, recorded, validating, both, *predictions, tuple(parts))
+
+
+def _follows(
+    fits: Sequence[tuple[Search, Fit]],
+    every: Sequence[Block],
+    u: FloatArray,
+    known: NDArray[np.bool_],
+) -> float:
+    """The largest `correlation` of the innovations of a part with the u, (T, m), of another one."""
+    largest = 0.0
+    for (_, fit), block in zip(fits, every, strict=True):
+        of_others = np.delete(u, block.inputs, axis=1)
+        largest = max(largest, correlation(fit.after.normalised, of_others, known).max())
+    return largest
 
 
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
     """Whether a model has entries that are 0 in the nominal one."""
-    pairs = (
-        (flown.matrix_a(), nominal.matrix_a()),
-        (flown.matrix_b(), nominal.matrix_b()),
-    )
-    return any(bool(np.any((new != 0.0) & (old == 0.0))) for new, old in pairs)
+    new, old = (np.hstack([model.matrix_a(), model.matrix_b()]) for model in (flown, nominal))
+    return bool(np.any((new != 0.0) & (old == 0.0)))
 
 
 def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
@@ -73,20 +74,27 @@ def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> F
     return np.asarray(total / LAGS)
 
 
-def advantage(first: Innovations, second: Innovations, span: int) -> float:
+def advantage(
+    first: Innovations, second: Innovations, span: int, counted: NDArray[np.bool_]
+) -> float:
     """By how many standard deviations one model predicts a record better than another one.
 
-        z = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
+        t = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
+        z = Phi^-1(F_(K-1)(t)),  F of Student's distribution, Phi of the normal one
 
     Where both models are equally far from the aircraft, z has a standard normal distribution,
     whichever is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica 57(2), 1989,
-    here with spans of `span` samples, whose d_k are nearly independent.
+    here with spans of `span` samples, whose d_k are nearly independent. K is small, hence Student's
+    t. Only samples of the mask `counted`, (T,), count; z is 0 for less than two spans.
     """
-    d = first.log_likelihood - second.log_likelihood
-    count = len(d) // span
-    sums = np.nansum(d[: count * span].reshape(count, span), axis=1)
-    spread = np.sqrt(count) * np.std(sums, ddof=1)
-    return float(np.sum(sums) / spread) if spread > 0.0 else 0.0
+    end = len(counted) // span * span
+    d = np.where(counted, first.log_likelihood - second.log_likelihood, 0.0)[:end]
+    seen = counted[:end].reshape(-1, span).any(axis=1)
+    sums = d.reshape(-1, span).sum(axis=1)[seen]
+    if len(sums) < 2 or np.ptp(sums) == 0.0:
+        return 0.0
+    t = np.sum(sums) / (np.sqrt(len(sums)) * np.std(sums, ddof=1))
+    return float(np.sign(t) * stats.norm.isf(stats.t.sf(abs(t), len(sums) - 1)))
 
 
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:

@@ -20,7 +20,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import nanoseconds
+from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
@@ -30,10 +30,7 @@ from flight_design.identification.model_identification import (
     identify,
     with_entries,
 )
-from flight_design.identification.model_quality import (
-    MAX_WHITENESS,
-    another_airframe,
-)
+from flight_design.identification.model_quality import another_airframe
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_design.learning.designs import (
     margin_behind,
@@ -50,7 +47,6 @@ from flight_design.learning.part_checks import (
     back_to_file,
     changed,
     explains,
-    forgets_coupling,
     forgotten,
     is_within,
     not_white,
@@ -58,6 +54,7 @@ from flight_design.learning.part_checks import (
     too_late,
     unchanged,
     uncoupled,
+    unproven,
     weaker,
 )
 from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
@@ -80,15 +77,9 @@ class Known(NamedTuple):
 
     end_ns: int  # of its window
     deviation: Mapping[str, float]  # of its entries by name, 1
-    delay: float  # of its latest input, s
+    latest: float  # delay of an input and two standard deviations, s
     is_rough: bool  # that of the rough airframe as it is
-    delay_deviation: float = 0.0  # s, standard deviation of `delay`
-    delays: tuple[float, ...] = ()  # of each input, s
-
-    @property
-    def latest(self) -> float:
-        """The delay of its inputs and two standard deviations, s."""
-        return self.delay + 2.0 * self.delay_deviation
+    delays: tuple[float, ...]  # of each input, s
 
 
 class Verdict(NamedTuple):
@@ -98,6 +89,7 @@ class Verdict(NamedTuple):
     known: dict[tuple[str, ...], Known]
     sentences: list[str]
     refusals: list[str]
+    tried: Airframe  # the model, with those that later samples have to show as better
 
 
 class Learner:
@@ -124,17 +116,10 @@ class Learner:
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances. With
         more noise than DRIFT the aircraft is not tested for a change: the disturbances stand for a
-        change, and for a dead input. `quick` is that of `identify`. Raises ParameterError for a
-        controller that does not learn.
+        change, and for a dead input. `quick` is that of `identify`.
         """
         settings = controller.learn
-        require(
-            settings is not None,
-            "controller.learn",
-            "no such section",
-            "one: a window and times of identifications",
-        )
-        assert settings is not None  # noqa: S101 - for the type checker
+        assert settings is not None  # noqa: S101 - `scenario_learner.learner` makes no other
         self._controller = controller
         self._rough = airframe
         self._design = design
@@ -154,6 +139,8 @@ class Learner:
         # of the next identification; what flies
         self._prior = airframe
         self._model = airframe
+        self._tried = airframe  # what the next identification tests
+        self._tried_ns = -1  # end of its record
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
         # Parts that fly the law of the start for good: their inputs without effect, "" for outputs
         # of `learn.without`
@@ -193,6 +180,9 @@ class Learner:
         The first proposal, before any record, is the rough airframe designed as one that errs.
         Parts that are refused later fly so, too. The law of the start follows where that proposal
         does not fly, or the law falls back.
+
+        While the rough model flies, a first model of a part only tests: the next identification
+        takes its own where the samples since then show an advantage over the rough model.
 
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the
         proposal was refused, or the controller fell back. Outputs that the controller gave up,
@@ -256,6 +246,7 @@ class Learner:
             self._prior = self._model if self._prior is self._rough else self._rough
         sentences += verdict.sentences
         if not sentences:
+            self._test_next(verdict)
             nothing = "each part flies the law of the start from before on"
             return LearnerResult(None, "; ".join(verdict.refusals) or nothing)
         self._adopt(verdict, without_model)
@@ -275,29 +266,31 @@ class Learner:
         model = self._model
         sentences = []
         refusals = []
+        tried = list[Entry]()
+        is_about_file = self._prior is self._rough
+        flies_file = is_about_file and not self._changed and self._design_of_rough is not None
         for part in identified.parts:
             if any(
                 is_within(part.outputs, outputs) or is_within(outputs, part.outputs)
                 for outputs in without_model
             ):
                 continue
-            if self._prior is self._rough and forgets_coupling(part, known):
+            if is_about_file and uncoupled(part, known) and back_to_file(part):
                 known = {}
                 model = self._rough
                 sentences.append(forgotten(part))
-            rough = (
-                part.outputs not in known
-                and part.before.whiteness.max() <= MAX_WHITENESS
-                and explains(part)
-            )
+            rough = part.outputs not in known and explains(part)
             learned = {
                 outputs for outputs, estimate in known.items() if not estimate.is_rough
             } - self._changed
             before = model if part.outputs in learned and not lost else None
             reason = "" if rough else part.refusal or not_white(part) or weaker(part, before)
+            if not (rough or reason or part.outputs in learned) and flies_file:
+                reason = unproven(part, self._rough.name)
+                tried += part.entries
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
-                if part.outputs in learned and self._prior is self._rough and back_to_file(part):
+                if part.outputs in learned and is_about_file and back_to_file(part):
                     model = with_entries(model, as_in_file(part))
                     del known[part.outputs]
                     name = "" if self._design_of_rough is None else self._rough.name
@@ -311,15 +304,14 @@ class Learner:
                 if entry.value
             }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(
-                end_ns, deviation, part.delay, rough, part.delay_deviation, part.delays
-            )
+            known[part.outputs] = Known(end_ns, deviation, part.latest, rough, part.delays)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
                 if rough
                 else sentence(part)
             )
-        return Verdict(model, known, sentences, refusals)
+        tested = with_entries(model, tried) if tried else model
+        return Verdict(model, known, sentences, refusals, tested)
 
     def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> None:
         """Design for a verdict, and take it as proposed. Raises ParameterError without a design."""
@@ -332,10 +324,16 @@ class Learner:
         self._changed = {
             part for part in self._changed if not any(is_within(part, outputs) for outputs in new)
         }
+        self._test_next(verdict)
         self._known = verdict.known
         self._model = verdict.model
         self._dead = without_model
         self._propose(proposed)
+
+    def _test_next(self, verdict: Verdict) -> None:
+        """Note what the next identification tests, on samples that are later than the record."""
+        self._tried = verdict.tried
+        self._tried_ns = self._record.end_ns
 
     def _propose(self, proposed: RiseDiConfig) -> None:
         """Note what is proposed."""
@@ -422,11 +420,12 @@ class Learner:
             channels=channels,
             at_bound=AT_BOUND,
             unknown=unknown,
+            after=seconds(self._tried_ns),
             may_couple=self._record.is_full,
             quick=self._quick,
         )
         prior = self._prior
-        model = self.model
+        model = None if self._tried is self._rough else self._tried
         if dead_input:
             prior = without_effect(prior, dead_input)
             model = model and without_effect(model, dead_input)
@@ -468,10 +467,9 @@ class Learner:
         powers = exponents(self._rough, self._thrust)
         states = list(self._rough.states)
         columns = {"A": states, "B": list(self._rough.inputs)}
-        exponent = {"A": powers.A, "B": powers.B}
         factors = [
             ratio
-            ** exponent[entry.matrix][
+            ** getattr(powers, entry.matrix)[
                 states.index(entry.row), columns[entry.matrix].index(entry.column)
             ].item()
             for entry in entries
@@ -503,7 +501,7 @@ class Learner:
         recent, ratio = self._steady(whole)
         if len(recent.t) < len(whole.t):
             return []
-        delays = {part: np.array(known.delays or known.delay) for part, known in old.items()}
+        delays = {part: np.array(known.delays) for part, known in old.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         return [change for change in changes if change.outputs in old]
 

@@ -13,7 +13,9 @@ from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, best_known
 from flight_design.learning.change_test import Change
 
-LIKELIER = 1.645  # standard deviations of a normal distribution, passed with 5 %
+# standard deviations of a normal distribution, passed with 5 %: the level of either test of a model
+# against the file
+LIKELIER = 1.645
 DELAY_DEVIATION = (
     0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
 )
@@ -32,10 +34,11 @@ def changed(change: Change) -> str:
 
 
 def explains(part: Part) -> bool:
-    """Whether the nominal airframe predicts the held-out samples as well as the identified
-    model.
+    """Whether the nominal airframe predicts the held-out samples as well as the identified model,
+    with white innovations.
     """
-    return bool(part.after.log_likelihood <= part.before.log_likelihood)
+    is_white = part.before.whiteness.max() <= MAX_WHITENESS
+    return bool(is_white and part.after.log_likelihood <= part.before.log_likelihood)
 
 
 def not_white(part: Part) -> str:
@@ -70,10 +73,25 @@ def too_late(part: Part, delay: float) -> str:
 
 
 def back_to_file(part: Part) -> bool:
-    """Whether the nominal model predicts a record better than the one that flies, with a
+    """Whether the nominal model predicts later samples better than the one that flies, with a
     probability of at most 5 % where both are as near to the aircraft.
     """
-    return part.file_advantage > LIKELIER
+    return part.advantage < -LIKELIER
+
+
+def unproven(part: Part, name: str) -> str:
+    """The refusal of a first model beside the airframe file of a name, which flies on.
+
+    The model before was chosen on the record up to then. Later samples have to show an advantage
+    over the file, with a probability of at most 5 % where both are as near to the aircraft.
+    """
+    if part.advantage > LIKELIER:
+        return ""
+    return (
+        f"{' and '.join(part.outputs)}: found an advantage over the airframe {name} of "
+        f"{part.advantage:.2g} standard deviations in the seconds since the model before, "
+        f"expected more than {LIKELIER:g}"
+    )
 
 
 def back(part: Part, name: str) -> str:
@@ -81,10 +99,11 @@ def back(part: Part, name: str) -> str:
     a name, or the law of the start.
     """
     flies = f"the airframe {name} as it is" if name else "the law of the start"
-    return (
-        f"{' and '.join(part.outputs)} by {flies}: the file predicts this record better than the "
-        f"model that flew, by {part.file_advantage:.2g} standard deviations"
-    )
+    return f"{' and '.join(part.outputs)} by {flies}: {_file_is_better(part)}"
+
+
+def _file_is_better(part: Part) -> str:
+    return f"the file predicts later seconds better, by {-part.advantage:.2g} standard deviations"
 
 
 def as_in_file(part: Part) -> tuple[Entry, ...]:
@@ -104,19 +123,9 @@ def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
     )
 
 
-def forgets_coupling(part: Part, known: Iterable[tuple[str, ...]]) -> bool:
-    """Whether a flown model with coupling predicts a record worse than the airframe file, as in
-    `back_to_file`.
-    """
-    return bool(uncoupled(part, known)) and part.coupled_advantage > LIKELIER
-
-
 def forgotten(part: Part) -> str:
     """Why a model with coupling is forgotten."""
-    return (
-        "no coupling any more: the file predicts this record better than the model that flew, by "
-        f"{part.coupled_advantage:.2g} standard deviations"
-    )
+    return f"no coupling any more: {_file_is_better(part)}"
 
 
 def weaker(part: Part, flown: Airframe | None) -> str:
@@ -133,13 +142,9 @@ def weaker(part: Part, flown: Airframe | None) -> str:
             / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
         )
         if share < 1.0 - MAX_DEVIATION:
-            expected = (
-                f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which "
-                "hide effects"
-            )
             return (
-                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, "
-                f"{expected}"
+                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, expected"
+                f" {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
             )
     return ""
 
