@@ -618,7 +618,7 @@ def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -
         GuidanceConfig.validate_mapping(square(200.0), "guidance")
     assert str(refused.value) == (
         "guidance.home: found a turn from home onto the orbit that is 76 m outside of the fence, "
-        "expected at least 12 m inside; with home 295 m inside every turn fits"
+        "expected at least 12 m inside; with home 292 m inside every turn fits"
     )
     GuidanceConfig.validate_mapping(square(295.0), "guidance")
     with refusing("with home 417 m inside every turn fits"):

@@ -170,7 +170,7 @@ class GuidanceParams(NamedTuple):
     slew: tuple[float, ...]  # largest derivatives of u_m
     max_age_ns: int
     hold_ns: int
-    turn_lag: float = 0.0  # s, of the turn behind the bank
+    turn_lag: float = 0.0  # s, of the turn behind the bank, beyond `attitude.turn_lead`
     fence: Fence | None = None
     home: Home = Home()
     link_timeout_ns: int = 0  # of the operator's link; 0: no limit

@@ -145,8 +145,7 @@ def follow(
         ground_speed**2 * -error.curvature / GRAVITY
     )
     attitude = params.attitude
-    lag = abs(change) / (2.0 * attitude.roll_rate) + 0.5 / attitude.k_phi
-    lag = lag + max(params.turn_lag - attitude.turn_lead, 0.0)
+    lag = abs(change) / (2.0 * attitude.roll_rate) + 0.5 / attitude.k_phi + params.turn_lag
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
     error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
     acceleration = path_acceleration(error, course, ground_speed, params.path) + slip

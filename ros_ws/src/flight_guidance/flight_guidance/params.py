@@ -432,7 +432,7 @@ class GuidanceConfig(NodeConfig):
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
-            turn_lag=2.0 / yaw,
+            turn_lag=max(2.0 / yaw - lead, 0.0),
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
