@@ -28,13 +28,8 @@ PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
 """s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of
 it at SIM_WIND_TURB 0.5."""
 STRONGER_ELEVATOR = 2.0  # `rise-di check` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
-TURBULENCE = (
-    0.25,
-    0.5,
-    0.25,
-    0.5,
-    1.0,
-)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+# SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)
 EXCITED = 35.0  # s, of an experiment on signs at least
 EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
 MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign

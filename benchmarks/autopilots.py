@@ -65,20 +65,12 @@ if TYPE_CHECKING:
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS = 20
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
-GUIDED, EACH, SETTLED = (
-    300.0,
-    60.0,
-    45.0,
-)  # s: engaged under guidance, each turn, and from its command until it counts as held
-OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = (
-    0.025,
-    0.5,
-    2,
-)  # s beyond the identified delay; SIM_WIND_TURB; flights
-FASTER, FASTER_THROTTLE = (
-    25.3,
-    (30.0, 85.0),
-)  # m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
+# s: engaged under guidance, each turn, and from its command until it counts as held
+GUIDED, EACH, SETTLED = (300.0, 60.0, 45.0)
+# s beyond the identified delay; SIM_WIND_TURB; flights
+OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = (0.025, 0.5, 2)
+# m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
+FASTER, FASTER_THROTTLE = (25.3, (30.0, 85.0))
 TRUE = 1.049  # of true over equivalent airspeed at the kit's place
 WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
@@ -191,10 +183,8 @@ def own_log() -> dict[str, Any]:
         with flying(
             plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME
         ):
-            narrower = (
-                "    upper: 0.3\n",
-                "    upper: 0.2\n",
-            )  # of the thrust, whose trim is 0.63 to 0.75 there
+            # of the thrust, whose trim is 0.63 to 0.75 there
+            narrower = ("    upper: 0.3\n", "    upper: 0.2\n")
             channel_map = (
                 plane.patient_map(name, narrower)
                 if name == "ardupilot"
@@ -433,9 +423,8 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     if arguments.sitl is not None:
         os.environ["RISE_DI_SITL"] = str(arguments.sitl.resolve())
-    os.environ.pop(
-        "ROS_DOMAIN_ID", None
-    )  # the autopilots are in domain 0, in networks of their own
+    # the autopilots are in domain 0, in networks of their own
+    os.environ.pop("ROS_DOMAIN_ID", None)
     from tests.sitl.kit import missing  # noqa: PLC0415 - after the kit's place is known
 
     if reason := missing():

@@ -45,10 +45,8 @@ MEASUREMENTS = {
 }
 COMMANDS = {name: each["command"] for name, each in MEASUREMENTS.items() if "command" in each}
 DIRTY = "-dirty"  # end of a revision with changes that are not committed
-BUSY, BUSY_SHARE = (
-    "busy with other work",
-    0.1,
-)  # end of a host on which times are longer; share of its processors
+# end of a host on which times are longer; share of its processors
+BUSY, BUSY_SHARE = ("busy with other work", 0.1)
 BASELINE = " x baseline"  # end of a goal on a ratio
 HEAD = """\
 # Evidence

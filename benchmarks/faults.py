@@ -39,10 +39,8 @@ waits for a processor."""
 
 TRAFFIC = ("exec_to_traffic", "ready_to_traffic", "ready_to_caught_up")  # of a killed node
 TIMES = ("reaction", "recovery", "longest_pause", "held_back", "page", *TRAFFIC, *STARTS)
-BANKS = (
-    "bank_deg",
-    "last_bank_deg",
-)  # the largest after the loss of u_m, and that when the wings have to be level
+# the largest after the loss of u_m, and that when the wings have to be level
+BANKS = ("bank_deg", "last_bank_deg")
 
 Row = dict[str, Any]
 
@@ -53,9 +51,8 @@ def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[l
     """
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
     words = only.replace(",", " ").split() or ["test"]
-    expression = (
-        only if {"and", "or", "not"} & set(words) else " and ".join(words)
-    )  # the name of a case has blanks
+    # the name of a case has blanks
+    expression = only if {"and", "or", "not"} & set(words) else " and ".join(words)
     options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}"]
     return run_campaign([*options, "-k", f"not random and ({expression} or log_holds)"])
 

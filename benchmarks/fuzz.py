@@ -121,9 +121,8 @@ def fuzz(target: str, seconds: int) -> int:
     ) as folder:
         process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)))
         process.start()
-        with suppress(
-            KeyboardInterrupt
-        ):  # Ctrl-C has reached the fuzzer too, which ends with its statistics
+        # Ctrl-C has reached the fuzzer too, which ends with its statistics
+        with suppress(KeyboardInterrupt):
             process.join()
         process.join()
     return process.exitcode or 0

@@ -37,10 +37,8 @@ kt, and altitude, ft."""
 # fmt: on
 DEFAULT = (100, 3000)
 
-LEARNED, LEARN_DURATION = (
-    34.0,
-    94.0,
-)  # s: the model of the window that ends at 30 s flies; the next one flies at 64 s
+# s: the model of the window that ends at 30 s flies; the next one flies at 64 s
+LEARNED, LEARN_DURATION = (34.0, 94.0)
 
 
 def main() -> None:

@@ -236,7 +236,6 @@ def plot(rows: Sequence[Row]) -> Figure:
             )
         axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
         plain(axis, f"A and B +-{100 * uncertainty:g} %: score", lines="y")
-    axis.set_ylim(
-        bottom=0.0
-    )  # of both panels, once all points are drawn: it ends the automatic limits
+    # of both panels, once all points are drawn: it ends the automatic limits
+    axis.set_ylim(bottom=0.0)
     return figure

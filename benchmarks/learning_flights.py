@@ -40,12 +40,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 REPOSITORY = Path(__file__).parents[1]
 SEED = 11  # of the aircraft
-LEARNED, DAMAGED, SETTLED, END = (
-    64.0,
-    60.0,
-    75.0,
-    100.0,
-)  # s: when the last model flies; the fault, and what counts after it
+# s: when the last model flies; the fault, and what counts after it
+LEARNED, DAMAGED, SETTLED, END = (64.0, 60.0, 75.0, 100.0)
 WINDOWS = ((0.0, 14.0), (14.0, 30.0), (30.0, DAMAGED), (DAMAGED, SETTLED), (SETTLED, END))
 """s, of a flight with damage: before the first model, with the first ones, learned, from the damage
 on, and learned again."""
@@ -111,9 +107,8 @@ CELLS = {
     "dead": Cell("dead", "turbulence", 0.3, 0.5),
     **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1, 2) for air in AIR},
 }
-OSPREY = Cell(
-    "learn", "calm", 0.3
-)  # any cell with the airframe, the actuators and the noise of the library
+# any cell with the airframe, the actuators and the noise of the library
+OSPREY = Cell("learn", "calm", 0.3)
 
 
 class Row(NamedTuple):

@@ -52,10 +52,8 @@ TURBULENCE = {
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": MODERATE | {"seed": 1},
 }
-PERIOD, REPORT_PERIOD = (
-    2.0,
-    0.1,
-)  # s between samples of the memory, in flight and while the report is written
+# s between samples of the memory, in flight and while the report is written
+PERIOD, REPORT_PERIOD = (2.0, 0.1)
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
   const place = ({node}) => node.getBoundingClientRect(), all = typeof figures === "undefined" ? [] : figures;
@@ -76,10 +74,8 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
         base = replace(base, controller=find_scenario("osprey_observer").controller)
-    speed, altitude = (
-        base.aircraft.channels().speed,
-        base.aircraft.altitude or 0.0,
-    )  # above the start
+    # above the start
+    speed, altitude = (base.aircraft.channels().speed, base.aircraft.altitude or 0.0)
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
     corners = [(0.0, 0.0), (SIDE, 0.0), (SIDE / 2.0, SIDE * math.sqrt(0.75))] * laps
     north, east = (list(values) for values in zip(*corners, strict=True))

@@ -110,9 +110,8 @@ class Manoeuvre(NamedTuple):
     """A manoeuvre: the section of guidance and the duration, s; and its figures."""
 
     plan: Callable[[GuidanceConfig], tuple[dict[str, Any], float]]
-    figures: Callable[
-        [Tape, GuidanceConfig, bool], Iterator[Figure]
-    ]  # the last: whether the air is calm
+    # the last: whether the air is calm
+    figures: Callable[[Tape, GuidanceConfig, bool], Iterator[Figure]]
     winds: tuple[float, ...] = (0.0,)
     turbulent: bool = True
     pose: Pose = Pose()

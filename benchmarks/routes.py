@@ -102,9 +102,8 @@ def steep(_: float) -> list[Waypoint]:
 
 
 EIGHT = of_radii((0, 0), (3, 0), (6, 3), (9, 3), (9, 0), (6, 0), (3, 3), (0, 3))
-BOX = of_radii(
-    (0, 0), (3, 0), (3, 3), (0, 3)
-)  # longer, and the f16 runs out of fuel against the wind
+# longer, and the f16 runs out of fuel against the wind
+BOX = of_radii((0, 0), (3, 0), (3, 3), (0, 3))
 CASES: Mapping[str, Case] = {
     "behind": Case(of_radii((-4, 0), (-9, 0), (-9, 5))),
     "across": Case(of_radii((3, 7), (3, 13))),

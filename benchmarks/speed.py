@@ -130,9 +130,8 @@ class Peer:
             )
             driven.sent += 1
             for received in self._u.take():
-                if (
-                    stamp_ns := stamp_of(received.message)
-                ) >= since_ns:  # else of an earlier process, or warm-up
+                # else of an earlier process, or warm-up
+                if (stamp_ns := stamp_of(received.message)) >= since_ns:
                     driven.start = driven.start or received.received_ns / NANOSECONDS
                     driven.received[stamp_ns] = received.received_ns
             for received in self._internals.take():
@@ -197,9 +196,8 @@ def controller_at(
     hz: float, folder: Path, role: str = "controller", scenario_name: str = SCENARIO
 ) -> Iterator[Child]:
     """The process of the controller of a scenario at a rate."""
-    others = {
-        "rate": max(hz, 500.0)
-    }  # at least as fast as the controller, as a scenario demands; they do not run here
+    # at least as fast as the controller, as a scenario demands; they do not run here
+    others = {"rate": max(hz, 500.0)}
     rates = {
         "aircraft": others | {"step": 0.001},
         "reference_model": others,

@@ -98,9 +98,8 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
         for _ in ticks(hz):
             if ended.is_set():
                 break
-            if (
-                sent_ns > begin_ns
-            ):  # a message had arrived; checked late, since an executor may have threads
+            # a message had arrived; checked late, since an executor may have threads
+            if sent_ns > begin_ns:
                 took.append(sent_ns - begin_ns)
             begin_ns = time.perf_counter_ns()
             executor.spin_once(timeout_sec=0.0)
@@ -167,9 +166,8 @@ def bare_loop(hz: float, seconds: float) -> dict[str, float]:
 def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     """An empty node of the stack, with the services, diagnostics and graph checks of its loop."""
     late: list[int] = []
-    skipped: list[
-        tuple[int, int]
-    ] = []  # from the first missed deadline to the next tick, monotonic ns
+    # from the first missed deadline to the next tick, monotonic ns
+    skipped: list[tuple[int, int]] = []
     period = round(NANOSECONDS / hz)
 
     class Empty(FlightNode[NodeConfig]):
@@ -207,12 +205,10 @@ def delay_monitor(core: int) -> dict[str, Any]:
     while not ended.is_set():
         time.sleep(MONITOR_PERIOD)
         now_ns = time.monotonic_ns()
-        if (
-            now_ns - last_ns > 1.5e9 * MONITOR_PERIOD
-        ):  # a wake-up takes a twentieth to a fifth of a period
-            delays.append(
-                (last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns)
-            )  # it was to sleep until then
+        # a wake-up takes a twentieth to a fifth of a period
+        if now_ns - last_ns > 1.5e9 * MONITOR_PERIOD:
+            # it was to sleep until then
+            delays.append((last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns))
         last_ns = now_ns
     return {"delays": delays}
 

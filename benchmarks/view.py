@@ -55,10 +55,8 @@ PIECE = 60.0  # s of flight that are repeated to a long log
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
 START_S = 1_795_000_000  # s, stamps of today
 POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
-FREEZE, RECOVERED = (
-    10.0,
-    0.3,
-)  # s: a page stops for so long, and is back when it is less behind than that
+# s: a page stops for so long, and is back when it is less behind than that
+FREEZE, RECOVERED = (10.0, 0.3)
 BEGUN = 3.0  # s, until a flight has begun
 FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
 TURN = 2.5  # s, with a client and without one in turns
@@ -165,9 +163,8 @@ class Client(threading.Thread):
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends; not while `asks` is off."""
-        os.sched_setscheduler(
-            0, os.SCHED_IDLE, os.sched_param(0)
-        )  # of this thread: in use the browser is on another host
+        # of this thread: in use the browser is on another host
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         while not self._ended.wait(1.0 / POLLS):
             try:
                 if self.asks:
@@ -361,10 +358,8 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
     found: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
     starting: list[float] = []  # s
     for number in range(count):
-        turns: dict[bool, list[tuple[int, int]]] = {
-            False: [],
-            True: [],
-        }  # system time, ns; without and with a client
+        # system time, ns; without and with a client
+        turns: dict[bool, list[tuple[int, int]]] = {False: [], True: []}
         with (
             tempfile.TemporaryDirectory() as folder,
             delay_monitors(bool(real_time())) as delays,

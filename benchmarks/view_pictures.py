@@ -28,11 +28,8 @@ DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
 STATE = "document.getElementById('state')?.textContent"
 ENDED = f"{STATE} === 'ENDED'"
 TIME = "parseFloat(document.getElementById('time').textContent.slice(4))"
-LIVE_AT, GHOST_AT, GUIDED_AT = (
-    12.0,
-    40.6,
-    60.0,
-)  # s: a roll, the vertical gust, the second leg of the route
+# s: a roll, the vertical gust, the second leg of the route
+LIVE_AT, GHOST_AT, GUIDED_AT = (12.0, 40.6, 60.0)
 
 
 def flown(scenario: Scenario, folder: Path, name: str) -> Path:
@@ -63,9 +60,8 @@ def save(
             browser.run(f"void document.querySelector('{selector}').click()")
             browser.wait_for(f"{DRAWN} > {before}")
         shot = Image.open(BytesIO(base64.b64decode(browser.call("Page.captureScreenshot")["data"])))
-        shot.convert("RGB").quantize(COLOURS).save(
-            IMAGES / picture, optimize=True
-        )  # a third of the size
+        # a third of the size
+        shot.convert("RGB").quantize(COLOURS).save(IMAGES / picture, optimize=True)
         browser.open("about:blank")
 
 

@@ -37,9 +37,8 @@ from rosidl_adapter.parser import (
 
 BUILD = Path(__file__).resolve().parents[1] / "build" / "messages"
 KINDS = ("msg", "srv", "action")
-MISSING = re.compile(
-    r'package configuration\s+file\s+provided\s+by\s+"(\w+)"'
-)  # of CMake's find_package
+# of CMake's find_package
+MISSING = re.compile(r'package configuration\s+file\s+provided\s+by\s+"(\w+)"')
 LAST_LINES = 15  # of a failed step
 
 

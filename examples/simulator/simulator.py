@@ -24,9 +24,8 @@ EFFECTS = {
     "V": ("thrust", 6.0),
 }
 DAMPING = 0.5  # 1/s
-KEPT = QoSProfile(
-    depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)  # in lockstep no sample may be lost
+# in lockstep no sample may be lost
+KEPT = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 speed = float(sys.argv[1])
 y, u = dict.fromkeys(EFFECTS, 0.0), {}
@@ -50,20 +49,17 @@ with suppress(KeyboardInterrupt):
         clock = Clock()
         clock.clock.sec, clock.clock.nanosec = divmod(t, SECOND)
         if t % SAMPLE == 0:
-            u = dict(
-                zip(received["u"].name, received["u"].position, strict=True)
-            )  # the servos take the u of the last sample
+            # the servos take the u of the last sample
+            u = dict(zip(received["u"].name, received["u"].position, strict=True))
             sample = JointState(name=list(y), position=list(y.values()))
             sample.header.stamp = clock.clock
             y_publisher.publish(sample)  # before the clock: a node then finds y at its tick
         clock_publisher.publish(clock)
-        due = (
-            max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0
-        )  # a pause is not caught up with
+        # a pause is not caught up with
+        due = max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0
         rclpy.spin_once(node, timeout_sec=0.0)
-        while time.monotonic() < due or (
-            not speed and t % SAMPLE == 0 and answered() < t
-        ):  # lockstep: u answers this y
+        # lockstep: u answers this y
+        while time.monotonic() < due or (not speed and t % SAMPLE == 0 and answered() < t):
             rclpy.spin_once(node, timeout_sec=0.0005)
         for output, (name, effect) in EFFECTS.items():
             y[output] += STEP / SECOND * (effect * u.get(name, 0.0) - DAMPING * y[output])

@@ -40,10 +40,8 @@ RISE_DI = typer.main.get_command(application([*COMMANDS]))
 
 def rise_di(words: list[str]) -> None:
     """The command and its options exist, and their values have the right types."""
-    with (
-        suppress(typer.Exit),
-        RISE_DI.make_context("rise-di", [*words]) as context,
-    ):  # --help and --version exit
+    # --help and --version exit
+    with suppress(typer.Exit), RISE_DI.make_context("rise-di", [*words]) as context:
         name, command, rest = RISE_DI.resolve_command(  # type: ignore[attr-defined]
             context, [*context._protected_args, *context.args]
         )

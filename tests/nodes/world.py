@@ -265,9 +265,8 @@ class World:
         self.subscriptions: list[Subscription] = []
         # by the full name of the topic
         self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(list)
-        self.answers: dict[
-            str, Callable[[Any], Any]
-        ] = {}  # services of the test, by their full names
+        # services of the test, by their full names
+        self.answers: dict[str, Callable[[Any], Any]] = {}
         self.loops: dict[AnyNode, RealTime] = {}
         self.nodes: list[AnyNode] = []
         # of the test, by full topic

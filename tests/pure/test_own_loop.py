@@ -133,9 +133,8 @@ def test_wrong_parts_are_refused(parts: dict[str, Any], sentence: str) -> None:
 def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     law = rise_di.as_control(CONTROLLER)
     y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
-    v = np.concatenate(
-        [y - y[0], y_m], axis=1
-    ).T  # from trim: the engagement of x = 0 has y = y_m = 0
+    # from trim: the engagement of x = 0 has y = y_m = 0
+    v = np.concatenate([y - y[0], y_m], axis=1).T
     loop = rise_di.Loop(CONTROLLER)
     u = np.array(
         [loop.step(t, *np.split(row, 2)) for t, row in zip(flown.time("u"), v.T, strict=True)]

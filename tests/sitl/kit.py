@@ -651,16 +651,14 @@ class Px4(Autopilot):
         while not armed:
             assert time.monotonic() < deadline, "PX4 does not arm"
             time.sleep(1.0)
-            with suppress(
-                AssertionError
-            ):  # not running yet, or refused until its estimator is ready
+            # not running yet, or refused until its estimator is ready
+            with suppress(AssertionError):
                 self.say("commander", "takeoff")
                 armed = self.state()["arming_state"] == ARMED
 
         def climbed(state: dict[str, Any]) -> bool:
-            if (
-                state["nav_state"] == HOLD and state["alt"] < 5.0
-            ):  # armed before its estimator had a position
+            # armed before its estimator had a position
+            if state["nav_state"] == HOLD and state["alt"] < 5.0:
                 self.say("commander", "takeoff")
             return bool(state["alt"] > 20.0)
 
@@ -772,9 +770,8 @@ class Quadrotor(Px4):
         while self.state().get("arming_state") != ARMED:
             assert time.monotonic() < deadline, "PX4 does not arm"
             time.sleep(1.0)
-            with suppress(
-                AssertionError
-            ):  # not running yet, or refused until its estimator is ready
+            # not running yet, or refused until its estimator is ready
+            with suppress(AssertionError):
                 self.say("commander", "takeoff")
         self.until(lambda state: state["alt"] > self.hover - 5.0, timeout=120.0)
         self.level()

@@ -290,9 +290,8 @@ def test_the_pilot_has_the_aircraft_again(
         if (undo := event.act(plane, flight)) is not None:
             afterwards.callback(undo)
         sticks_at = sticks_act(plane, began)
-        if (
-            "killed" not in name or event.act is kill_agent
-        ):  # without one of its nodes the flight ends by itself
+        # without one of its nodes the flight ends by itself
+        if "killed" not in name or event.act is kill_agent:
             flight.interrupt()
         flight.end()
         afterwards.close()

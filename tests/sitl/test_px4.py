@@ -142,9 +142,8 @@ def test_px4_flies_by_its_own_law_again(
             afterwards.callback(undo)
         px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
         changed = px4.mode_changed() + time.time() - time.monotonic()
-        if (
-            "killed" not in name or event.act is kill_agent
-        ):  # without one of its nodes the flight ends by itself
+        # without one of its nodes the flight ends by itself
+        if "killed" not in name or event.act is kill_agent:
             flight.wait_for("RELEASE").interrupt()
         flight.end()
         afterwards.close()

@@ -224,9 +224,8 @@ def test_fmu_state_is_taken_back_and_a_wrong_gain_is_refused(unit: Path) -> None
     instance.setFMUstate(instance.deSerializeFMUstate(content))
     assert steps(50, 50) == first
     instance.setReal([references["Lambda.q"]], [-1.0])
-    with pytest.raises(
-        Exception, match="fmi2DoStep failed with status 2"
-    ):  # discarded, and the law flies on unchanged
+    # discarded, and the law flies on unchanged
+    with pytest.raises(Exception, match="fmi2DoStep failed with status 2"):
         steps(100, 1)
     instance.setReal([references["Lambda.q"]], [1.0])
     assert np.isfinite(steps(101, 1)).all()

@@ -155,9 +155,8 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
     if law == "lqg":
         return np.zeros(4)
     scale = np.array(parameters.input_scale)
-    if (
-        law == "l1"
-    ):  # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
+    # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
+    if law == "l1":
         passed, Omega = (
             1.0 - np.exp(-np.array(parameters.bandwidth) * DT),
             np.reshape(parameters.Omega, (4, 4)),
@@ -231,9 +230,8 @@ def test_no_integral_winds_up_in_saturation(name: str) -> None:
     for k in range(500, 1000):
         state = tick(parameters, state, 10 * k, 0.5)
     assert state.u == pytest.approx([-0.02] * 4, rel=1e-12)
-    for group, value in fields(
-        state.law
-    ).items():  # the slowest filter is l1's, 4 rad/s: 5 s leave exp(-20) of a change
+    # the slowest filter is l1's, 4 rad/s: 5 s leave exp(-20) of a change
+    for group, value in fields(state.law).items():
         assert_allclose(value, earlier[group], rtol=1e-7, err_msg=group)
     # so u leaves its limit with the first sample of the other sign, as fast as it may
     assert tick(parameters, state, 10_000, -0.5).u == pytest.approx(

@@ -130,9 +130,8 @@ def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = 
             parameters = vary(parameters, change)
             controller.retune(parameters)
         output = controller.tick(now_ns, tick.late * 1000, active=tick.active)
-        if (
-            output is not None and controller.has_internals
-        ):  # else u is at trim before the first engagement
+        # else u is at trim before the first engagement
+        if output is not None and controller.has_internals:
             rows["u"].append((output.stamp_ns, output.u))
             rows["internals"].append((output.stamp_ns, output.internals))
     names = {"y": outputs, "y_m": outputs, "u": parameters.inputs, "internals": controller.names}

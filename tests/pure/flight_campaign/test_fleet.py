@@ -171,9 +171,8 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
         batch.shared(scenario.controller.law_params()),
     )
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
-    for number in (
-        range(2) if name == "turbulence" else (1,)
-    ):  # the second one: what would fly as the first differs
+    # the second one: what would fly as the first differs
+    for number in range(2) if name == "turbulence" else (1,):
         for key, values in alone(scenario, number).items():
             assert np.asarray(getattr(together, key))[:, number] == approx(values, rel=within), (
                 number,

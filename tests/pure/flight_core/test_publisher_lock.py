@@ -89,7 +89,6 @@ def test_delayed_reference_awaited_up_to_age_limit(
             stamps.append(output.stamp_ns)
     assert visited == modes
     assert stamps == sorted(set(stamps))
-    if (
-        late < 0.1
-    ):  # each y is used in order, as late as its y_m, which may be extrapolated by one period
+    # each y is used in order, as late as its y_m, which may be extrapolated by one period
+    if late < 0.1:
         assert 199 * period_ns - stamps[-1] == nanoseconds(late) - period_ns

@@ -379,10 +379,8 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
     ratio = selection.stable_speed_ratio(osprey, controller)
     assert 1.0 < ratio < selection.MAX_SPEED_RATIO
     surfaces = np.array([name != "V" for name in controller.outputs])
-    for factor, stable in (
-        (ratio, True),
-        (ratio + selection.SPEED_STEP, False),
-    ):  # the same response by a larger input_scale
+    # the same response by a larger input_scale
+    for factor, stable in ((ratio, True), (ratio + selection.SPEED_STEP, False)):
         scale = np.where(surfaces, factor**2, 1.0) * controller.input_scale
         scaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
         assert (selection.assess_gains(osprey, scaled, SERVOS).delay_margin != 0.0) == stable

@@ -249,9 +249,8 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         np.zeros(4),
     )
     has_been_inside, has_left = np.zeros(4, dtype=bool), np.zeros(4, dtype=bool)
-    for _ in range(
-        math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)
-    ):  # the longest way round against the wind
+    # the longest way round against the wind
+    for _ in range(math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)):
         v_north, v_east = speed * np.cos(psi) + wind[0], speed * np.sin(psi) + wind[1]
         course, ground_speed = np.arctan2(v_east, v_north), np.hypot(v_north, v_east)
         motion = Motion(

@@ -70,9 +70,8 @@ def test_viewer_gets_messages_of_log_with_definitions(
         await connection.write_message(
             json.dumps({"op": SUBSCRIBE, "subscriptions": [subscription]})
         )
-        with (
-            path.open("ab") as log
-        ):  # the protocol does not acknowledge a subscription: the log grows until messages come
+        # the protocol does not acknowledge a subscription: the log grows until messages come
+        with path.open("ab") as log:
             while not received and (piece := rest.read(5000)):
                 log.write(piece)
                 log.flush()

@@ -521,10 +521,8 @@ def test_part_has_no_further_model_after_its_second_fallback(
     flight.step(1)
     flight.now_ns += NANOSECONDS
     flight.engage()
-    for time, name in (
-        (0.5, "q"),
-        (0.6, "p"),
-    ):  # the fallbacks of the engagement before do not count, nor those of another part
+    # the fallbacks of the engagement before do not count, nor those of another part
+    for time, name in ((0.5, "q"), (0.6, "p")):
         flight.receive(faded(time))
         flight.step()
         assert acting_inputs(flight.controller.parameters) == START.inputs  # type: ignore[arg-type]

@@ -187,9 +187,8 @@ def test_controller_in_real_time_follows_flight_with_stamps_moved_to_now(
     # The recorded aircraft does not respond to this u, and these ticks use other samples of y than
     # the recorded ones. So both u are close but not equal. In 2 s the recorded u reaches 0.06.
     largest = np.abs(read_run(run).tape["u"].values).max()
-    for _ in range(
-        3
-    ):  # again where the host did not run: the controller held u, or ramped it to trim
+    # again where the host did not run: the controller held u, or ramped it to trim
+    for _ in range(3):
         begin = time.time()
         with peer() as peer_node:
             receiving = Receiver(peer_node.node, Y)

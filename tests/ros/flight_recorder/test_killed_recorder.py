@@ -73,9 +73,8 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(
         }
         if k < 7:
             following = recorder(f"run{k + 1}")  # starts in the meantime
-        with pytest.raises(
-            subprocess.TimeoutExpired
-        ):  # the random instant of the kill is the test case
+        # the random instant of the kill is the test case
+        with pytest.raises(subprocess.TimeoutExpired):
             process.popen.wait(float(generator.uniform(0.0, 0.3)))
         process.popen.kill()
         missing.append(missing_seconds(folder, witness))

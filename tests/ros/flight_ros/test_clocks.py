@@ -25,11 +25,8 @@ def test_refusal_names_clock_of_the_other_node(start_node: Start, tmp_path: Path
     name = f"/aircraft#{aircraft.popen.pid}"
     estimate = rf"the clock of {name} is (0\.\d+) s behind this one"
 
-    def told(
-        sentence: str,
-    ) -> (
-        bool
-    ):  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
+    # the first estimate has the delays of a busy host, and one within 5 ms is not told again
+    def told(sentence: str) -> bool:
         return any(
             float(offset) == pytest.approx(0.15, abs=0.01)
             for offset in re.findall(sentence, controller.output)

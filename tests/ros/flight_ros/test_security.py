@@ -109,9 +109,8 @@ def hosts() -> Iterator[Hosts]:
                 "link set lo up",
             ):
                 subprocess.run([*place, ip, *command.split()], check=True)
-        for (
-            place
-        ) in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
+        # it takes up to a second, and Fast DDS ignores a device that is not up
+        for place in places:
             until(partial(is_up, [*place, ip, "link", "show", name]), "a device that is up")
         yield Hosts(*places)
     finally:

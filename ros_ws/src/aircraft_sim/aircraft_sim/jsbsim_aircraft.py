@@ -51,9 +51,8 @@ NamedProperties = tuple[tuple[str, float], ...]
 """Properties of a model, and the value of each at the command 1."""
 
 
-PROPERTY = re.compile(
-    r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+"
-)  # outside of JSBSim's settings
+# outside of JSBSim's settings
+PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")
 
 
 def named_properties(

@@ -112,9 +112,8 @@ class JsbsimModel:
         self._altitude = self._node("position/h-sl-ft")
         self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._apply_wind(self._wind(0))
-        settle(
-            self._fdm, seconds(condition.step_ns)
-        )  # one step: the wind of t = 0 acts from t = 0 on
+        # one step: the wind of t = 0 acts from t = 0 on
+        settle(self._fdm, seconds(condition.step_ns))
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
         self._velocity = self._ground_velocity()

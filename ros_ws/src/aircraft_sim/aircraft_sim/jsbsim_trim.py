@@ -74,16 +74,14 @@ NEAR = 100.0
 FAR = 1e6  # of TOLERANCE: of a motion whose accelerations are not finite
 IDLE = 0.01  # throttle below which an engine without thrust is no failure
 
-START = np.array(
-    [0.05, 0.7, 0.0, 0.0, 0.0, 0.0]
-)  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
+# alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
+START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
 # of these unknowns
 LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
 HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
-TOLERANCE = np.array(
-    [0.02, 0.02, 0.02, 0.002, 0.002, 0.002]
-)  # m/s^2, rad/s^2: a tenth of a degree of attitude
+# m/s^2, rad/s^2: a tenth of a degree of attitude
+TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 
 NOT_BALANCED = "are left at best"  # words of a trim that the solver does not reach
 AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")
@@ -299,9 +297,8 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
             if residual < nearest or not problem:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
-            fdm = _load(
-                condition
-            )  # a solver far from a trim may have left it with numbers that are not finite
+            # a solver far from a trim may have left it with numbers that are not finite
+            fdm = _load(condition)
     except jsbsim.BaseError as error:
         problem = error_text(error)
     raise FlightEnded(
@@ -360,9 +357,8 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
     jsbsim.set_logger(log)  # of this thread
     fdm = jsbsim.FGFDMExec(str(root() if foreign is None else folder))
     fdm.set_debug_level(0)
-    fdm.set_output_path(
-        os.devnull
-    )  # some models write tables into the working folder while they load
+    # some models write tables into the working folder while they load
+    fdm.set_output_path(os.devnull)
     if foreign is not None:
         files = model_files(foreign)
         fdm.set_aircraft_path(str(files.write(folder).parent))
@@ -429,9 +425,8 @@ def _solve_accelerations(
         return residuals(fdm)
 
     _start_engines(fdm, condition)
-    if (
-        by_elevator
-    ):  # inside the stops, also where an input has no effect: a flying wing has no rudder
+    # inside the stops, also where an input has no effect: a flying wing has no rudder
+    if by_elevator:
 
         def weighted(scaled: FloatArray) -> FloatArray:
             return np.asarray(

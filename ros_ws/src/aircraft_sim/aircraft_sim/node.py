@@ -49,9 +49,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = PublisherLock(self._timeouts_ns)
         self._timeout_logged = False
-        self._ages_of_u: list[
-            int
-        ] = []  # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
+        # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
+        self._ages_of_u: list[int] = []
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(
             U, decode, self._accept_u, max_age_ns=self._max_u_age_ns, lock=self._publisher_lock
@@ -102,9 +101,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
         awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
         if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
-            self._publish_pose(
-                self._empty_encoder.encode(stamp_ns, NO_CHANNELS)
-            )  # no pose of this instant comes later
+            # no pose of this instant comes later
+            self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
     def advance(self) -> bool:
@@ -116,13 +114,11 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return False
         if self._ahead_of_log():
             return False
-        waits_ns = (
-            -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
-        )  # the next instant that needs a u
+        # the next instant that needs a u
+        waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
         until_ns = min(waits_ns, self._end_ns or waits_ns)
-        self._publish_clock(
-            instant(until_ns)
-        )  # first: the reference model computes y_m while the aircraft integrates
+        # first: the reference model computes y_m while the aircraft integrates
+        self._publish_clock(instant(until_ns))
         messages: list[bytes] = []
         while (t_ns := self._number * self.period_ns()) <= until_ns:
             messages += self._fly_to(self._number, 0, self._u) or [
@@ -165,9 +161,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        valid = self._u_receiver.poll(
-            now_ns, 1 if self.parameters.lockstep else None
-        )  # in lockstep there is one u for each y
+        # in lockstep there is one u for each y
+        valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
             if publisher is None and not self.parameters.lockstep:

@@ -515,9 +515,8 @@ class AircraftConfig(NodeConfig):
         section = self.turbulence
         if section is None or not (section.wind or section.sigma):  # off, or of intensity 0
             return None
-        spectrum = dryden(
-            section.altitude, section.wind or 0.0, section.sigma or 0.0
-        )  # None where it has no effect
+        # None where it has no effect
+        spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)
         every = (*AXES, *ROTARY)
         places = [every.index(axis) for axis in axes]
         return filters(spectrum, speed, self.step, places, section.seed, span)

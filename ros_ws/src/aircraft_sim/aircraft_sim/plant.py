@@ -192,9 +192,8 @@ def advance(
 
 def diverged(state: AircraftState) -> bool:
     """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
-    return not all(
-        abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist()
-    )  # the comparison is false for NaN too
+    # the comparison is false for NaN too
+    return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())
 
 
 def output(state: AircraftState, plant: PlantParams) -> Array:

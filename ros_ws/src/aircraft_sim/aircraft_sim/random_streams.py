@@ -16,9 +16,8 @@ ROTARY, ROTARY_START = range(8, 10)
 """Streams, one for each use. Under the same seed they are independent of each other."""
 
 
-def generator(
-    number: int, stream: int, seed: int
-) -> "np.random.Generator":  # as a text: np.random loads when it is used
+# as a text: np.random loads when it is used
+def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
     """Generator of draw `number` >= 0 of a stream, with seed >= 0.
 
     Source: Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC11 (Philox).

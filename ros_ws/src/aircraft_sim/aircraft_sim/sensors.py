@@ -43,9 +43,8 @@ class Measured(NamedTuple):
     drift: Drift
 
 
-DelayLine = tuple[
-    StampedVector, ...
-]  # samples that have been measured and have not arrived yet, the oldest first
+# samples that have been measured and have not arrived yet, the oldest first
+DelayLine = tuple[StampedVector, ...]
 
 
 def initial_drift(params: Sensors) -> Drift:

@@ -35,9 +35,8 @@ deviations; or the two limits, with equal probability."""
 class Spread(NamedTuple):
     """How the entries of A and B are drawn."""
 
-    entries: Mapping[str, float] = MappingProxyType(
-        {}
-    )  # uncertainty by entry, named as in `drawn_entries`
+    # uncertainty by entry, named as in `drawn_entries`
+    entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
 
 

@@ -81,9 +81,8 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self._moves = np.ones(
-            len(self.inputs), dtype=bool
-        )  # whether the newest u differs from the one before
+        # whether the newest u differs from the one before
+        self._moves = np.ones(len(self.inputs), dtype=bool)
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}

@@ -31,9 +31,8 @@ rosbags."""
 
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
-REQUEST = re.compile(
-    r"^---\s*$", re.MULTILINE
-)  # what ends the request in the definition of a service
+# what ends the request in the definition of a service
+REQUEST = re.compile(r"^---\s*$", re.MULTILINE)
 VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
 
 

@@ -89,9 +89,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._link = self._open_link()
         self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._conflict = ""  # the topics that have two publishers, as a sentence
-        self._recorded: dict[
-            str, tuple[Callable[[bytes], None], Encoder]
-        ] = {}  # what comes over MAVLink, as named vectors
+        # what comes over MAVLink, as named vectors
+        self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
@@ -132,9 +131,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._publish_would_send = self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        self._pose_encoders: dict[
-            tuple[str, ...], Encoder
-        ] = {}  # by the names of the fresh channels
+        # by the names of the fresh channels
+        self._pose_encoders: dict[tuple[str, ...], Encoder] = {}
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
         self.create_service(SetBool, "~/engage", self._engage)
@@ -237,9 +235,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        if (
-            self._pause_ns() <= self._longest_pause_ns
-        ):  # else the tick was stopped half-way, and its u is old
+        # else the tick was stopped half-way, and its u is old
+        if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
 
@@ -391,9 +388,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        restarted = (
-            bool(before) and self._u_sender != before
-        )  # it can take less time than the loss of the service
+        # it can take less time than the loss of the service
+        restarted = bool(before) and self._u_sender != before
         if (
             ready
             and (restarted or not self._controller_ready)

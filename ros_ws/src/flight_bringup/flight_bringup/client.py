@@ -78,9 +78,8 @@ class FlightGearClient(Client):
             while (now := time.monotonic()) - heard < POSE_TIMEOUT:
                 if self._take():
                     heard = now
-                with suppress(
-                    OSError
-                ):  # FlightGear is not started yet, or the network is down for a while
+                # FlightGear is not started yet, or the network is down for a while
+                with suppress(OSError):
                     sender.sendto(packet(self._newest, origin, ground, int(time.time())), address)
                 time.sleep(1.0 / rate)
 

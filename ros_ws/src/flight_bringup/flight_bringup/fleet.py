@@ -342,9 +342,8 @@ def fly_fleet(
         except KeyboardInterrupt:
             pass
         finally:
-            with handle_signals(
-                signal.SIG_IGN
-            ):  # as of FlightProcesses.stop, which runs in other threads
+            # as of FlightProcesses.stop, which runs in other threads
+            with handle_signals(signal.SIG_IGN):
                 for flight in flights:
                     flight.end(flight.outcome)
                 for flight in flights:

@@ -386,9 +386,8 @@ class FlightProcesses:
 
         At the end of a lockstep flight a learner completes its search first.
         """
-        with handle_signals(
-            signal.SIG_IGN
-        ):  # a second Ctrl-C must not interrupt this: it would truncate the log
+        # a second Ctrl-C must not interrupt this: it would truncate the log
+        with handle_signals(signal.SIG_IGN):
             if self.processes:
                 leave_outcome(self._run, self.outcome)
             searches = self.lockstep and self.outcome == COMPLETED and self.scenario.learns()

@@ -329,9 +329,8 @@ def advance(
     blocks = timing.blocks
     u_late = timing.u_late
     flown = now.mission
-    places = np.argsort(
-        [*chain.from_iterable(block.rows for block in blocks)]
-    )  # of the states in the order of the blocks
+    # of the states in the order of the blocks
+    places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
     acting = (
         command

@@ -54,9 +54,8 @@ class Fleet(NamedTuple):
     """
 
     blocks: tuple[StateBlock, ...]
-    tick: tuple[
-        Array, ...
-    ]  # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
+    # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
+    tick: tuple[Array, ...]
     forced: Array  # (n, K r, N)
     # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
     rate: Array

@@ -61,9 +61,8 @@ class Course(NamedTuple):
     """
 
     segments: Segments
-    axes: NDArray[
-        np.int64
-    ]  # (g,) indices of the axes of the airframe's gusts along which there is wind
+    # (g,) indices of the axes of the airframe's gusts along which there is wind
+    axes: NDArray[np.int64]
     # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
     basis: FloatArray
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y

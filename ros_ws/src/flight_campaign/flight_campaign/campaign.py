@@ -93,10 +93,8 @@ class Sweep(Config):
                 else factor * float(value)
             )
         m = len(controller.outputs)
-        by_channel = isinstance(value, tuple) and len(value) in (
-            m - 1,
-            m,
-        )  # k_d of (22) has none for the last
+        # k_d of (22) has none for the last
+        by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
         )
@@ -272,9 +270,8 @@ def define(
             from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 
             missions.build(scenario, course)
-    published = scenario.vary(
-        aircraft={"uncertainty": {}}
-    )  # each aircraft of the campaign has its own
+    # each aircraft of the campaign has its own
+    published = scenario.vary(aircraft={"uncertainty": {}})
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
     stated_units = _permitted_units(scenario, units or {})

@@ -166,9 +166,8 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    if learn is not None and (
-        learn.prior is None or learn.prior.file is None
-    ):  # the learner begins with the airframe, not with the corner
+    # the learner begins with the airframe, not with the corner
+    if learn is not None and (learn.prior is None or learn.prior.file is None):
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
         )

@@ -52,14 +52,12 @@ class LawResult(NamedTuple):
     costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
-    lost_late: dict[
-        float, float
-    ]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    lost_late: dict[float, float]
     rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
     slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
-    margins: (
-        Margins | None
-    )  # of the nominal aircraft; None for a law without a linear loop from y to u
+    # of the nominal aircraft; None for a law without a linear loop from y to u
+    margins: Margins | None
 
 
 def compare(

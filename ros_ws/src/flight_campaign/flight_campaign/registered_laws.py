@@ -123,9 +123,8 @@ def find_laws(
                 getattr(controller, key),
                 f"{expected}, as in {scenario.name}",
             )
-        controllers[name] = controller.model_copy(
-            update={"delay": 0.0}
-        )  # in a benchmark topics have no delay
+        # in a benchmark topics have no delay
+        controllers[name] = controller.model_copy(update={"delay": 0.0})
     return controllers
 
 

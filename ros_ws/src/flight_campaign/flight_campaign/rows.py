@@ -26,9 +26,8 @@ class Chunk(NamedTuple):
     first: int  # number of the first
     diverged: FloatArray  # (N,)
     figures: dict[str, FloatArray]  # (N,) each, by name
-    entries: dict[
-        str, FloatArray
-    ]  # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
+    # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
+    entries: dict[str, FloatArray]
 
 
 def joined(parts: Sequence[Chunk]) -> Chunk:

@@ -45,9 +45,8 @@ class Figure(Config):
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # none yet
-    bins: dict[int, int] = Field(
-        default={}
-    )  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
+    # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
+    bins: dict[int, int] = Field(default={})
 
     @classmethod
     def from_values(cls, values: FloatArray) -> Self:
@@ -113,9 +112,8 @@ class Tally(Config):
     flights: int = 0
     diverged: int = 0
     lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
-    figures: dict[str, Figure] = Field(
-        default={}
-    )  # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    figures: dict[str, Figure] = Field(default={})
     worst: tuple[Worst, ...] = ()  # the worst first
 
     @classmethod

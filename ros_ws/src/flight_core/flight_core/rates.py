@@ -31,9 +31,8 @@ def divide(whole_ns: int, part_ns: int, key: str, whole_name: str) -> int:
     """Number of parts in the whole. Raises ParameterError naming `key` unless the number is an
     integer.
     """
-    if (
-        part_ns <= 0 or whole_ns % part_ns
-    ):  # asked first: the sentence takes longer than the division
+    # asked first: the sentence takes longer than the division
+    if part_ns <= 0 or whole_ns % part_ns:
         expected = f"a whole fraction of {whole_name} ({seconds(whole_ns):g} s)"
         raise ParameterError(f"{key}: found {seconds(part_ns):g} s, expected {expected}")
     return whole_ns // part_ns

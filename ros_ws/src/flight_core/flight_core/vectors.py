@@ -168,9 +168,8 @@ def select(
         selected = np.array(values, dtype=np.float64)
     else:
         selected = np.asarray(values, dtype=np.float64)[_places(tuple(wanted), tuple(names))]
-    if not all(
-        map(math.isfinite, selected.tolist())
-    ):  # a third of the time of np.isfinite for a few channels
+    # a third of the time of np.isfinite for a few channels
+    if not all(map(math.isfinite, selected.tolist())):
         raise ChannelError("finite", f"{', '.join(wanted)} = {selected.tolist()} is not finite")
     return selected
 

@@ -83,9 +83,8 @@ class GuidanceClient(Client):
             )
             return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
         finally:
-            self._node.destroy_publisher(
-                publisher
-            )  # else guidance that starts later would receive the route, and fly it
+            # else guidance that starts later would receive the route, and fly it
+            self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
         """Whether guidance is among the subscribers in the graph, and each of them has been

@@ -195,9 +195,8 @@ class Inputs(NamedTuple):
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    commands: Mapping[
-        str, float
-    ]  # commands that are new, by channel of Target; they name the modes
+    # commands that are new, by channel of Target; they name the modes
+    commands: Mapping[str, float]
     authority: Authority = Authority()  # of the inputs, as learned in flight
 
 

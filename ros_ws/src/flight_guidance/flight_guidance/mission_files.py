@@ -83,10 +83,8 @@ def has_first_fence(tree: Any) -> bool:
     )
 
 
-TRANSECTS = (
-    "survey",
-    "CorridorScan",
-)  # complexItemType, with the waypoints that QGroundControl made
+# complexItemType, with the waypoints that QGroundControl made
+TRANSECTS = ("survey", "CorridorScan")
 LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
 
 
@@ -152,9 +150,8 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], Home | None]:
         index, _, frame, command, *params = (
             value for value in numbers[:-1] if isinstance(value, float)
         )
-        if (
-            index == 0 and frame == 0 and command == WAYPOINT and not items
-        ):  # ArduPilot's item 0 is the home
+        # ArduPilot's item 0 is the home
+        if index == 0 and frame == 0 and command == WAYPOINT and not items:
             home = Home(*params[4:7]) if params[4] or params[5] else None
             continue
         items.append(

@@ -379,9 +379,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
         imu.header.stamp = odometry.header.stamp
         imu.header.frame_id = self._body
-        imu.linear_acceleration_covariance[
-            0
-        ] = -1.0  # no estimate, as the definition of the message says
+        # no estimate, as the definition of the message says
+        imu.linear_acceleration_covariance[0] = -1.0
         self._imu.publish(imu)
         wind = Vector3Stamped(header=odometry.header)
         if (state := self._guidance.state) is not None:

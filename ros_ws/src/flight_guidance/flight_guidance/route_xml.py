@@ -80,9 +80,8 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     polygons = _outer_elements(kinds, "Polygon")
     tracks = _outer_elements(kinds, "Track")
     marks = _outer_elements(kinds, "Placemark")
-    others = [
-        kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks
-    ]  # whose Model is a sign
+    # whose Model is a sign
+    others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks]
     geometries: list[Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:

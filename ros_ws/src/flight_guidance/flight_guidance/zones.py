@@ -55,12 +55,10 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
-    level = np.where(
-        edge_north == 0.0, 1.0, edge_north
-    )  # an edge to the east crosses no line to the east
-    crossed = ((x < 0.0) != (x < edge_north)) & (
-        y < x * edge_east / level
-    )  # by a ray to the east: even-odd rule
+    # an edge to the east crosses no line to the east
+    level = np.where(edge_north == 0.0, 1.0, edge_north)
+    # by a ray to the east: even-odd rule
+    crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
 
 

@@ -92,9 +92,8 @@ class StampClock:
                 after_step = int(known[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            if (
-                self._last_ns is None
-            ):  # the messages before are too few to be the begin of the clock
+            # the messages before are too few to be the begin of the clock
+            if self._last_ns is None:
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
                 keep[known[:first]] &= (away_ns >= -STEP_NS) & (

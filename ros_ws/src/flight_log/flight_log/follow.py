@@ -74,9 +74,8 @@ class Follower:
         self.run = run
         self.complete = False  # the end of the data has been read
         self.fault = ""  # why nothing more of the log can be read
-        self.definitions: dict[
-            str, str
-        ] = {}  # of the message types that have occurred, ros2msg, by name
+        # of the message types that have occurred, ros2msg, by name
+        self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
         self._remaps = remaps
         self._read_files: list[Path] = []

@@ -97,9 +97,8 @@ class TopicSamples:
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode = decode
         self._expected = expected
-        self._batch: list[
-            tuple[Table, NDArray[np.int64], NDArray[np.int64]]
-        ] = []  # of one length; log times, steps of numbers
+        # of one length; log times, steps of numbers
+        self._batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
         self._batched = 0  # messages
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
@@ -264,9 +263,8 @@ class LogContent:
         self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
         self.lines: list[bytes] = []  # of /rosout: that a node is ready
         self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        self.reports: dict[
-            str, list[tuple[int, bytes]]
-        ] = {}  # of bridges by full topic name: time of sending, ns, and message
+        # of bridges by full topic name: time of sending, ns, and message
+        self.reports: dict[str, list[tuple[int, bytes]]] = {}
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
 

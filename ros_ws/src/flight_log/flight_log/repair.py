@@ -49,9 +49,8 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
-    missing: tuple[
-        str, ...
-    ] = ()  # names of the files that metadata.yaml names and the folder lacks
+    # names of the files that metadata.yaml names and the folder lacks
+    missing: tuple[str, ...] = ()
 
 
 def repair(run: Path) -> Repair:

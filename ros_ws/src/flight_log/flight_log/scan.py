@@ -155,9 +155,8 @@ class Scan:
         self.endless = 0  # bytes of a record that no file holds, at `position`
         # the latest log time in the index and the chunk headers, including lost messages
         self.known_end_ns = 0
-        self.message_counts: dict[
-            int, int
-        ] = {}  # by channel, as the index has them; known from the first record on
+        # by channel, as the index has them; known from the first record on
+        self.message_counts: dict[int, int] = {}
         self._messages = 0  # that have been read
 
     @property
@@ -525,9 +524,8 @@ def decompress(chunk: bytes) -> bytes:
     if size > max(MAX_CHUNK_BYTES, len(compressed)):
         raise McapError(f"a chunk with a size of {size} bytes")
     if compression == b"zstd":
-        if (
-            zstandard.frame_content_size(compressed) > size
-        ):  # the decompressor would allocate that much
+        # the decompressor would allocate that much
+        if zstandard.frame_content_size(compressed) > size:
             raise McapError("a chunk that holds more than its size")
         data = _OF_THREAD.zstd.decompress(compressed, max_output_size=size)
     elif compression == b"lz4":

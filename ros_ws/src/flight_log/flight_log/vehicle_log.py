@@ -151,9 +151,8 @@ class VehicleLog(NamedTuple):
     # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
     # (mode.h)
     manual: int = 0
-    taken: tuple[
-        tuple[str, str], ...
-    ] = ()  # of several systems, sensors or instances: what is taken, and why
+    # of several systems, sensors or instances: what is taken, and why
+    taken: tuple[tuple[str, str], ...] = ()
 
     def source(self, quantity: str) -> Source | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""

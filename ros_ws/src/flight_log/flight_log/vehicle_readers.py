@@ -155,9 +155,8 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
 
     wanted = _wanted(TLOG)
-    autopilots: dict[
-        int, tuple[int, int]
-    ] = {}  # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
+    # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
+    autopilots: dict[int, tuple[int, int]] = {}
     received: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
     with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name

@@ -87,9 +87,8 @@ class FlightNode(Node, Generic[P]):
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
-        self._waiting: dict[
-            str, tuple[int, int]
-        ] = {}  # by topic: last call, and when to log it next
+        # by topic: last call, and when to log it next
+        self._waiting: dict[str, tuple[int, int]] = {}
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS)
         )

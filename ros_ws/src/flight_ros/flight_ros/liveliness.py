@@ -63,9 +63,8 @@ class LivelinessMonitor:
         After a clean shutdown a role is lost after SHUTDOWN_GRACE_NS, unless a report names the
         role with the first end.
         """
-        for subscription in (
-            self._subscriptions
-        ):  # the executor may serve a report later than the end of its publisher
+        # the executor may serve a report later than the end of its publisher
+        for subscription in self._subscriptions:
             for message, _ in take_messages(subscription, 1):
                 self._on_report(message)
         if self._dead or not self._left or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:

@@ -127,9 +127,8 @@ class Decoder:
             return sample
         seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
         value = np.frombuffer(raw, "<f8", len(self._names), self._place)[self._order]
-        if (
-            not math.isfinite(value.sum()) and not np.isfinite(value).all()
-        ):  # the sum of finite values can overflow
+        # the sum of finite values can overflow
+        if not math.isfinite(value.sum()) and not np.isfinite(value).all():
             raise ChannelError(
                 "finite", f"{', '.join(self._wanted)} = {value.tolist()} is not finite"
             )

@@ -58,9 +58,8 @@ class Refusals:
         # the end of a sentence on the stamp of a sender whose clock differs
         self.clock_of = clock_of
         self.counts: Counter[str] = Counter()  # by "topic: reason"
-        self.last: dict[
-            str, tuple[int, str]
-        ] = {}  # by full topic: instant on the monotonic clock, and sentence
+        # by full topic: instant on the monotonic clock, and sentence
+        self.last: dict[str, tuple[int, str]] = {}
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
         self._conflict = ""

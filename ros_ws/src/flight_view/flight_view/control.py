@@ -38,9 +38,8 @@ GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without argu
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
-SYSTEM_TIME_NS = (
-    10**17
-)  # stamps above are of the system clock, stamps of a lockstep flight begin at 0
+# stamps above are of the system clock, stamps of a lockstep flight begin at 0
+SYSTEM_TIME_NS = 10**17
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
@@ -278,9 +277,8 @@ class Control:
             "undo": len(self._undo),
             "targets": list(TARGETS),
         }
-        known = (
-            scenario is not None and self._digest and "controller" in nodes
-        )  # the digest is that of a refresh
+        # the digest is that of a refresh
+        known = scenario is not None and self._digest and "controller" in nodes
         if scenario is not None and known and gains_of(scenario.controller):
             shown |= {
                 "gains": self._gains(scenario),

@@ -365,9 +365,8 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            self.description |= described(
-                self.scenario
-            )  # reads the airframe, maybe a file of another machine
+            # reads the airframe, maybe a file of another machine
+            self.description |= described(self.scenario)
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
 
@@ -401,9 +400,8 @@ class Flight:
         # widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        if names != topic.names and sorted(names) == sorted(
-            topic.names
-        ):  # of a second publisher: values are matched by name
+        # of a second publisher: values are matched by name
+        if names != topic.names and sorted(names) == sorted(topic.names):
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
             shown = GROUPS.get(topic.name)
@@ -422,9 +420,8 @@ class Flight:
             samples = self.samples[topic.name] = Series(
                 tuple(_text(names[i]) for i in topic.columns)
             )
-            samples.thinned = (
-                0 if narrower is None else narrower.thinned + 1
-            )  # pages read the topic again
+            # pages read the topic again
+            samples.thinned = 0 if narrower is None else narrower.thinned + 1
         samples = self.samples[topic.name]
         if topic.name == POSE and set(names) < set(topic.names):
             return

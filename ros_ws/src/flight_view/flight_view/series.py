@@ -79,9 +79,8 @@ class Series:
         """
         grouped = self.count - self.count % 4
         k = len(self.names)
-        for start in range(
-            0, grouped, BLOCK
-        ):  # in place: temporary arrays of all rows would stay in the heap of the process
+        # in place: temporary arrays of all rows would stay in the heap of the process
+        for start in range(0, grouped, BLOCK):
             groups = self._values[start : min(start + BLOCK, grouped)].reshape(-1, 4, k)
             thin = np.stack(
                 [np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1

@@ -288,9 +288,8 @@ class _LimitedServer(HTTPServer):
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        self._admitted: dict[
-            IOStream, bool
-        ] = {}  # by connection in the order of arrival: whether it has a place for long
+        # by connection in the order of arrival: whether it has a place for long
+        self._admitted: dict[IOStream, bool] = {}
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._leave_out_closed()
@@ -460,9 +459,8 @@ class _News(_Handler, WebSocketHandler):
             parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
         )
         self._since = time.monotonic()
-        self._answered = (
-            asyncio.get_running_loop().create_future()
-        )  # done once the answer is in the buffers of the network
+        # done once the answer is in the buffers of the network
+        self._answered = asyncio.get_running_loop().create_future()
         self.look()
         return self._answered  # before it is done, the next message is not read
 
@@ -475,9 +473,8 @@ class _News(_Handler, WebSocketHandler):
         if self._known is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
-                if (
-                    self._sending is not None and not self._sending.done()
-                ):  # the peer does not read the end of the answer either
+                # the peer does not read the end of the answer either
+                if self._sending is not None and not self._sending.done():
                     self._peer.close()
             return
         try:

@@ -96,9 +96,8 @@ def _attitude(flight: Flight) -> str:
         math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi")
     )
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
-    turned = (
-        f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
-    )  # a pose may have no psi
+    # a pose may have no psi
+    turned = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
     angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {turned} deg"
     placed = (
         f", altitude {altitude:.1f} m, climb {climb:+.1f} m/s" if math.isfinite(altitude) else ""

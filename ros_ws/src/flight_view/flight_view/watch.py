@@ -109,9 +109,8 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
         try:
             server.listen(port)
         except OSError as error:
-            reason = os.strerror(
-                error.errno or 0
-            )  # the sentence of `strerror` may hold the address
+            # the sentence of `strerror` may hold the address
+            reason = os.strerror(error.errno or 0)
         else:
             break
     else:
@@ -125,10 +124,8 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
     )
     follow = asyncio.ensure_future(server.follow())
     loop = asyncio.get_running_loop()
-    for number in (
-        signal.SIGINT,
-        signal.SIGTERM,
-    ):  # also when a shell started this in the background, with SIGINT ignored
+    # also when a shell started this in the background, with SIGINT ignored
+    for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, follow.cancel)
     try:
         await follow

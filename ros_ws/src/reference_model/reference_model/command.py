@@ -44,9 +44,8 @@ def command(t: Array, profile: Profile) -> Array:
     elapsed = xp.maximum(since, 0.0 * since)
     rising = xp.minimum(elapsed, profile.rise + 0.0 * elapsed)
     angle = profile.frequency * t + profile.phase
-    ones = xp.ones_like(
-        profile.change[0, :]
-    )  # a product with it sums over the edges several times faster than xp.sum
+    # a product with it sums over the edges several times faster than xp.sum
+    ones = xp.ones_like(profile.change[0, :])
     w = (profile.change * rising) @ ones / profile.rise + profile.amplitude * xp.sin(angle)
     w_integral = (
         profile.change * (rising * rising / (2.0 * profile.rise) + elapsed - rising)

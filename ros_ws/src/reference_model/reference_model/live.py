@@ -24,9 +24,8 @@ class LiveParams(NamedTuple):
     bounds: FloatArray  # (m,) largest absolute values of u_m
     reach: FloatArray  # (m,) largest changes of u_m from step to step
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
-    channels: (
-        tuple[int, int, int, int | None] | None
-    )  # places of q, V, p, r in u_m, of r None without rudder; None where another one is missing
+    # places of q, V, p, r in u_m, of r None without rudder; None where another one is missing
+    channels: tuple[int, int, int, int | None] | None
     gain: tuple[float, float]  # of bank and of pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
 

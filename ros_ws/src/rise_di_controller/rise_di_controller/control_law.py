@@ -58,9 +58,8 @@ class ControlLaw(NamedTuple):
 
     state: type[Any]
     engage: Callable[[Measurements, Any], Any]  # (measured, params) -> state
-    step: Callable[
-        [Any, Measurements, Array, Any], tuple[Any, Array]
-    ]  # (state, measured, dt, params) -> (state, u)
+    # (state, measured, dt, params) -> (state, u)
+    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]]
     """(state, measured, dt, params, limits) -> (state, u before saturation, u)"""
     retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state

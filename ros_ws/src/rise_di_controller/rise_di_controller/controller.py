@@ -344,9 +344,8 @@ class Controller:
         )
         if inputs is None:
             return None
-        if (
-            was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0
-        ):  # a step has another dt
+        # a step has another dt
+        if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
             self._restarted = "u or the state of the law was not finite"
         effects = self._tested(inputs)
         self._measure_vanes(inputs)

@@ -73,9 +73,8 @@ class Oscillations:
 
     def __init__(self, least: FloatArray) -> None:
         """`least`: mean squares below a divergence, (m,)."""
-        self.periods = np.zeros_like(
-            least
-        )  # s, of the oscillations at the last test, (m,); 0 for none
+        # s, of the oscillations at the last test, (m,); 0 for none
+        self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least
         self._largest = np.zeros_like(least)
         self._record = deque[FloatArray](maxlen=round(WINDOW / STEP))

@@ -60,9 +60,8 @@ class GuardParams(NamedTuple):
     # ticks over which a new observer runs before it flies; 0: it starts from the present error
     history: int = 0
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
-    vanes: tuple[
-        int, ...
-    ] = ()  # states of the nominal model read by vanes; the readings follow the outputs in y
+    # states of the nominal model read by vanes; the readings follow the outputs in y
+    vanes: tuple[int, ...] = ()
     over_speed: OverSpeed | None = (
         None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
     )
@@ -408,9 +407,8 @@ def law_within_limits(
     u, effector_values = _within_effectors(
         saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard
     )
-    if not np.array_equal(
-        u, u_free
-    ):  # otherwise `limited` gives the same and takes three times as long
+    # otherwise `limited` gives the same and takes three times as long
+    if not np.array_equal(u, u_free):
         limits = guard.limits if guard.allocation is None else reached(u_free, u)
         after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
         u, effector_values = _within_effectors(u, effectors, dt, guard)

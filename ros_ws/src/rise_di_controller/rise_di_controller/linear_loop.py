@@ -196,9 +196,8 @@ def sampled_plant(
     n, m = plant.B.shape[-2:]
     batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
-    rate = np.where(
-        has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0
-    )  # without an actuator: any rate, unused
+    # without an actuator: any rate, unused
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)
     motion = np.zeros((*batch, n + m, n + m))
     drive = np.zeros((*batch, n + m, m))
     motion[..., :n, :n] = plant.A
@@ -216,9 +215,8 @@ def sampled_plant(
     C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
-    inputs = np.zeros(
-        (*batch, n + m, m + held * m)
-    )  # effect of u of this tick, then of earlier ticks
+    # effect of u of this tick, then of earlier ticks
+    inputs = np.zeros((*batch, n + m, m + held * m))
     for i in range(m):
         split = loop.period - part[i]
         transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)

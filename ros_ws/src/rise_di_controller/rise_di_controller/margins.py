@@ -488,9 +488,8 @@ def _largest_norm(balanced: ComplexArray) -> FloatArray:
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))
-    least = np.abs(np.einsum("NFii->NFi", balanced)).max(
-        axis=(1, 2)
-    )  # a diagonal entry, unchanged by D
+    # a diagonal entry, unchanged by D
+    least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))
     refined = np.zeros(bounds.shape, dtype=bool)

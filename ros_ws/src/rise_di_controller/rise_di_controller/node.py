@@ -67,9 +67,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         LifecycleNodeMixin.__init__(self)
         answer_invalid_transitions(self)
         self._active = False
-        self._publishes = (
-            self.parameters.autostart
-        )  # a standby that was never activated publishes no u beside another's
+        # a standby that was never activated publishes no u beside another's
+        self._publishes = self.parameters.autostart
         self._controller = Controller(self.parameters)
         y_input = self.parameters.measured, self._taking(self._controller.take_y)
         y_m_input = self.parameters.outputs, self._taking(self._controller.take_y_m)

@@ -41,11 +41,8 @@ from rise_di_controller.observer import ObserverParams, filter_matrix, with_obse
 from rise_di_controller.probe import LARGEST, Probe, ProbeConfig
 from rise_di_controller.saturation import Limits
 
-MARGIN_PARTS = (
-    0.0,
-    0.5,
-    1.0,
-)  # of the delay margin, where the nominal loop with an observer has to be stable
+# of the delay margin, where the nominal loop with an observer has to be stable
+MARGIN_PARTS = (0.0, 0.5, 1.0)
 
 MAX_DELAY_PERIODS = 100
 """The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor
@@ -449,9 +446,8 @@ class ControllerConfig(NodeConfig):
         only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
-        if (
-            content["law"] == "rise_di"
-        ):  # logs of versions that had no other law have no name either
+        # logs of versions that had no other law have no name either
+        if content["law"] == "rise_di":
             del content["law"]
         return int.from_bytes(
             blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big"

@@ -67,9 +67,8 @@ class Proposal(NamedTuple):
     stamp_ns: int  # the end of the window: the instant of its last tick
     start: int  # digest of the parameters of the start, for which the learner was started
     flown: int  # digest of the parameters that flew at the end of the window
-    change: Mapping[
-        str, Any
-    ]  # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    change: Mapping[str, Any]
     sentence: str  # what was learned, or why there is no model
 
 
@@ -152,9 +151,8 @@ class Learning:
         self._announce = announce
         self._simulated = simulated
         self._updates = Updates(parameters.learn)
-        self._due = deque[
-            int
-        ]()  # ends of the windows whose proposals have not acted, in simulated time
+        # ends of the windows whose proposals have not acted, in simulated time
+        self._due = deque[int]()
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2

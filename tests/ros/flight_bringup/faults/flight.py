@@ -165,9 +165,8 @@ class Probe:
         self.received: dict[str, deque[Received]] = {
             topic.name: deque(maxlen=BUFFER_SIZE) for topic in TOPICS
         }
-        self.monitored: list[
-            Process
-        ] = []  # their scheduling delays are sampled once they are ready
+        # their scheduling delays are sampled once they are ready
+        self.monitored: list[Process] = []
         # when, and the longest since the sample before, s
         self.delays: deque[tuple[float, float]] = deque(maxlen=BUFFER_SIZE)
         self._waited_ns: dict[int, int] = {}

@@ -212,9 +212,8 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     # by a storm that uses up the processors: the failsafe may act
     starved = window.host_delay > MAX_AGE
     assert starved or np.abs(ticks.y).max() <= USUAL
-    if (
-        flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None
-    ):  # else the publisher lock of u was free
+    # else the publisher lock of u was free
+    if flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None:
         assert np.abs(applied).max() <= max(USUAL, np.abs(ticks.u).max())
     quiet = window.host_delay <= QUIET
     if quiet:  # else the failsafe of the aircraft may have moved u

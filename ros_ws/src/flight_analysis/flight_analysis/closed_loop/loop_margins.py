@@ -214,9 +214,8 @@ def linear_loop(
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller)
-    if not set(controller.vanes) <= set(
-        airframe.states
-    ):  # y_dot = Omega u has no angles: the observer of y alone
+    # y_dot = Omega u has no angles: the observer of y alone
+    if not set(controller.vanes) <= set(airframe.states):
         controller = controller.without_vanes()
     states = np.array(list(airframe.states))
     vane_rows = [(states == name).astype(np.float64) for name in controller.vanes]

@@ -75,9 +75,8 @@ class Account(NamedTuple):
     busy: str = ""  # the sentence on a host that left out samples and ticks
     unguided: bool = False  # the controller was engaged, and guidance took no step
     legs: tuple[FlownLeg, ...] = ()  # of the route, in order
-    unflown: tuple[
-        int, ...
-    ] = ()  # numbers of the legs that were ahead when the flight ended, in order
+    # numbers of the legs that were ahead when the flight ended, in order
+    unflown: tuple[int, ...] = ()
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
     late: float | None = (
@@ -100,9 +99,8 @@ class Account(NamedTuple):
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user of a log."""
-        lacks = [
-            lack for lack in self.lacks if not any(part in lack for part in PARTS)
-        ]  # which notes tell of
+        # which notes tell of
+        lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]
         return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:

@@ -68,9 +68,8 @@ class SampleStore:
         # compression leaves the interpreter to the other threads
         self._pool = ThreadPoolExecutor(PACKERS)
         self._instants: dict[tuple[str, int, bool], Instants] = {}
-        self._digests: dict[
-            int, tuple[str, NDArray[np.int64]]
-        ] = {}  # of stamps by their id, which the stamps keep
+        # of stamps by their id, which the stamps keep
+        self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 
     @property

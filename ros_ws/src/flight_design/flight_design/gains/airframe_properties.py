@@ -67,14 +67,12 @@ class AirframeFacts(NamedTuple):
     coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    pairing: (
-        Pairing | None
-    )  # `search`: a change to D = I, None where no order that was tried has one
+    # `search`: a change to D = I, None where no order that was tried has one
+    pairing: Pairing | None
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
-    integrated: tuple[
-        str, ...
-    ]  # states that integrate outputs only: each gives a zero at the origin
+    # states that integrate outputs only: each gives a zero at the origin
+    integrated: tuple[str, ...]
 
     @property
     def in_theorem(self) -> bool:

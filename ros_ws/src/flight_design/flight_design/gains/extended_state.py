@@ -24,9 +24,8 @@ a search on the `osprey`, T = 0.035 s and 0.115 s in V, with the cost of gusts a
 together: no other aircraft was in it."""
 
 
-DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS[
-    "p"
-]  # for an output that is not in EXTENDED_STATE_PRODUCTS
+# for an output that is not in EXTENDED_STATE_PRODUCTS
+DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
 
 
 def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:

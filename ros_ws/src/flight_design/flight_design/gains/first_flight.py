@@ -24,21 +24,15 @@ ENGINE_LAG = 0.3
 # rad, rad/s: 20 deg, 57 deg/s, assumed
 STOP = 0.35
 SURFACE_RATE = 1.0
-AUTHORITY = {
-    SPEED: 0.3 * GRAVITY,
-    ANGULAR_RATE: 2.0,
-}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
+# m/s^2, rad/s^2: what the end stop of another input gives, assumed
+AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}
 USED = 0.4  # part of the authority that the edge of a command takes at most
 NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
 SPEEDS = {"V", "u"}  # outputs that a throttle moves slowly
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
 RATE = 200.0  # Hz, of y and y_m
-FASTEST = {
-    "q": 3.0,
-    "p": 4.0,
-    "r": 2.0,
-    "V": 1.2,
-}  # rad/s, natural frequency of the reference model at most
+# rad/s, natural frequency of the reference model at most
+FASTEST = {"q": 3.0, "p": 4.0, "r": 2.0, "V": 1.2}
 LAG_PRODUCT = 0.18  # 1, natural frequency times the lag of the input at most
 
 SCENARIO_YAML = gain_yaml.yaml_template("""\

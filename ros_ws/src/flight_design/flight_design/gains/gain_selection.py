@@ -74,11 +74,8 @@ BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
 on the `osprey`."""
 
-INPUT_LIMITS = (
-    "lower",
-    "upper",
-    "slew",
-)  # limits of the controller, one an input. They are reordered with the inputs.
+# limits of the controller, one an input. They are reordered with the inputs.
+INPUT_LIMITS = ("lower", "upper", "slew")
 
 
 # of the search for the speed up to which the delay margin lasts
@@ -99,9 +96,8 @@ class LoopSetting(NamedTuple):
     gamma_2: float = 0.0  # 1/s, an assumption: 0 gives the smallest bounds (29), (30)
     factor: float = BETA_TO_SLEW  # beta / slew of the ideal control
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
-    inputs: tuple[
-        str, ...
-    ] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
+    # input of each output, in the airframe's order; empty: the airframe's pairing
+    inputs: tuple[str, ...] = ()
     feedforward: bool = (
         False  # whether the result has the published airframe as model of a feedforward
     )
@@ -479,9 +475,8 @@ def _rise_di_conditions(
         *gain_conditions.check(gains, bounds),
         Condition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
-    if (
-        controller.observer is not None
-    ):  # the engineering rules are those of a law that has no other feedback beside it
+    # the engineering rules are those of a law that has no other feedback beside it
+    if controller.observer is not None:
         return theorem, (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)

@@ -28,9 +28,8 @@ from rise_di_controller.model_sections import (
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-PLAIN = re.compile(
-    r"[A-Za-z/][A-Za-z0-9_./:-]*"
-)  # a string that needs no quotes, unless it is a word such as true
+# a string that needs no quotes, unless it is a word such as true
+PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")
 
 
 def yaml_flow(value: Any, precision: int = 6) -> str:

@@ -32,10 +32,8 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 PHASE_MARGIN = 45.0  # deg, the default
 ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this has to be accepted by name
-PHASE_MARGINS = (
-    5.0,
-    80.0,
-)  # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
+# deg, the range of a requirement: a loop that integrates behind a lag has less than 90
+PHASE_MARGINS = (5.0, 80.0)
 
 MAX_SLOWER = 64.0  # largest factors of the search
 MAX_LOWER = 18.0  # by which the integral and the bandwidth fall
@@ -45,9 +43,8 @@ FURTHER_STARTS = (
     (exponent(8.0), exponent(8.0)),
 )  # exponents of `slower` and `lower` of all channels
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
-WORST_STEP = math.radians(
-    2.5
-)  # by which the nominal phase margin rises while the worst aircraft has too little
+# by which the nominal phase margin rises while the worst aircraft has too little
+WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 
 OF_ZERO = 0.98  # of the damping of a zero that is asked for; 1/s

@@ -371,9 +371,8 @@ def within_range(
             ("upper", row.upper, high - trim),
         ):
             if abs(limit) > abs(room):
-                values["inputs"][name][side] = float(
-                    f"{room * (1.0 - 1e-4):.5g}"
-                )  # the trim is rounded too
+                # the trim is rounded too
+                values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")
                 narrower = (
                     f"{name}: its trim is {trim:.3g}, so that the {side} limit is "
                     f"{room:.3g} in place of {limit:.3g}"

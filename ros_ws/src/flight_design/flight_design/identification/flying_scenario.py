@@ -59,11 +59,8 @@ REFERENCE_BANDWIDTH = (
 # of the limit of thrust, which the command of V or climb needs in the end; the rest is for
 # disturbances
 HELD_FRACTION = 0.5
-HOVER = {
-    "q": PULSE_P,
-    "p": PULSE_P,
-    "r": PULSE_P,
-}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
+# rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
+HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}
 FULL_RANGE_TIME = (
     1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
 )
@@ -80,9 +77,8 @@ class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for a flight."""
 
     controller: RiseDiConfig
-    delay_margin: (
-        float | None
-    )  # s, of the identified channels with the lags and the delay; None without a softened sign
+    # s, of the identified channels with the lags and the delay; None without a softened sign
+    delay_margin: float | None
     lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file

@@ -245,9 +245,8 @@ class Passage:
         )
         state_columns = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
         driven = slice(s, s + 2 * HOLD * m)
-        following = HOLD * m + np.append(
-            np.arange(s), self._angles
-        )  # z, and again its angles, in place of sin(x) - x
+        # z, and again its angles, in place of sin(x) - x
+        following = HOLD * m + np.append(np.arange(s), self._angles)
         for k, matrix in enumerate(lifted):
             columns = np.flatnonzero(self._kind == k)
             forced = matrix[..., driven] @ inputs[..., columns]

@@ -499,9 +499,8 @@ class Likelihood:
         square = np.array(
             [np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans]
         )
-        largest = (
-            UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
-        )  # 0 at rest, without noise
+        # 0 at rest, without noise
+        largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
             for spans in (square > largest, LEVELS[levels, 1] > 0.0)

@@ -18,12 +18,8 @@ DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 GOOD = 0.7
 DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
 FRACTIONS = (0.5, 0.25)
-STARTS = (
-    0,
-    3,
-    4,
-    13,
-)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
+# levels with which the search begins: calm air, light and moderate turbulence, gusts
+STARTS = (0, 3, 4, 13)
 TURBULENT = STARTS[2]
 ALIKE = 0.8  # of the spans: so many have the same level where `fit_alike` takes it for all
 SIGNS = (-1.0, 1.0)  # of the effect of the slope of the vertical wind on q, in two further starts

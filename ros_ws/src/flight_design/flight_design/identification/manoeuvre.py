@@ -24,17 +24,12 @@ RATE = 200.0
 PULSE_Q = 0.05  # rad/s
 PULSE_P = 0.15  # rad/s
 PULSE_V = 2.0  # m/s: heights of the pulses
-HEIGHTS = {
-    "q": PULSE_Q,
-    "V": PULSE_V,
-    "p": PULSE_P,
-    "r": PULSE_Q,
-}  # also the units of the outputs in the coupling
+# also the units of the outputs in the coupling
+HEIGHTS = {"q": PULSE_Q, "V": PULSE_V, "p": PULSE_P, "r": PULSE_Q}
 NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
 DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
-AUTHORITY_FRACTION = (
-    1.0 / 3.0
-)  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
+# of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
+AUTHORITY_FRACTION = 1.0 / 3.0
 DURATION = 60.0  # s
 # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_SPEED = 5.0
@@ -131,9 +126,8 @@ class ManoeuvreResult(NamedTuple):
     outcome: str
     rms: dict[str, float]  # of the error by output, SI
     largest: dict[str, float]  # abs(u) by input
-    at_stop: dict[
-        str, float
-    ]  # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
+    # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
+    at_stop: dict[str, float]
 
     @property
     def text(self) -> str:

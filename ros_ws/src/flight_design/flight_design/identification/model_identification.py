@@ -93,9 +93,8 @@ class Identification(NamedTuple):
     airframe: Airframe
     recorded: Recording
     held_out: NDArray[np.bool_]  # (T,)
-    innovations: tuple[
-        FloatArray, FloatArray
-    ]  # (T, m) each, of the nominal model and of this one, units of y
+    # (T, m) each, of the nominal model and of this one, units of y
+    innovations: tuple[FloatArray, FloatArray]
     before: Prediction
     after: Prediction
     parts: tuple[Part, ...]

@@ -22,21 +22,12 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_log import SERVOS, Parameters
 
-CHANNEL = re.compile(
-    r"channels\[(\d+)\]|chan(\d+)_raw"
-)  # of a transmitter: Rc.msg from 0, MAVLink from 1
-AXES: Mapping[str, str] = {
-    "p": "ROLL",
-    "q": "PITCH",
-    "V": "THROTTLE",
-    "r": "YAW",
-}  # of RCMAP, by what responds
-FUNCTIONS = {
-    "ROLL": 4,
-    "PITCH": 19,
-    "THROTTLE": 70,
-    "YAW": 21,
-}  # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
+# of a transmitter: Rc.msg from 0, MAVLink from 1
+CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
+# of RCMAP, by what responds
+AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
+# SERVOn_FUNCTION: aileron, elevator, throttle, rudder
+FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
 SAME_LINE = Line(1, 1.0, 0.0)
 
 # of half the range: the effect differs by as much, below the standard errors of `identify`

@@ -163,9 +163,8 @@ class Layout(NamedTuple):
     period: float  # s, of y
     recent: int  # samples of y one by one
     y_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of y(k - a - 1) to y(k - b)
-    u_windows: tuple[
-        tuple[int, int], ...
-    ]  # (a, b): the mean of u from t_k - b period to t_k - a period
+    # (a, b): the mean of u from t_k - b period to t_k - a period
+    u_windows: tuple[tuple[int, int], ...]
 
     @classmethod
     def from_period(cls, period: float) -> "Layout":

@@ -39,9 +39,8 @@ class Channel(NamedTuple):
     D: int  # of the airframe and the map
     D_controller: int
     measured: float | None  # Omega_ii of a recorded flight, NaN where the input never moves
-    ratio: (
-        float | None
-    )  # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
+    # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
+    ratio: float | None
 
 
 class SignCheck(NamedTuple):
@@ -49,9 +48,8 @@ class SignCheck(NamedTuple):
 
     channels: tuple[Channel, ...]
     contradictions: tuple[str, ...]  # sentences
-    uncertain: tuple[
-        str, ...
-    ]  # sentences on the channels whose sign the recorded flight does not show
+    # sentences on the channels whose sign the recorded flight does not show
+    uncertain: tuple[str, ...]
     seconds: float  # of the recorded flight that were used
 
 

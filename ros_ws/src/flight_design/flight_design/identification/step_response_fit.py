@@ -23,11 +23,8 @@ LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
 SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
-ORDERS = (
-    (1, 1, 1, 0, 0, 0),
-    (1, 1, 1, 1, 0, 0),
-    (1, 1, 1, 1, 1, 1),
-)  # an integrator, first order, second order
+# an integrator, first order, second order
+ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
 MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
 # of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can
 # show
@@ -64,9 +61,8 @@ def second_order(
     Shapes (N,).
     """
     begin = np.maximum(t - delay, 0.0)
-    A = np.array(
-        [[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]]
-    )  # z, z', v; y = z' or z
+    # z, z', v; y = z' or z
+    A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
     values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
@@ -95,9 +91,8 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
         ) and begins_with_Omega(t, tried.theta):
             best = tried
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
-    misfit = max(
-        best.chi_squared / max(len(t) - sum(best.free), 1), 1.0
-    )  # R. T. Birge, Phys. Rev. 40, 1932
+    # R. T. Birge, Phys. Rev. 40, 1932
+    misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)
     deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
     J = best.jacobian[:, inside]
     deviation[inside] = np.sqrt(misfit * np.diag(np.linalg.pinv(J.T @ J)))

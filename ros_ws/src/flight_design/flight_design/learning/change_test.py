@@ -32,9 +32,8 @@ from flight_design.identification.likelihood_search import (
 from flight_design.identification.model_quality import MAX_DEVIATION
 
 RECORD = 10.0  # s, of the flight that is tested
-LOSS = (
-    2.0 * MAX_DEVIATION
-)  # 1, of the effect of an input: up to two deviations of an accepted model are no change
+# 1, of the effect of an input: up to two deviations of an accepted model are no change
+LOSS = 2.0 * MAX_DEVIATION
 MAX_GAIN = 8.0  # of log-likelihood: four standard deviations, see `change_test`
 # rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
 ANGLE = 0.3
@@ -58,9 +57,8 @@ class Change(NamedTuple):
 
     outputs: tuple[str, ...]
     gain: float  # of log-likelihood by a loss of effect beyond LOSS
-    left: Mapping[
-        str, float
-    ]  # 1, the most probable effect of each input in parts of that of the model
+    # 1, the most probable effect of each input in parts of that of the model
+    left: Mapping[str, float]
     dead: str  # the input without any effect; empty where there is none
 
     @property

@@ -63,9 +63,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 AT_BOUND = 1
-SHORTEST = (
-    20.0 * TRANSIENT
-)  # s, of a record: two held-out seconds of the six that `identify` needs at least
+# s, of a record: two held-out seconds of the six that `identify` needs at least
+SHORTEST = 20.0 * TRANSIENT
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
 """A controller with the feedforward and the observer of a model, and its delay margin. Raises

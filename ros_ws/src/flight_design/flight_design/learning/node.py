@@ -133,9 +133,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
         """Begin the search that is due, if any, on the record so far."""
         if self._is_due and self._search is None:
             self._is_due = False
-            self._search = threading.Thread(
-                target=self._propose, daemon=True
-            )  # it does not delay the end of the node
+            # it does not delay the end of the node
+            self._search = threading.Thread(target=self._propose, daemon=True)
             self._search.start()
 
     def _take(self, sample: StampedVector, now_ns: int) -> None:
