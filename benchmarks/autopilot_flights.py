@@ -65,7 +65,8 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
     """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a
     limit, whether it replays.
     """
-    summary, log = autopilot.summary(), read_run(autopilot.run)
+    summary = autopilot.summary()
+    log = read_run(autopilot.run)
     replayed = on_the_ground("replay", str(autopilot.run)).returncode == 0
     return {
         "engaged": summary["engagements"],
@@ -85,7 +86,8 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
 
 def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     """The delay of y behind y_m with the smallest error, s."""
-    y, y_m = tape["y"], tape["y_m"]
+    y = tape["y"]
+    y_m = tape["y_m"]
     t = np.arange(
         engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100
     )

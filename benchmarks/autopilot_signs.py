@@ -45,7 +45,8 @@ def signs(experiments: int = 25) -> dict[str, Any]:
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
         loaded = load_map(channel_map)
-        airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
+        airframe = plane.folder / "signs_airframe.yaml"
+        scenario = plane.folder / "signs.yaml"
         planned = experiment(loaded, 24.0, 0.2, str(airframe))
         airframe.write_text(planned.airframe)
         content = yaml.safe_load(planned.scenario)
@@ -59,7 +60,8 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
         flown.wait_for("DISENGAGED")
-        begun, earlier = [], len(stored("signs").get("experiments", []))
+        begun = []
+        earlier = len(stored("signs").get("experiments", []))
         winds = [
             TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)
         ]
@@ -90,10 +92,12 @@ def signs_of_logs(
     not judged. Those of a run in strong turbulence are also judged together, as `rise-di check`
     judges a log with several.
     """
-    earlier, channel_map = stored("signs"), load_map("ardupilot")
+    earlier = stored("signs")
+    channel_map = load_map("ardupilot")
     found, ended, together = (earlier.get(key, []) for key in ("experiments", "ended", "together"))
     for run in runs:
-        log, strong = read_run(run), dict[float, list[Engagement]]()
+        log = read_run(run)
+        strong = dict[float, list[Engagement]]()
         end_ns = int(log.tape["y"].stamp_ns[-1])
         for number, engagement in enumerate(log.engagements or []):
             turbulence = wind_of(number, engagement)
@@ -121,7 +125,8 @@ def judged(
     rows = [list(channel_map.outputs).index(name) for name in pairing.outputs]
     Omega = np.zeros((len(rows), len(columns)))
     Omega[rows, columns] = expected
-    u, end_ns = tape["u"], int(tape["y"].stamp_ns[-1])
+    u = tape["u"]
+    end_ns = int(tape["y"].stamp_ns[-1])
     spans = [(engaged.start_ns, engaged.stop_ns or end_ns) for engaged in engagements]
 
     def verdicts(flipped: str) -> dict[str, str]:

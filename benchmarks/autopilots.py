@@ -70,7 +70,8 @@ GUIDED, EACH, SETTLED = (300.0, 60.0, 45.0)
 # s beyond the identified delay; SIM_WIND_TURB; flights
 OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = (0.025, 0.5, 2)
 # m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
-FASTER, FASTER_THROTTLE = (25.3, (30.0, 85.0))
+FASTER = 25.3
+FASTER_THROTTLE = (30.0, 85.0)
 TRUE = 1.049  # of true over equivalent airspeed at the kit's place
 WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
@@ -132,7 +133,8 @@ def identified(
 
     With the log of an experiment that this command flew before, there is no new one.
     """
-    found, channel_map = place / "found", place / f"{Path(map_name).stem}.yaml"
+    found = place / "found"
+    channel_map = place / f"{Path(map_name).stem}.yaml"
     command = (
         "identify",
         "--bridge",
@@ -193,7 +195,8 @@ def own_log() -> dict[str, Any]:
             found = plane.folder / "found"
             command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
             plane.experiment(*command, "--write", str(found)).succeed(300.0)
-            run, log = (REPOSITORY / "runs" / "latest").resolve(), plane.folder / "experiment.BIN"
+            run = (REPOSITORY / "runs" / "latest").resolve()
+            log = plane.folder / "experiment.BIN"
             shutil.copy(plane.dataflash(), log)
             results[name] = {"experiment": run.name, "flights": {}}
             for wind, (speed, turbulence) in WINDS.items():
@@ -250,7 +253,8 @@ def guided() -> dict[str, Any]:
 
     starts = np.arange(15.0, GUIDED, EACH).tolist()
     with arduplane(0.03) as plane:
-        found, scenario = plane.folder / "found", plane.folder / "guided.yaml"
+        found = plane.folder / "found"
+        scenario = plane.folder / "guided.yaml"
         program = plane.turns(starts, ALTITUDE + 20.0, 24.0)
         scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0))
         with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
@@ -264,7 +268,8 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
     """
     (one,) = json.loads((run / "summary.json").read_text())["engagements"]
     tape = read_run(run).tape
-    t, errors = tape.time("guidance"), control_errors(tape)
+    t = tape.time("guidance")
+    errors = control_errors(tape)
     stop = one["stop"] or GUIDED
     held = in_spans(
         t,
@@ -284,7 +289,8 @@ def observed() -> dict[str, Any]:
     """The last identified gains without and with an extended-state observer of the identified Omega
     and lags, in turbulence.
     """
-    found, results = FOLDER / "arduplane" / "found", []
+    found = FOLDER / "arduplane" / "found"
+    results = []
     alone = load_scenario(found / "scenario.yaml")
     controller = alone.rise_di()
     model = controller.feedforward
@@ -329,7 +335,8 @@ def bumpless() -> dict[str, Any]:
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-        log, inputs = read_run(plane.run), load_map(channel_map).inputs.values()
+        log = read_run(plane.run)
+        inputs = load_map(channel_map).inputs.values()
         ranges = {f"{row.message}.{row.field}": row.range[1] - row.range[0] for row in inputs}
         return {
             "steps": [
@@ -368,7 +375,8 @@ def releases() -> dict[str, Any]:
     """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again,
     s.
     """
-    report, python = FOLDER / "releases.xml", sys.executable
+    report = FOLDER / "releases.xml"
+    python = sys.executable
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
     subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
     suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now

@@ -150,7 +150,8 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
     definition = define(scenario, count, UNCERTAINTY, SEED, count)
     figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures
     outputs = scenario.controller.outputs
-    worst, single_speed = np.zeros(len(outputs)), 0.0
+    worst = np.zeros(len(outputs))
+    single_speed = 0.0
     for number in range(count):
         sampled = definition.aircraft_scenario(number)
         single_speed = max(single_speed, alone(sampled)[0])

@@ -30,11 +30,9 @@ import yaml
 from benchmarks.tables import parser_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-FOLDER, PAGE, BUILD = (
-    REPOSITORY / "docs/evidence",
-    REPOSITORY / "docs/evidence.md",
-    REPOSITORY / "build/evidence",
-)
+FOLDER = REPOSITORY / "docs/evidence"
+PAGE = REPOSITORY / "docs/evidence.md"
+BUILD = REPOSITORY / "build/evidence"
 SECTIONS: Mapping[str, Mapping[str, Any]] = yaml.safe_load(
     Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8")
 )

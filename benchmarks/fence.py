@@ -174,13 +174,18 @@ def fly_fleet(
     )
     scenario, _, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
     route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
-    scenario, airframe = scenario.vary(guidance={"route": route}), load_airframe("osprey")
-    course, vehicle = build_course(scenario), batch.vehicle(scenario)
+    scenario = scenario.vary(guidance={"route": route})
+    airframe = load_airframe("osprey")
+    course = build_course(scenario)
+    vehicle = batch.vehicle(scenario)
     mission = missions.build(scenario, course)
     fence = Fence(of_radius(fence.zones, radius), at(fence.home, radius), radius)
     mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
     control_law, params = scenario.controller.tuned_law()
-    beyond, banks, lost, home = [], [], 0, 0
+    beyond = []
+    banks = []
+    lost = 0
+    home = 0
     for first in range(0, aircraft, CHUNK):
         A, B = sampled_matrices(
             airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first)
@@ -217,7 +222,8 @@ def fly_alone(name: str, shape: str, wind: str) -> Row:
     tape = simulate(scenario.vary(guidance={"fence": fence, "program": program}))
     beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
     bank = float(np.abs(tape["pose"]["phi"]).max())
-    pose, home = tape["pose"], at(HOME, radius)
+    pose = tape["pose"]
+    home = at(HOME, radius)
     to_home = math.hypot(pose["north"][-1] - home[0], pose["east"][-1] - home[1])
     row = row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
     return row._replace(home=int(to_home <= HOME_RADII * radius))
@@ -244,10 +250,8 @@ def row_of(
     largest: float,
 ) -> Row:
     """A row from the distances beyond the fence, m, and the largest banks of the flights."""
-    outside, turned = (
-        sum(distance > 0.0 for distance in beyond),
-        sum(bank > 0.9 * largest for bank in banks),
-    )
+    outside = sum(distance > 0.0 for distance in beyond)
+    turned = sum(bank > 0.9 * largest for bank in banks)
     return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost, 0)
 
 
@@ -267,16 +271,15 @@ def main() -> int:
         "--from-outside", action="store_true", help="start ospreys outside of a fence; not stored"
     )
     chosen = parser.parse_args()
-    writer, failed = csv.writer(sys.stdout), False
+    writer = csv.writer(sys.stdout)
+    failed = False
     writer.writerow(Row._fields)
     if chosen.from_outside:
         return int(not all(fly_home(chosen.aircraft, chosen.seed, writer.writerow)))
     for name in chosen.only:
         options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
-        begun, flown = (
-            evidence.origin(f"python -m benchmarks.fence --only {name}{options}"),
-            list[Row](),
-        )
+        begun = evidence.origin(f"python -m benchmarks.fence --only {name}{options}")
+        flown = list[Row]()
         for shape, wind in product(chosen.shapes, chosen.winds):
             of_fleet = name == OSPREY
             row = (

@@ -104,7 +104,8 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     guidance = scenario.guidance
     if guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
-    speed, altitude = guidance.speed, scenario.aircraft.altitude or 0.0
+    speed = guidance.speed
+    altitude = scenario.aircraft.altitude or 0.0
     section, duration = manoeuvre.plan(guidance.model_copy(update={"wind": air.across * speed}))
     section |= {"wind": air.across * speed, "max_age": manoeuvre.pose.max_age}
     for name in ("altitude", "theta"):

@@ -29,7 +29,8 @@ def excluding_delays(intervals: Intervals, delays: Intervals) -> NDArray[np.int6
     begin, end = np.asarray(intervals, dtype=np.int64).reshape(-1, 2).T
     origin = int(begin.min(initial=np.iinfo(np.int64).max))
     # of the disjoint delays: begins and ends after the origin, and the time in delays until each
-    edges, total = ([0], [0])
+    edges = [0]
+    total = [0]
     for since, until in sorted(
         (int(begin_ns) - origin, int(end_ns) - origin) for begin_ns, end_ns in delays
     ):

@@ -21,7 +21,8 @@ from flight_design.identification.step_identification import (
     without_beta,
 )
 
-KNOT, FOOT = 1852.0 / 3600.0, 0.3048  # m/s, m; exact
+KNOT = 1852.0 / 3600.0
+FOOT = 0.3048  # m/s, m; exact
 
 
 # fmt: off
@@ -45,7 +46,8 @@ def main() -> None:
     """Print the tables of the selected aircraft."""
     arguments = sys.argv[1:]
     names = arguments or list(FLEET)
-    rows, reasons = [], []
+    rows = []
+    reasons = []
     for number, name in enumerate(names, 1):
         print(f"{number} of {len(names)}: {name}", file=sys.stderr)
         speed, altitude = FLEET.get(name, DEFAULT)

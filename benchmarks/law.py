@@ -40,8 +40,10 @@ FLOOR = "NumPy a * x + b"
 def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], object]:
     """A whole tick after the engagement, with the k-th rows of y and y_m."""
     controller = find_scenario(scenario).controller
-    tuned, limits = controller.tuned_law(), controller.guard()
-    first, stamp_ns = StampedVector(0, y_m[0]), limits.period_ns
+    tuned = controller.tuned_law()
+    limits = controller.guard()
+    first = StampedVector(0, y_m[0])
+    stamp_ns = limits.period_ns
     engaged, _ = guard.tick(
         guard.initial_state(4), 0, StampedVector(0, y[0]), [first], limits, tuned
     )
@@ -60,9 +62,12 @@ def measure() -> dict[str, tuple[float, float, float]]:
     and the multiply-add.
     """
     controller = find_scenario("osprey_gust").controller
-    law, limits = controller.law_params(), controller.guard().limits
-    y, y_m = noise()[0], np.zeros(4)
-    dt, zero = 0.01, np.zeros(4)
+    law = controller.law_params()
+    limits = controller.guard().limits
+    y = noise()[0]
+    y_m = np.zeros(4)
+    dt = 0.01
+    zero = np.zeros(4)
     state = engage(y[0], y_m)
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),

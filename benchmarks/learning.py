@@ -138,7 +138,8 @@ def main(
         name for name in CELLS if sum(each.cell == name for each in rows) == count(name, aircraft)
     ]
     rows = [each for each in rows if each.cell in whole]
-    found, airs = list(figures(rows)), [name for name in CELLS if CELLS[name].kind == "learn"]
+    found = list(figures(rows))
+    airs = [name for name in CELLS if CELLS[name].kind == "learn"]
     for uncertainty in sorted({CELLS[name].uncertainty for name in airs if name in whole}):
         found += rival_figures(uncertainty, range(aircraft))
     for each in found:

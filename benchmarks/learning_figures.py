@@ -41,10 +41,8 @@ LABELS = {
     "learner": "learner",
     "true": "true model",
 }
-RIVALS, OBJECTIVE = (
-    ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"),
-    "gust_turbulence",
-)
+RIVALS = ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer")
+OBJECTIVE = "gust_turbulence"
 """Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file
 in the loop of osprey_servo. MRAC measures the full state, and INDI the actuators too."""
 
@@ -109,7 +107,8 @@ def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Lost flights, and mean and largest score of the flights to the end, of each."""
     for key, label in LABELS.items():
         values = np.array([getattr(each, key) for each in chosen])
-        flown, whole = values[~np.isnan(values)], values[np.isfinite(values)]
+        flown = values[~np.isnan(values)]
+        whole = values[np.isfinite(values)]
         if len(flown):
             lost = float(len(flown) - len(whole))
             yield row(f"{name}: lost, {label}", lost, at_most=0.0 if key == "learner" else None)

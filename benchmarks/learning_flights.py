@@ -167,7 +167,8 @@ def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenar
     """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again
     and again.
     """
-    shipped, seed = find_scenario("osprey_learn"), {"seed": 1000 + number}
+    shipped = find_scenario("osprey_learn")
+    seed = {"seed": 1000 + number}
     sampled = {"A": cell.uncertainty, "B": cell.uncertainty, "seed": SEED, "number": number}
     air = AIR[cell.air]
     air = air | ({"turbulence": air["turbulence"] | seed} if air["turbulence"] else {})
@@ -212,7 +213,9 @@ def score(
     """
     if tape.outcome != COMPLETED:
         return math.inf
-    y_m, truth, t = tape["y_m"], tape["truth"], tape.time("y_m")
+    y_m = tape["y_m"]
+    truth = tape["truth"]
+    t = tape.time("y_m")
     outputs = tuple(name for name in y_m.names if name not in without)
     e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[
         (t >= first) & (t < end)
@@ -252,7 +255,8 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
         aircraft.matrix_b()[:, columns],
         aircraft.matrix_c()[rows],
     )
-    loop, m = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate), len(columns)
+    loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
+    m = len(columns)
     return int(
         not is_stable(
             plant, linear_law(controller.tuned_law(), m, loop.period), loop, np.full(m, LATE)
@@ -287,7 +291,9 @@ class Learned(NamedTuple):
 
 def fly(name: str, number: int, chosen: Scenario) -> Learned:
     """Fly a scenario that learns."""
-    make, events, timed = learner(chosen), list[Event](), list[Timed]()
+    make = learner(chosen)
+    events = list[Event]()
+    timed = list[Timed]()
     assert make is not None  # noqa: S101 - for the type checker
 
     def watched(parameters: RiseDiConfig, make: Learn = make) -> Learner:
@@ -330,11 +336,9 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
     same in every air.
     """
     chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
-    flight, aircraft, start = (
-        evaluation(chosen),
-        chosen.aircraft.sampled_airframe(),
-        start_of(chosen),
-    )
+    flight = evaluation(chosen)
+    aircraft = chosen.aircraft.sampled_airframe()
+    start = start_of(chosen)
     controllers = {
         "alone": start,
         "file": file_design(OSPREY),
@@ -370,11 +374,9 @@ def learn(name: str, cell: Cell, number: int) -> Row:
                 learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder
             )
         flown = fly(name, number, chosen)
-        flight, aircraft, start = (
-            evaluation(chosen),
-            chosen.aircraft.sampled_airframe(),
-            start_of(chosen),
-        )
+        flight = evaluation(chosen)
+        aircraft = chosen.aircraft.sampled_airframe()
+        start = start_of(chosen)
         if cell.kind == "rough":
             others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
         if cell.kind in {"coupled", "untold"}:
@@ -402,8 +404,10 @@ def rough(number: int) -> Airframe:
     """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of
     angles stay.
     """
-    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number])
-    A, B = airframe.matrix_a(), airframe.matrix_b()
+    airframe = load_airframe("osprey")
+    rng = np.random.default_rng([SEED, number])
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
     dynamic = np.array([[float(state not in {"theta", "phi"})] for state in airframe.states])
     direct = np.array([[float(state in airframe.outputs)] for state in airframe.states]) * (
         np.abs(B) > 0.0
@@ -419,12 +423,11 @@ def coupled(number: int) -> Airframe:
     """The osprey with entries between its two parts of up to COUPLING of the largest effect on the
     row, in units of motion.
     """
-    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number, 1])
-    A, B, size = (
-        airframe.matrix_a(),
-        airframe.matrix_b(),
-        np.array([1.0 if name == "V" else 0.1 for name in airframe.states]),
-    )
+    airframe = load_airframe("osprey")
+    rng = np.random.default_rng([SEED, number, 1])
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
+    size = np.array([1.0 if name == "V" else 0.1 for name in airframe.states])
     of_lon = np.array([name in {"V", "alpha", "q", "theta"} for name in airframe.states])
     other = of_lon[:, None] != of_lon[None, :]
     other_input = (
@@ -432,7 +435,8 @@ def coupled(number: int) -> Airframe:
         != np.array([name in {"elevator", "thrust"} for name in airframe.inputs])[None, :]
     )
     dynamic = np.array([name not in {"theta", "phi"} for name in airframe.states])
-    row_A, row_B = np.sqrt(np.sum((A * size) ** 2, axis=1)), np.abs(B).max(axis=1)
+    row_A = np.sqrt(np.sum((A * size) ** 2, axis=1))
+    row_B = np.abs(B).max(axis=1)
     A = (
         A
         + COUPLING
@@ -458,7 +462,8 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
     actuators["faults"] = [f"{channel} {kind} {DAMAGED:g}" for channel in inputs if channel in hit]
     chosen = learning(cell, number, END, actuators=actuators)
-    flown, start = fly(name, number, chosen), start_of(chosen)
+    flown = fly(name, number, chosen)
+    start = start_of(chosen)
     aircraft = chosen.aircraft.sampled_airframe()
     B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))

@@ -69,7 +69,8 @@ def loop_steps_per_second(scenario: Scenario) -> float:
 
 def echo_steps_per_second() -> float:
     """Round trips per second of four channels to another process and back."""
-    encoder, values = Encoder(("q", "V", "p", "r"), "requester"), np.zeros(4)
+    encoder = Encoder(("q", "V", "p", "r"), "requester")
+    values = np.zeros(4)
     with open_node("requester") as node, Child("polled_echo"):
         subscription = PolledSubscription(node, U, LOCKSTEP, raw=True)
         publisher = node.create_publisher(Y.type, Y.name, PUBLISH)
@@ -87,7 +88,8 @@ def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
     """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs,
     interleaved.
     """
-    aircraft, model = {"rate": RATE, "step": 1.0 / RATE}, {"rate": RATE}
+    aircraft = {"rate": RATE, "step": 1.0 / RATE}
+    model = {"rate": RATE}
     scenario = find_scenario("osprey_gust", duration).vary(aircraft=aircraft, reference_model=model)
     scenario = written(scenario, folder / "at_100_hz.yaml")
     measurements: dict[str, Callable[[Path], float]] = {

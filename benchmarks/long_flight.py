@@ -75,7 +75,8 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
     if observer:
         base = replace(base, controller=find_scenario("osprey_observer").controller)
     # above the start
-    speed, altitude = (base.aircraft.channels().speed, base.aircraft.altitude or 0.0)
+    speed = base.aircraft.channels().speed
+    altitude = base.aircraft.altitude or 0.0
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
     corners = [(0.0, 0.0), (SIDE, 0.0), (SIDE / 2.0, SIDE * math.sqrt(0.75))] * laps
     north, east = (list(values) for values in zip(*corners, strict=True))
@@ -156,9 +157,11 @@ def skips(
     rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate}
     rates |= {} if real_time else {"u": scenario.controller.rate}
     rates |= dict.fromkeys(("u_m", "guidance"), guidance.rate)
-    found, end_ns = {}, tape.start_ns + nanoseconds(scenario.flight.duration)
+    found = {}
+    end_ns = tape.start_ns + nanoseconds(scenario.flight.duration)
     for name, rate in rates.items():
-        stamps, period = tape[name].until(end_ns).stamp_ns, period_ns(rate, name)
+        stamps = tape[name].until(end_ns).stamp_ns
+        period = period_ns(rate, name)
         lateness = period // 2 if real_time else 0
         ends = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))
         found[name] = (ends[np.diff(stamps) > 1.5 * period], period)
@@ -216,7 +219,8 @@ def figures(
     write_report(run)
     written = time.monotonic() - begin
     read = read_run(run)
-    tape, scenario = read.tape, load_scenario(run.parent / "flown.yaml")
+    tape = read.tape
+    scenario = load_scenario(run.parent / "flown.yaml")
     log = tape["guidance"]
     xtrack = log["xtrack"][tape.time("guidance") > 30.0]
     replay = replay_guidance(tape, scenario.guidance)

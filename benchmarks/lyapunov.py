@@ -73,7 +73,8 @@ def main() -> None:
     for name, signals in evidence_by_beta.items():
         late = signals.t > 20.0
         e, r = (np.max(np.linalg.norm(signal[late], axis=1)) for signal in (signals.e, signals.r))
-        V2, P = signals.V2, signals.P
+        V2 = signals.V2
+        P = signals.P
         print(
             f"{name}: V2 {V2[0]:.2f} -> {V2[-1]:.2f}, P >= {P.min():.2f}, past 20 s |e| "
             f"{e:.2g}, |r| {r:.2g}"

@@ -26,7 +26,10 @@ from flight_guidance.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
 START = 5.0  # s, of the command
-BANK, TURN, CLIMB, FASTER = math.radians(20.0), math.pi / 2.0, 100.0, 0.1  # rad, rad, m, of V0
+BANK = math.radians(20.0)
+TURN = math.pi / 2.0
+CLIMB = 100.0
+FASTER = 0.1  # rad, rad, m, of V0
 WIND = 0.2  # of V0
 RECTANGLE = ((0, 0, 0), (3, 0, 0), (3, 2.5, 0), (0, 2.5, 0), (0, 0, 0))
 ROUTE = ((0, 0, 0), (3, 0, 10), (5, 2, 10), (5, 5, 0), (2.5, 6.25, 0), (2.5, 3, 0), (0, 2.375, 0))
@@ -93,7 +96,8 @@ class FaultyPose(Guidance):
 
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose. Raises ChannelError as Guidance does."""
-        how, last = self._how, self._pose or sample
+        how = self._how
+        last = self._pose or sample
         if 0.0 <= seconds(now_ns) - FAULT < how.fault:
             if how.off is None:
                 sample = last._replace(stamp_ns=sample.stamp_ns) if how.stamped else last
@@ -130,7 +134,8 @@ def after(tape: Tape, t: float, *names: str) -> tuple[FloatArray, ...]:
 
 def settled(tape: Tape, name: str, target: float, band: float) -> float:
     """Time from START until a channel stays within a band, s."""
-    t, outside = tape.time("guidance"), np.abs(tape["guidance"][name] - target) > band
+    t = tape.time("guidance")
+    outside = np.abs(tape["guidance"][name] - target) > band
     return float(t[np.flatnonzero(outside)[-1]] - START) if outside.any() else 0.0
 
 
@@ -239,7 +244,8 @@ def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figur
     """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each
     input.
     """
-    t, u = tape.time("u"), tape["u"].values
+    t = tape.time("u")
+    u = tape["u"].values
     span = u.max(axis=0) - u.min(axis=0)
     limits = np.array(
         [RANGES.get(name, width) for name, width in zip(tape["u"].names, span, strict=True)]
@@ -259,7 +265,8 @@ def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> It
     """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any
     manoeuvre.
     """
-    phi, V = tape["truth"]["x.phi"], tape["guidance"]["y.V"]
+    phi = tape["truth"]["x.phi"]
+    V = tape["guidance"]["y.V"]
     limit = 2.0 if calm else 3.0
     yield Figure(
         "bank beyond (deg)",

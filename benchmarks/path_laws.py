@@ -158,7 +158,8 @@ def cells() -> Iterator[Cell]:
 
 def main() -> None:
     """Fly, print the rows and store them."""
-    begun, figures = evidence.origin("python -m benchmarks.path_laws"), list[evidence.Row]()
+    begun = evidence.origin("python -m benchmarks.path_laws")
+    figures = list[evidence.Row]()
     for cell in cells():
         print(cell.name, dict(cell.values), flush=True)
         figures += cell.figures

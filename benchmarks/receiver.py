@@ -7,6 +7,7 @@ python -m benchmarks.speed --only receiver
 """
 
 import time
+from functools import partial
 
 import numpy as np
 from benchmarks.nodes import open_node
@@ -39,7 +40,8 @@ def long_message(sender: str, size: int) -> bytes:
 def measure() -> dict[str, FloatArray]:
     """Times of one message each, ns, of a right message and of refused ones."""
     parameters = find_scenario("osprey_gust").controller
-    controller, encoder = Controller(parameters), Encoder(parameters.outputs, OWN)
+    controller = Controller(parameters)
+    encoder = Encoder(parameters.outputs, OWN)
     right = encoder.encode(0, np.zeros(4))
     refused = {
         DECODED: right + bytes(len(right)),
@@ -63,7 +65,8 @@ def measure() -> dict[str, FloatArray]:
     with open_node("receiver") as node:
         subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
         lock = PublisherLock(lambda: (TAKEOVER_NS, TAKEOVER_NS))
-        decode, max_age_ns = Decoder(parameters.outputs).decode, lambda: TAKEOVER_NS
+        decode = Decoder(parameters.outputs).decode
+        max_age_ns = partial(int, TAKEOVER_NS)
         receiver = Receiver(
             subscription, Refusals(node), decode, take, max_age_ns=max_age_ns, lock=lock
         )

@@ -36,7 +36,9 @@ def publish(rate: float, duration: float) -> None:
     sent at the end.
     """
     tape = simulate(find_scenario("osprey_servo", 5.0))
-    ended, sent, missed = termination(), 0, 0
+    ended = termination()
+    sent = 0
+    missed = 0
     with open_node("publisher") as node:
         publishers = [node.create_publisher(topic.type, topic.name, PUBLISH) for topic in TOPICS]
         signals = [tape["y_m" if topic is U_M else topic.name] for topic in TOPICS]

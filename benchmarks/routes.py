@@ -123,7 +123,8 @@ def duration(route: Route, section: GuidanceConfig) -> float:
     climb, sink = section.climb_limits()
     slowest, (start, course), at = section.speed - section.wind, route.start(0), (0.0, 0.0)
     side = float(path.joining(start, course, route.radius, route.near(0), at, 0.0))
-    length, time = 0.0, SETTLE
+    length = 0.0
+    time = SETTLE
     if side:
         length = (
             float(path.joining_length(start, course, side * route.radius, at, 0.0))
@@ -145,7 +146,8 @@ def duration(route: Route, section: GuidanceConfig) -> float:
 
 def fly(name: str, title: str, case: Case) -> Row:
     """The result of a flight."""
-    scenario, limit = aircraft_of(name), LIMIT if case.wind or case.turbulent else CALM_LIMIT
+    scenario = aircraft_of(name)
+    limit = LIMIT if case.wind or case.turbulent else CALM_LIMIT
     try:
         varied = planned(scenario, name, case)
     except ParameterError as refusal:
@@ -156,7 +158,8 @@ def fly(name: str, title: str, case: Case) -> Row:
     if varied.guidance is None:
         raise ValueError(f"{name} has no guidance")
     route = varied.guidance.plan(varied.guidance.waypoints())
-    result, flown = "flown", flown_legs(tape)
+    result = "flown"
+    flown = flown_legs(tape)
     missed = [leg for leg in flown if leg.result == "missed"]
     if missed:
         result = f"missed leg {missed[0].leg} by {missed[0].missed:.0f} m"
@@ -172,7 +175,8 @@ def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
     """The scenario of a case. Raises ParameterError where the route is refused."""
     if scenario.guidance is None:
         raise ValueError(f"{name} has no guidance")
-    wind, ground = case.wind * scenario.guidance.speed, scenario.aircraft.altitude or 0.0
+    wind = case.wind * scenario.guidance.speed
+    ground = scenario.aircraft.altitude or 0.0
     section = scenario.guidance.model_copy(update={"wind": wind})
     waypoints = [
         point._replace(altitude=point.altitude + ground)
@@ -220,10 +224,12 @@ def main() -> int:
         "--cases", nargs="*", choices=[*CASES], default=[*CASES], help="routes; not stored"
     )
     chosen = parser.parse_args()
-    writer, failed = csv.writer(sys.stdout), False
+    writer = csv.writer(sys.stdout)
+    failed = False
     writer.writerow(Row._fields)
     for name in chosen.only:
-        begun, flown = evidence.origin(f"python -m benchmarks.routes --only {name}"), list[Row]()
+        begun = evidence.origin(f"python -m benchmarks.routes --only {name}")
+        flown = list[Row]()
         for title in chosen.cases:
             flown.append(row := fly(name, title, CASES[title]))
             writer.writerow(row)

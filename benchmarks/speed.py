@@ -117,7 +117,9 @@ class Peer:
         """Publish to a process for `seconds` after its first answer and WARM_UP. Raises
         RuntimeError without an answer.
         """
-        begin, first, since_ns = time.monotonic(), 0.0, time.time_ns()
+        begin = time.monotonic()
+        first = 0.0
+        since_ns = time.time_ns()
         driven = Driven()
         zero = np.zeros(self._values.shape[1])
         for tick in ticks(hz):
@@ -142,7 +144,9 @@ class Peer:
                     )
             if not first and driven.received and time.time() > driven.start + WARM_UP:
                 first = time.monotonic() - WARM_UP
-                driven, cpu_ns, since_ns = Driven(driven.start), child.cpu_ns(), time.time_ns()
+                driven = Driven(driven.start)
+                cpu_ns = child.cpu_ns()
+                since_ns = time.time_ns()
             if not driven.received and not first and time.monotonic() > begin + MATCHED_WITHIN:
                 raise RuntimeError(f"no answer within {MATCHED_WITHIN:g} s")
         driven.cpu_ns = child.cpu_ns() - cpu_ns
@@ -274,7 +278,8 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
     with open_node("peer") as node:
         peer = Peer(node)
         for hz in RATES:
-            driven, echoed = Driven(), dict.fromkeys(EXECUTORS, Driven())
+            driven = Driven()
+            echoed = dict.fromkeys(EXECUTORS, Driven())
             for _ in range(ROUNDS):
                 for executor in EXECUTORS:
                     with Child("echo", "--executor", executor) as child:
@@ -345,7 +350,8 @@ def _ticks(
     child: Child, seconds: float, delays: Callable[[], Intervals] | None = None
 ) -> dict[str, float]:
     time.sleep(seconds / 2.0)
-    cpu_ns, at = child.cpu_ns(), time.monotonic()
+    cpu_ns = child.cpu_ns()
+    at = time.monotonic()
     time.sleep(seconds / 2.0)  # it started later, so it still runs
     share = (child.cpu_ns() - cpu_ns) / 1e9 / (time.monotonic() - at)
     output = child.figures(timeout=seconds + 20.0)
@@ -400,7 +406,8 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def _use(pids: Sequence[int], seconds: float) -> list[dict[str, float]]:
-    before, begin = [threads_ns(pid) for pid in pids], time.monotonic()
+    before = [threads_ns(pid) for pid in pids]
+    begin = time.monotonic()
     time.sleep(seconds)
     elapsed = time.monotonic() - begin
     shares = [
@@ -472,7 +479,8 @@ def import_rows() -> Iterator[Row]:
         name: [sys.executable, "-c", alone.format(name.split()[-1])] for name in (floor, ours)
     }
     commands[usage] = [RISE_DI, "--help"]
-    whole, imported = defaultdict(list), defaultdict(list)
+    whole = defaultdict(list)
+    imported = defaultdict(list)
     for _ in range(IMPORTS):  # in turns, since the speed of the host drifts
         for name, command in commands.items():
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -503,7 +511,8 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
     """CPU time, losses and size of the recorder at 1 kHz on six topics, compared with rosbags'
     writer fed from memory.
     """
-    run, floor = folder / "recorded", "rosbags' Writer, MCAP"
+    run = folder / "recorded"
+    floor = "rosbags' Writer, MCAP"
     sent, processor = recorder.record(run, 1000.0, seconds)
     rewritten = recorder.rewrite(run, folder / "rosbags", CompressionMode.NONE)
     count = rewritten.counts.total()

@@ -154,7 +154,9 @@ def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
 
 def bare_loop(hz: float, seconds: float) -> dict[str, float]:
     """A loop that only sleeps until the next deadline."""
-    late, missed, end = [], 0, time.monotonic() + seconds
+    late = []
+    missed = 0
+    end = time.monotonic() + seconds
     for tick in ticks(hz):
         late.append(tick.late_ns)
         missed += tick.missed
@@ -200,7 +202,8 @@ def delay_monitor(core: int) -> dict[str, Any]:
     os.sched_setscheduler(
         0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO))
     )
-    ended, delays = termination(), []
+    ended = termination()
+    delays = []
     last_ns = time.monotonic_ns()
     while not ended.is_set():
         time.sleep(MONITOR_PERIOD)

@@ -117,16 +117,19 @@ def open_log(hours: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         write_long_log(run, hours)
-        begin, times = time.monotonic(), dict[str, float]()
+        begin = time.monotonic()
+        times = dict[str, float]()
         with watching(run) as (server, address):
-            client, head = Client(address), dict[str, Any]()
+            client = Client(address)
+            head = dict[str, Any]()
             while head.get("state") != "ended":
                 head = client.news()
                 if head["topics"]:
                     times.setdefault("first samples", time.monotonic() - begin)
                 time.sleep(1.0 / POLLS)
             times["whole log"] = time.monotonic() - begin
-            processor, memory = server.cpu_times(), server.memory_info().rss / 1e6
+            processor = server.cpu_times()
+            memory = server.memory_info().rss / 1e6
         size = sum(path.stat().st_size for path in run.glob("*.mcap")) / 1e6
     return times | {
         "processor": processor.user + processor.system,
@@ -267,10 +270,12 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         flying(Path(folder), seconds) as (flight, run),
         watching(run) as (server, address),
     ):
-        client, drawn = Client(address), []
+        client = Client(address)
+        drawn = []
         client.start()
         time.sleep(BEGUN)
-        before, begin = threads_ns(server.pid), time.monotonic()
+        before = threads_ns(server.pid)
+        begin = time.monotonic()
         if browser:
             with Browser(Path(folder) / "profile") as page:
                 page.open(address)

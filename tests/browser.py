@@ -39,7 +39,8 @@ class Browser:
             raise FileNotFoundError("no Chromium on the path")
         commands, self._commands = os.pipe()
         self._responses, responses = os.pipe()
-        ends, null = (commands, responses), subprocess.DEVNULL
+        ends = (commands, responses)
+        null = subprocess.DEVNULL
         flags = [
             *FLAGS,
             *flags,
@@ -121,13 +122,15 @@ class Browser:
         Time counts while the browser answers: of each look at most LOOK, since other work may keep
         the processor from both.
         """
-        waited, before = 0.0, time.monotonic()
+        waited = 0.0
+        before = time.monotonic()
         while not self._holds(expression):
             if waited > limit:
                 raise TimeoutError(f"not true after {limit:g} s: {expression}; {self.console}")
             time.sleep(0.02)
             now = time.monotonic()
-            waited, before = waited + min(now - before, LOOK), now
+            waited = waited + min(now - before, LOOK)
+            before = now
 
     def _holds(self, expression: str) -> bool:
         """Whether an expression is true; not on a page that the browser is leaving."""

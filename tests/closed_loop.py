@@ -69,7 +69,8 @@ def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) 
 
 def reference_outputs(params: model.Model, profile: Profile, dt: float, steps: int) -> FloatArray:
     """y_m at 0, dt, 2 dt, ..., shape (steps + 1, m), from rest."""
-    x_m, matrices = np.zeros(len(params.A_m)), model.stepper(dt, params)
+    x_m = np.zeros(len(params.A_m))
+    matrices = model.stepper(dt, params)
     y_m = [model.output(x_m, params)]
     for k in range(steps):
         x_m = model.step(
@@ -92,9 +93,12 @@ def fly(
 
     The law acts on the aircraft through ideal actuators. The flight starts from x_0, or from trim.
     """
-    period_ns, m, references = nanoseconds(dt), len(law.K), iter(y_m)
+    period_ns = nanoseconds(dt)
+    m = len(law.K)
+    references = iter(y_m)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware, u = PlantParams(aircraft, ideal, period_ns), np.zeros(m)
+    hardware = PlantParams(aircraft, ideal, period_ns)
+    u = np.zeros(m)
     simulated = AircraftState(np.zeros(len(aircraft.A)) if x_0 is None else x_0, u)
     state = rise.engage(dynamics.y(simulated.x, aircraft), next(references))
     errors = [state.e]

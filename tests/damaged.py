@@ -57,7 +57,8 @@ def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 
     """
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
+        reader = make_reader(source)
+        writer = Writer(target)
         writer.start(profile="ros2", library="damaged")
         for attachment in reader.iter_attachments():
             writer.add_attachment(

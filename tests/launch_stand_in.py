@@ -44,7 +44,8 @@ class LaunchContext:
         handlers that handle once.
         """
         follow: list[Any] = []
-        events, self.events = self.events, []
+        events = self.events
+        self.events = []
         for event in events:
             for action in actions:
                 handler = action.event_handler if isinstance(action, RegisterEventHandler) else None

@@ -30,7 +30,8 @@ def serving(
     *runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False
 ) -> Iterator[str]:
     """Serve runs from a thread of this process; the address with the token."""
-    ready, address = threading.Event(), ""
+    ready = threading.Event()
+    address = ""
     loop = asyncio.new_event_loop()
 
     async def serve() -> None:

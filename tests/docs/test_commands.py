@@ -52,7 +52,8 @@ def make(words: list[str]) -> None:
     """The target exists."""
     folder = REPOSITORY
     if words[:1] == ["-C"]:
-        folder, words = folder / words[1], words[2:]
+        folder = folder / words[1]
+        words = words[2:]
     rules = re.findall(r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(), re.MULTILINE)
     targets = " ".join(rules).split()
     asked = [word for word in words if "=" not in word]

@@ -279,20 +279,19 @@ def targets(data: bytes, folder: Path) -> None:
     After a time without steps beyond the age limit of u_m, guidance starts again at what is
     measured: no limit holds across it.
     """
-    guidance, params, now_ns, before, before_ns = (
-        Guidance(_guided()),
-        _guided().params(),
-        0,
-        None,
-        0,
-    )
+    guidance = Guidance(_guided())
+    params = _guided().params()
+    now_ns = 0
+    before = None
+    before_ns = 0
     values = [
         value
         for (value,) in struct.iter_unpack("<d", data[: len(data) // 8 * 8])
         if math.isfinite(value)
     ]
     while len(values) > GUIDED_NUMBERS:
-        part, values = values[:GUIDED_NUMBERS], values[GUIDED_NUMBERS:]
+        part = values[:GUIDED_NUMBERS]
+        values = values[GUIDED_NUMBERS:]
         now_ns += params.period_ns
         with suppress(ChannelError):
             guidance.take_pose(StampedVector(now_ns, np.array(part[: len(POSE)])), now_ns)
@@ -309,7 +308,8 @@ def targets(data: bytes, folder: Path) -> None:
                 moved
                 <= np.delete(params.slew, V) * (now_ns - before_ns) / 1e9 * (1.0 + 1e-9) + 1e-12
             ).all(), moved
-        before, before_ns = output.u_m, now_ns
+        before = output.u_m
+        before_ns = now_ns
 
 
 def control(data: bytes, folder: Path) -> None:
@@ -367,7 +367,9 @@ def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
     folder = Path(tempfile.mkdtemp(prefix="fuzz"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     run = write_run(folder, log(_flight()))
-    scenario, loop, times = find_scenario("osprey_servo"), asyncio.new_event_loop(), count()
+    scenario = find_scenario("osprey_servo")
+    loop = asyncio.new_event_loop()
+    times = count()
     flight = Flight(run)
     flight.update()
     nodes = NodesInMemory(scenario, "aircraft", "controller", "guidance", dry_run=True)
@@ -481,7 +483,8 @@ def _flight() -> list[tuple[str, str, bytes]]:
 
 
 def _mcaps() -> list[bytes]:
-    flight, file = _flight(), {"osprey.yaml": b"/**/flight:\n  ros__parameters: {duration: 1.0}\n"}
+    flight = _flight()
+    file = {"osprey.yaml": b"/**/flight:\n  ros__parameters: {duration: 1.0}\n"}
     whole = log(flight, attached=file)
     return [
         whole,

@@ -30,8 +30,10 @@ class CommandResult(NamedTuple):
 
 def rise_di(*arguments: str) -> CommandResult:
     """Run the command in this process. An exception other than SystemExit would be a traceback."""
-    output, errors = io.StringIO(), io.StringIO()
-    status, handler = 0, signal.getsignal(signal.SIGINT)
+    output = io.StringIO()
+    errors = io.StringIO()
+    status = 0
+    handler = signal.getsignal(signal.SIGINT)
     with (
         patch("sys.argv", ["rise-di", *arguments]),
         redirect_stdout(output),

@@ -278,7 +278,8 @@ def flights(draw: st.DrawFn, complete: dict[str, tuple[str, ...]]) -> list[tuple
 
 
 def channels(scenario: Scenario) -> dict[str, tuple[str, ...]]:
-    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    outputs = scenario.controller.outputs
+    inputs = scenario.controller.inputs
     return {
         "/y": outputs,
         "/y_m": outputs,

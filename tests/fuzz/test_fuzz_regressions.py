@@ -40,7 +40,8 @@ def constant_flight(
     scenario: Scenario, value: float = 0.0, name: str = "osprey_gust.yaml"
 ) -> bytes:
     """The log of three samples of y, y_m and u with one value, and of its scenario."""
-    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    outputs = scenario.controller.outputs
+    inputs = scenario.controller.inputs
     messages = [
         (topic, JOINT_STATE, vector(k * 10_000_000, names, (value,) * 4))
         for k in range(3)

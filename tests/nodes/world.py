@@ -38,7 +38,8 @@ from flight_ros.topics import PUBLISH
 T = TypeVar("T")
 AnyNode = FlightNode[Any]
 
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "thrust", "aileron", "rudder")
 EPOCH_NS = 1_700_000_000 * NANOSECONDS  # of the system clock where the monotonic clock is 0
 STEP = 0.005  # s, between two calls of what the test does meanwhile
 LIMIT = 60.0  # s of the time of the test, until a wait fails
@@ -99,8 +100,10 @@ class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
     def __init__(
         self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str
     ) -> None:
-        self.kind, self.sequence = kind, 0
-        self._world, self._topic = world, topic
+        self.kind = kind
+        self.sequence = 0
+        self._world = world
+        self._topic = topic
         self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.PUBLISHER)
 
     @property
@@ -133,7 +136,9 @@ class Subscription:
     def __init__(
         self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool
     ) -> None:
-        self.topic_name, self.msg_type, self.raw = topic, kind, raw
+        self.topic_name = topic
+        self.msg_type = kind
+        self.raw = raw
         self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.SUBSCRIPTION)
         self.queue: deque[tuple[bytes, dict[str, int]]] = deque(
             maxlen=self.endpoint.qos_profile.depth
@@ -167,7 +172,8 @@ class Client:
     """A client of a service of another node of the world, or of one that the test answers."""
 
     def __init__(self, world: "World", service: str) -> None:
-        self._world, self._service = world, service
+        self._world = world
+        self._service = service
         self.srv_name = service
 
     def service_is_ready(self) -> bool:
@@ -226,7 +232,8 @@ class InWorld:
         **_: object,
     ) -> Subscription:
         """A subscription of the world."""
-        name, node = self.resolve_topic_name(topic), self.get_fully_qualified_name()
+        name = self.resolve_topic_name(topic)
+        node = self.get_fully_qualified_name()
         return cast("World", self.world).subscribe(kind, name, qos, node, raw=raw)
 
     def destroy_subscription(self, subscription: Subscription) -> None:

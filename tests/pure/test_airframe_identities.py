@@ -145,7 +145,8 @@ def test_multirotor_in_hover_is_not_refused() -> None:
 
 def test_height_is_a_state() -> None:
     """h_dot = V0 (theta - alpha), in ft beside speeds in kt: the units convert at the edge."""
-    kt, ft = 1852.0 / 3600.0, 0.3048
+    kt = 1852.0 / 3600.0
+    ft = 0.3048
     V0 = 20.0
     values = NAVION | {
         "speed": V0,
@@ -207,7 +208,8 @@ def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
     """The Navion turned by a trim angle of attack to u, w of body axes, with V = u cos + w sin; and
     the same in V, w.
     """
-    sine, cosine = np.sin(alpha), np.cos(alpha)
+    sine = np.sin(alpha)
+    cosine = np.cos(alpha)
     turn = np.eye(4)
     # u, w of body axes from those of stability axes
     turn[:2, :2] = [[cosine, -sine], [sine, cosine]]

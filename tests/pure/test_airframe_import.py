@@ -186,7 +186,8 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
     frame, note = import_airframe(
         tool_file(tmp_path, "navion.st", AVL_ST), speed="176 ft/s", thrust=True, **BODY
     )
-    matrix, x = frame.matrix_a(), list(frame.states)
+    matrix = frame.matrix_a()
+    x = list(frame.states)
     lateral = matrix[
         np.ix_(
             [x.index(name) for name in ("beta", "p", "r", "phi")],
@@ -275,8 +276,10 @@ def test_avl_system_matrix_has_the_published_eigenvalues(tmp_path: Path, axes: f
 
 
 def test_xflr5_log_gives_both_motions(tmp_path: Path) -> None:
-    f16, b747 = load_airframe("navion_longitudinal"), load_airframe("aerosonde_lateral")
-    longitudinal, lateral = np.array(f16.matrix_a()), np.array(b747.matrix_a())
+    f16 = load_airframe("navion_longitudinal")
+    b747 = load_airframe("aerosonde_lateral")
+    longitudinal = np.array(f16.matrix_a())
+    lateral = np.array(b747.matrix_a())
     longitudinal[:, 2] *= [1.0, 25.0 / f16.speed, 1.0, 1.0]  # w_dot = V0 q of the speed of both
     longitudinal[1, 0] *= f16.speed / 25.0
 
@@ -413,8 +416,16 @@ def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
     with w_dot and Ixz.
     """
     m, Ix, Iy, Iz, Ixz = 17642.0, 33898.0, 165669.0, 189496.0, 2952.0
-    S, b, c, rho, V0, theta, g = 49.239, 11.787, 4.889, 0.3809, 178.0, np.radians(9.4), 9.81
-    U, W, force = V0 * np.cos(theta), V0 * np.sin(theta), 0.5 * rho * V0 * S
+    S = 49.239
+    b = 11.787
+    c = 4.889
+    rho = 0.3809
+    V0 = 178.0
+    theta = np.radians(9.4)
+    g = 9.81
+    U = V0 * np.cos(theta)
+    W = V0 * np.sin(theta)
+    force = 0.5 * rho * V0 * S
     mass = np.array(
         [
             [m, 0.0, 0.0],

@@ -72,7 +72,8 @@ def test_only_link_of_autopilot_is_open() -> None:
     """The agent's topics and the flight's are on one loopback interface, with the stack's own
     profile.
     """
-    agent, flight = AUTOPILOT["agent"], AUTOPILOT["flight"]
+    agent = AUTOPILOT["agent"]
+    flight = AUTOPILOT["flight"]
     assert AUTOPILOT.keys() == {"agent", "flight"}
     (profile,) = agent["volumes"]
     source, target, access = profile.split(":")

@@ -79,7 +79,8 @@ def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> No
     stamps = range(0, 2_000_000, 20_000)
     rows = [(stamp, (1.0, 0.01 * k, 0.0, 0.0)) for k, stamp in enumerate(stamps)]
     write_ulog(path, {"vehicle_attitude": ("float[4] q;", rows)}, {"FW_AIRSPD_TRIM": 25.0})
-    here, there = read_vehicle_log(path), read_foreign_log(path)
+    here = read_vehicle_log(path)
+    there = read_foreign_log(path)
     assert there._replace(tables={}) == here._replace(tables={})
     assert there.tables.keys() == here.tables.keys()
     for name, table in here.tables.items():

@@ -40,7 +40,8 @@ def columns(tape: Tape, topic: str, names: tuple[str, ...]) -> FloatArray:
 
 def test_loop_gives_bits_of_simulation(flown: Tape) -> None:
     loop = rise_di.Loop(CONTROLLER)
-    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    y = columns(flown, "y", CONTROLLER.outputs)
+    y_m = columns(flown, "y_m", CONTROLLER.outputs)
     u = [loop.step(t, *row) for t, *row in zip(flown.time("u"), y, y_m, strict=True)]
     assert np.array_equal(u, flown["u"].values)
     assert loop.mode is Mode.ENGAGED
@@ -81,7 +82,8 @@ def test_loop_refuses_wrong_sample(t: float, y: ArrayLike, sentence: str) -> Non
 
 
 def test_plant_of_own_flies_as_simulation(flown: Tape) -> None:
-    aircraft, numbers = Simulator(SCENARIO.aircraft), iter(range(10_000))
+    aircraft = Simulator(SCENARIO.aircraft)
+    numbers = iter(range(10_000))
 
     def plant(t: float, u: FloatArray, dt: float) -> FloatArray:
         held = select(aircraft.inputs, CONTROLLER.inputs, u)
@@ -132,7 +134,8 @@ def test_wrong_parts_are_refused(parts: dict[str, Any], sentence: str) -> None:
 
 def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     law = rise_di.as_control(CONTROLLER)
-    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    y = columns(flown, "y", CONTROLLER.outputs)
+    y_m = columns(flown, "y_m", CONTROLLER.outputs)
     # from trim: the engagement of x = 0 has y = y_m = 0
     v = np.concatenate([y - y[0], y_m], axis=1).T
     loop = rise_di.Loop(CONTROLLER)
@@ -154,16 +157,20 @@ def test_environment_passes_checks_of_gymnasium() -> None:
 
 
 def test_environment_under_law_flies_as_simulation(flown: Tape) -> None:
-    env, loop = rise_di.FlightEnv(SCENARIO), rise_di.Loop(CONTROLLER)
+    env = rise_di.FlightEnv(SCENARIO)
+    loop = rise_di.Loop(CONTROLLER)
     observed, _ = env.reset()
-    flight, ended, reward = [], False, 0.0
+    flight = []
+    ended = False
+    reward = 0.0
     while not ended:
         flight.append(observed)
         u = loop.step((len(flight) - 1) * loop.period, observed[:M], observed[M:])
         observed, step_reward, terminated, ended, _ = env.step(u)
         reward += step_reward
         assert not terminated
-    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    y = columns(flown, "y", CONTROLLER.outputs)
+    y_m = columns(flown, "y_m", CONTROLLER.outputs)
     assert np.array_equal([*flight, observed], np.concatenate([y, y_m], axis=1))
     units = np.array([{"p": 0.02, "V": 0.1}.get(name, 0.01) for name in CONTROLLER.outputs])
     assert reward == approx(-np.sum(np.abs(y - y_m)[1:] / units) / CONTROLLER.rate)
@@ -197,11 +204,10 @@ def test_environments_draw_entries_of_scenario() -> None:
         }
     )
     calm = own.vary(aircraft={"sensors": {}})
-    u, place = 0.1 * np.eye(M)[CONTROLLER.inputs.index("thrust")], CONTROLLER.outputs.index("V")
-    flights, alone = (
-        rise_di.FlightVectorEnv(calm, 8, uncertainty=0.0),
-        rise_di.FlightEnv(calm, uncertainty=0.0),
-    )
+    u = 0.1 * np.eye(M)[CONTROLLER.inputs.index("thrust")]
+    place = CONTROLLER.outputs.index("V")
+    flights = rise_di.FlightVectorEnv(calm, 8, uncertainty=0.0)
+    alone = rise_di.FlightEnv(calm, uncertainty=0.0)
     flights.reset(seed=1)
     together = [flights.step(np.tile(u, (8, 1)))[0] for _ in range(50)][-1][:, place]
     one_by_one = []
@@ -217,10 +223,8 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
     """The fleet's linear steps against the simulator's integration: their difference is that of the
     campaign's figures.
     """
-    flights, alone = (
-        rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0),
-        rise_di.FlightEnv(SCENARIO),
-    )
+    flights = rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0)
+    alone = rise_di.FlightEnv(SCENARIO)
     observed, _ = flights.reset(seed=1)
     expected, _ = alone.reset(seed=1)
     assert flights.observation_space.contains(observed)
@@ -241,7 +245,9 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
     # without end stops
     flights = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_gust", 3.0), 2)
     first, _ = flights.reset(seed=3)
-    u, terminations, still = np.zeros((2, M)), 0, None
+    u = np.zeros((2, M))
+    terminations = 0
+    still = None
     u[1] = (
         # far beyond the limits of the law, so that the second aircraft leaves every bound within
         # some steps

@@ -97,7 +97,8 @@ def test_docstrings_name_their_equations() -> None:
 @pytest.fixture(scope="module")
 def channels(osprey_gust: Scenario) -> Mapping[str, Sequence[str]]:
     """Channels by topic in the default scenario."""
-    outputs, inputs = osprey_gust.controller.outputs, osprey_gust.controller.inputs
+    outputs = osprey_gust.controller.outputs
+    inputs = osprey_gust.controller.inputs
     return {
         **dict.fromkeys(("y", "y_m", "u_m"), outputs),
         "u": inputs,

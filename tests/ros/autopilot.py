@@ -39,7 +39,8 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 SPEED = 25.0  # m/s, trim
 FULL = math.radians(30.0)  # of the surfaces
 FULL_THRUST = 20.0  # N
-ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+ENU_OF_NED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+FLU_OF_FRD = np.diag([1, -1, -1])
 
 
 class Autopilot:
@@ -53,7 +54,8 @@ class Autopilot:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._simulator = Simulator(load_scenario(scenario).aircraft)
-        self._release_after, self._monotonic = release_after, monotonic
+        self._release_after = release_after
+        self._monotonic = monotonic
         self.node = node
         self._twist = self.node.create_publisher(TwistStamped, "/ap/twist/filtered", QOS)
         self._airspeed = self.node.create_publisher(Vector3Stamped, "/ap/airspeed", QOS)
@@ -111,12 +113,15 @@ class Autopilot:
             number = max(number + 1, int((time.monotonic() - begin) / self.period))
 
     def _publish(self, q: float, V: float, p: float, r: float) -> None:
-        twist, airspeed = TwistStamped(), Vector3Stamped()
+        twist = TwistStamped()
+        airspeed = Vector3Stamped()
         for message in (twist, airspeed):
             message.header.stamp.sec = 12  # like a time since boot: not the host's clock
             message.header.frame_id = "base_link"
         twist.twist.linear.y = SPEED + V  # north, in ENU
-        twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z = p, -q, -r
+        twist.twist.angular.x = p
+        twist.twist.angular.y = -q
+        twist.twist.angular.z = -r
         alpha = 0.05
         airspeed.vector.x, airspeed.vector.z = (
             (SPEED + V) * math.cos(alpha),
@@ -147,17 +152,23 @@ class Odometer(Autopilot):
         return [elevator, thrust / FULL_THRUST - 0.5, aileron, rudder]
 
     def _publish(self, q: float, V: float, p: float, r: float) -> None:
-        imu, odometry = Imu(), Odometry()
+        imu = Imu()
+        odometry = Odometry()
         for message in (imu, odometry):
             message.header.stamp.sec = 12  # simulated time
-        imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = p, -q, -r
+        imu.angular_velocity.x = p
+        imu.angular_velocity.y = -q
+        imu.angular_velocity.z = -r
         phi, theta, psi, north, east, altitude, v_north, v_east, climb, _ = (
             self._simulator.pose().tolist()
         )
         attitude = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
         turn = Rotation.from_matrix(ENU_OF_NED @ attitude @ FLU_OF_FRD)
-        place, velocity = odometry.pose.pose, odometry.twist.twist.linear
-        place.position.x, place.position.y, place.position.z = east, north, altitude
+        place = odometry.pose.pose
+        velocity = odometry.twist.twist.linear
+        place.position.x = east
+        place.position.y = north
+        place.position.z = altitude
         place.orientation.x, place.orientation.y, place.orientation.z, place.orientation.w = (
             turn.as_quat().tolist()
         )

@@ -52,10 +52,8 @@ class Process:
     def __init__(
         self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None
     ) -> None:
-        command, pipe = (
-            [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments],
-            subprocess.PIPE,
-        )
+        command = [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments]
+        pipe = subprocess.PIPE
         self.popen = subprocess.Popen(
             command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True
         )
@@ -238,10 +236,8 @@ def settable_clock(folder: Path) -> Path:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")
-    library, source = (
-        folder / "clock.so",
-        Path(__file__).parent / "flight_bringup" / "faults" / "clock.c",
-    )
+    library = folder / "clock.so"
+    source = Path(__file__).parent / "flight_bringup" / "faults" / "clock.c"
     subprocess.run(
         [compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"],
         check=True,

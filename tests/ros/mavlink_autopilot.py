@@ -35,9 +35,12 @@ def fly(scenario: Path, port: int) -> None:
     connection: Any = mavutil.mavlink_connection(
         f"udpout:127.0.0.1:{port}", source_system=1, source_component=1, dialect="ardupilotmega"
     )
-    send, period = connection.mav, simulator.period_ns / 1e9
+    send = connection.mav
+    period = simulator.period_ns / 1e9
     places = [simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
-    begin, number, channels = time.monotonic(), 0, list(STICKS)
+    begin = time.monotonic()
+    number = 0
+    channels = list(STICKS)
     print("ready", flush=True)
     while True:
         while (message := connection.recv_msg()) is not None:

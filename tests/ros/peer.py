@@ -29,7 +29,8 @@ from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
 T = TypeVar("T")
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 def stamp_ns(message: Any) -> int:

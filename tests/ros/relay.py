@@ -42,7 +42,8 @@ def device(pid: int) -> int:
 
 def forward(ends: tuple[int, int], delay: float, loss: float) -> None:
     """Forward until the process ends."""
-    until, rng = 0.0, random.Random(1)  # noqa: S311 - loss
+    until = 0.0
+    rng = random.Random(1)  # noqa: S311 - loss
 
     def pull(*_: object) -> None:
         nonlocal until

@@ -35,7 +35,8 @@ def installed(tmp_path: Path) -> Path:
     """The folder that holds the installed wheel, and a foreign package of the name guidance, as on
     PyPI.
     """
-    built, target = tmp_path / "built", tmp_path / "installed"
+    built = tmp_path / "built"
+    target = tmp_path / "installed"
     build = (
         sys.executable,
         "-m",
@@ -61,7 +62,8 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
     """Runs Python with the wheel. Strangers of all names are in the working folder and behind the
     wheel on the path.
     """
-    behind, working = tmp_path / "behind", tmp_path / "working"
+    behind = tmp_path / "behind"
+    working = tmp_path / "working"
     for name in PACKAGES:
         write_package(behind, name)
         write_package(working, name)

@@ -29,7 +29,9 @@ class HostDelays(threading.Thread):
 
     def run(self) -> None:
         """Measure until the process ends."""
-        period, begin, computed = 0.01, time.time(), time.process_time()
+        period = 0.01
+        begin = time.time()
+        computed = time.process_time()
         while True:
             time.sleep(period)
             begin, before = time.time(), begin
@@ -76,7 +78,8 @@ def until(
     `because` says what the test waits for. The limit grows by the delays of the host. A wait that
     ends without the condition fails with the output of all processes of the test.
     """
-    begin, began = time.monotonic(), time.time()
+    begin = time.monotonic()
+    began = time.time()
     while not (value := condition()):
         each()
         if time.monotonic() - begin > timeout + HOST.since(began):

@@ -42,7 +42,8 @@ KIT = Path(os.environ.get("RISE_DI_SITL", REPOSITORY.parent / "shared" / "sitl")
 PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
 # of a rehearsal
-OWN_MAP, OWN_SCENARIO = (os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO"))
+OWN_MAP = os.environ.get("RISE_DI_MAP")
+OWN_SCENARIO = os.environ.get("RISE_DI_SCENARIO")
 POLL = 0.1  # s, between two questions to the autopilot
 ENGAGEMENTS = 4  # attempts: some seconds of level flight end the climb that a fault before has left
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
@@ -332,9 +333,12 @@ def followed(tape: Tape, name: str, start: float, stop: float) -> float:
     """The part of y that goes along with y_m from start to stop, s, over y_m: the largest at a
     delay below 0.6 s.
     """
-    y, y_m = tape["y"], tape["y_m"]
-    t, t_m = tape.time("y"), tape.time("y_m")
-    inside, parts = (t > start) & (t < stop), []
+    y = tape["y"]
+    y_m = tape["y_m"]
+    t = tape.time("y")
+    t_m = tape.time("y_m")
+    inside = (t > start) & (t < stop)
+    parts = []
     for delay in np.arange(0.0, 0.6, 0.05):
         reference = np.interp(t[inside] - delay, t_m, y_m[name])
         moved = reference - reference.mean()
@@ -535,10 +539,8 @@ class ArduPlane(Autopilot):
         """
         log = read_run(self.run)
         (span,) = log.engagements or []
-        y_m, pulses = (
-            log.tape["y_m"],
-            load_scenario(self.run / "parameters.yaml").reference_model.pulses,
-        )
+        y_m = log.tape["y_m"]
+        pulses = load_scenario(self.run / "parameters.yaml").reference_model.pulses
         stop_ns = span.stop_ns or int(y_m.stamp_ns[-1])
         errors = {}
         for name, (kind, field) in OWN_SIGNALS.items():
@@ -590,7 +592,8 @@ class ArduPlane(Autopilot):
 
     def compare(self) -> dict[str, Agreement]:
         """The rates and the pose of the last flight with the autopilot's own log."""
-        tape, compared = read_run(self.run).tape, {}
+        tape = read_run(self.run).tape
+        compared = {}
         for topic, kind, rows in LOGGED:
             t, logged = self.log(kind, *rows.values())
             signal = tape[topic]
@@ -599,7 +602,8 @@ class ArduPlane(Autopilot):
             for name, values in zip(rows, logged[inside].T, strict=True):
                 measured = signal[name]
                 if name == "psi":
-                    measured, values = np.unwrap(measured), np.unwrap(values)  # noqa: PLW2901 - the same angle
+                    measured = np.unwrap(measured)
+                    values = np.unwrap(values)  # noqa: PLW2901 - the same angle
                 elif name in IN_METRES:
                     scale, begin = IN_METRES[name]
                     values = scale * (values - begin)  # noqa: PLW2901 - the same position
@@ -647,7 +651,8 @@ class Px4(Autopilot):
         """Take off from the runway, into Hold. The airplane cannot hold its default speed of 15
         m/s.
         """
-        deadline, armed = time.monotonic() + 60.0, False
+        deadline = time.monotonic() + 60.0
+        armed = False
         while not armed:
             assert time.monotonic() < deadline, "PX4 does not arm"
             time.sleep(1.0)

@@ -16,7 +16,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-AUTOPILOT, BRIDGE = ("127.0.0.1", 5763), ("127.0.0.1", 14551)
+AUTOPILOT = ("127.0.0.1", 5763)
+BRIDGE = ("127.0.0.1", 14551)
 STATION = 253  # its system
 TAKEN = 4  # Hz, the default of MAVProxy
 BEAT = 1.0  # s

@@ -64,7 +64,8 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     flight.wait_for("DISENGAGED")
     plane.wander(flight)
     compared = plane.compare()
-    messages, tape = list(stored_messages(plane.run)), read_run(plane.run).tape
+    messages = list(stored_messages(plane.run))
+    tape = read_run(plane.run).tape
     t_y = tape["y"].stamp_ns / 1e9
     t, equivalent = plane.log("VFR_HUD", "airspeed")
     inside = (t > t_y[0]) & (t < t_y[-1])
@@ -105,7 +106,8 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
         assert plane.state()["mode"] == "MANUAL"
     (one,) = plane.summary()["engagements"]
     tape = read_run(plane.run).tape
-    y, y_m = tape["y"], tape["y_m"]
+    y = tape["y"]
+    y_m = tape["y_m"]
     t = (y.stamp_ns - tape.start_ns) / 1e9
     pulses = SCENARIO.reference_model.pulses
     assert one["start"] < min(pulse.start[0] for pulse in pulses.values()), (
@@ -174,7 +176,8 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
     (one,) = plane.summary()["engagements"]
     assert one["stop"] is None, one["reason"]
     tape = read_run(plane.run).tape
-    t, errors = tape.time("guidance"), control_errors(tape)
+    t = tape.time("guidance")
+    errors = control_errors(tape)
     held = in_spans(t, [(start + 45.0, start + each) for start in starts])
     largest = {
         name: float(np.max(np.abs(errors[name][held]))) for name in ("heading", "altitude", "V")

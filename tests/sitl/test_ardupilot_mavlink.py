@@ -211,7 +211,8 @@ def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPla
 def mode_after(plane: ArduPlane, change: Callable[[], object], seconds: float) -> set[str]:
     """The modes of the autopilot in the seconds after a change."""
     change()
-    modes, end = set(), time.monotonic() + seconds
+    modes = set()
+    end = time.monotonic() + seconds
     while time.monotonic() < end:
         modes.add(plane.state()["mode"])
         time.sleep(0.2)

@@ -57,7 +57,8 @@ def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
 def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(osprey_gust: Scenario) -> None:
     with flying(osprey_gust, max_age=MAX_AGE, hold=HOLD, ramp=RAMP) as flight:
         flight.fly(0.01)
-        last_ns, begin = flight.world.vectors("/u")[-1].stamp_ns, len(flight.world.sent["/truth"])
+        last_ns = flight.world.vectors("/u")[-1].stamp_ns
+        begin = len(flight.world.sent["/truth"])
         flight.world.run(MAX_AGE + HOLD + RAMP + 0.1)
         t = (
             np.array(

@@ -77,7 +77,8 @@ class Setup:
     """A bridge, the simulated autopilot, and a publisher of u."""
 
     def __init__(self, world: World, channel_map: Path) -> None:
-        self.world, self.map = world, channel_map
+        self.world = world
+        self.map = channel_map
         self.begin_ns = world.clock.now_ns
         self.autopilot = Autopilot(SCENARIO, RELEASE_AFTER, world, world.clock.monotonic)
         self.autopilot_runs = True
@@ -201,7 +202,8 @@ def flown(setup: Setup, duration: float) -> dict[str, float]:
 def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channels(
     setup: Setup,
 ) -> None:
-    world, setup.u = setup.world, None
+    world = setup.world
+    setup.u = None
     setup.start()
     controller = world.start(ControllerNode)
     world.start(ReferenceModelNode)
@@ -259,7 +261,8 @@ def test_surface_without_effect_by_the_probe_of_the_controller_releases(setup: S
 def test_silent_autopilot_releases_and_bridge_does_not_engage_again_by_itself(setup: Setup) -> None:
     setup.start()
     setup.engaged()
-    silent, setup.autopilot_runs = setup.t, False
+    silent = setup.t
+    setup.autopilot_runs = False
     setup.until_logged("RELEASE -> DISENGAGED: ", " s old (/ap/")
     setup.until_logged("waiting for /ap/twist/filtered: no sample of its publisher arrives")
     setup.autopilot_runs = True
@@ -292,7 +295,8 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
     # of a controller, whose time is not that of its system clock
     setup.world.send("/u", dict.fromkeys(INPUTS, 0.0), age=step)
     before = len(setup.world.sent["/y"])
-    u, setup.u = setup.u, None
+    u = setup.u
+    setup.u = None
 
     def step_with_old_time() -> None:
         setup.step()
@@ -461,7 +465,8 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_tim
     commanded = 0.02  # rad of elevator, within a tenth of its limit, as engagement requires
     setup.u = (commanded, 0.0, 0.0, 0.0)
     setup.engaged()
-    setup.u, stale = None, setup.t - TICK  # the last u
+    setup.u = None
+    stale = setup.t - TICK  # the last u
     setup.until_logged("RELEASE -> DISENGAGED: u is")
     setup.run(1.0)
     since = [sent for sent in setup.joys if sent.t > stale]
@@ -612,12 +617,16 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
     """The messages are of a publisher in the frames of REP 103; SciPy gives orientation and
     velocity in the body axes.
     """
-    phi, theta, psi = 0.3, -0.2, 2.0
-    enu_of_ned, flu_of_frd = [[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.diag([1, -1, -1])
+    phi = 0.3
+    theta = -0.2
+    psi = 2.0
+    enu_of_ned = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    flu_of_frd = np.diag([1, -1, -1])
     turn = Rotation.from_matrix(
         enu_of_ned @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix() @ flu_of_frd
     )
-    imu, odometry = Imu(angular_velocity=RATES), Odometry(child_frame_id="plane/base_link")
+    imu = Imu(angular_velocity=RATES)
+    odometry = Odometry(child_frame_id="plane/base_link")
     for message, values in (
         (odometry.pose.pose.position, (30.0, 40.0, 20.0)),
         (odometry.pose.pose.orientation, turn.as_quat().tolist()),
@@ -634,7 +643,8 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
             world.publish("/uav1/sim/odom", odometry)
 
         world.run(0.5, publish)
-        y, pose = world.last("/uav1/y"), world.last("/uav1/pose")
+        y = world.last("/uav1/y")
+        pose = world.last("/uav1/pose")
     assert y == approx({"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1})  # V is captured at an engagement
     expected = {
         "phi": phi,

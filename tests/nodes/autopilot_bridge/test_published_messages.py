@@ -118,10 +118,8 @@ class Px4:
         types = import_module("px4_msgs.msg")
         self._world = world
         # nose up and 2 m/s fast
-        odometry, airspeed = (
-            fill(types.VehicleOdometry(q=[1.0, 0.0, 0.0, 0.0]), RATES["px4"]),
-            fill(types.AirspeedValidated(), AIRSPEED["px4"]),
-        )
+        odometry = fill(types.VehicleOdometry(q=[1.0, 0.0, 0.0, 0.0]), RATES["px4"])
+        airspeed = fill(types.AirspeedValidated(), AIRSPEED["px4"])
         self._status = types.VehicleStatus(arming_state=self.ARMED, nav_state=self.HOLD)
         self._publishers = [
             (world.create_publisher(type(message), f"/fmu/out/{topic}", 5), message)

@@ -60,7 +60,8 @@ def test_node_names_law_of_another_package_and_takes_new_gains_of_it_in_flight(
         assert any("law pid" in line for line in flight.node.log.lines)
         assert flight.set(lead=[0.0, 0.0, 0.0, 0.0]) == (True, "")
         flight.run(0.3)
-        digest, state = flight.column("parameters"), flight.column("integral_e.q")
+        digest = flight.column("parameters")
+        state = flight.column("integral_e.q")
         assert digest[-1] != digest[0]
         assert state[-1] > state[0] >= 0.0  # the law's own
         assert not flight.set(law="pi")[0]  # at a restart only

@@ -31,7 +31,8 @@ class Proposer:
     """Proposes the model of osprey_observer to a controller that starts with other parameters."""
 
     def __init__(self, flight: Flight, start: RiseDiConfig) -> None:
-        self.flight, self.start = flight, start
+        self.flight = flight
+        self.start = start
         self.change = designed(start, find_scenario("osprey_observer").rise_di())
         self._publisher = flight.world.publisher(PROPOSAL.type, "/proposal")
 
@@ -159,10 +160,8 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
 
 
 def test_learner_refuses_a_scenario_that_does_not_learn() -> None:
-    file, refusal = (
-        find_scenario("osprey_servo").path,
-        r"learner\.scenario_file: found a scenario without controller\.learn",
-    )
+    file = find_scenario("osprey_servo").path
+    refusal = r"learner\.scenario_file: found a scenario without controller\.learn"
     with (
         world_of("-p", f"scenario_file:={file}") as world,
         refusing(refusal),

@@ -48,7 +48,8 @@ class Recording:
     """A recorder, and the publishers of a flight."""
 
     def __init__(self, world: World, folder: Path) -> None:
-        self.world, self.folder = world, folder
+        self.world = world
+        self.folder = folder
         self.node: Any = world.start(RecorderNode)
 
     def send(self, *topics: str, age: float = 0.0) -> None:
@@ -283,10 +284,8 @@ def test_topic_without_its_publisher_is_no_silence(recorder: Recording) -> None:
 
 
 def test_lost_messages_are_counted_and_reported(recorder: Recording) -> None:
-    publisher, encoder = (
-        recorder.world.publisher(JointState, "/truth"),
-        Encoder(OUTPUTS, "/aircraft#1"),
-    )
+    publisher = recorder.world.publisher(JointState, "/truth")
+    encoder = Encoder(OUTPUTS, "/aircraft#1")
 
     def send(count: int) -> None:
         for k in range(count):
@@ -375,7 +374,8 @@ def test_full_disk_ends_recording_with_one_error_and_not_flight(
 ) -> None:
     names = tuple(f"x.{k}" for k in range(100))
     with recording(osprey_gust, disk / "run", min_free=least, lockstep="true") as recorder:
-        encoder, number = Encoder(names, "/aircraft#1"), 0
+        encoder = Encoder(names, "/aircraft#1")
+        number = 0
         publisher = recorder.world.publisher(JointState, "/truth")
 
         def send() -> None:

@@ -17,7 +17,9 @@ def exchanged(
     """What a knows of b after six exchanges; the clock of b is ahead by the offset, s, and messages
     take there and back, s.
     """
-    a, b, rng = Peers("/a", hosts[0]), Peers("/b", hosts[1]), random.Random(1)  # noqa: S311 - jitter
+    a = Peers("/a", hosts[0])
+    b = Peers("/b", hosts[1])
+    rng = random.Random(1)  # noqa: S311 - jitter
     b.ahead = offset
     for k in range(6):
         sent = 1000.0 + k

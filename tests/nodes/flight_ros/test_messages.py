@@ -77,7 +77,8 @@ def test_the_middleware_reads_what_was_encoded() -> None:
 def test_wanted_channels_decoded_by_name_with_and_without_known_layout(
     names: list[str], values: list[float], stamp_ns: int
 ) -> None:
-    decoder, encoder = Decoder(("p", "V")), Encoder(names, "/aircraft#1")
+    decoder = Decoder(("p", "V"))
+    encoder = Encoder(names, "/aircraft#1")
     for _ in range(2):  # the second sample has a known layout
         sample = decoded(decoder, encoder.encode(stamp_ns, np.array(values)))
         assert (sample.stamp_ns, sample.sender) == (stamp_ns, "/aircraft#1")
@@ -129,6 +130,7 @@ def test_invalid_message_rejected_with_reason(reason: str, raw: bytes, known_lay
 
 
 def test_message_with_velocities_read_by_positions() -> None:
-    decoder, raw = Decoder(("q",)), vector(NANOSECONDS, ["q"], [3.0], "x", velocity=[9.0])
+    decoder = Decoder(("q",))
+    raw = vector(NANOSECONDS, ["q"], [3.0], "x", velocity=[9.0])
     for _ in range(2):
         assert decoded(decoder, raw).value.tolist() == [3.0]

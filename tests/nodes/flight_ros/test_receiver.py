@@ -26,13 +26,15 @@ class Topic(PolledSubscription):
     """A subscription without middleware. It is also the node that logs."""
 
     def __init__(self) -> None:
-        self.topic, self.name = Y, "/y"
+        self.topic = Y
+        self.name = "/y"
         self.messages: list[bytes] = []
         self.lines: list[tuple[str, str]] = []
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
         """The messages, without metadata."""
-        taken, self.messages = self.messages[:most], self.messages[most or len(self.messages) :]
+        taken = self.messages[:most]
+        self.messages = self.messages[most or len(self.messages) :]
         return [ReceivedMessage(message, 0, 0, 0) for message in taken]
 
     def get_logger(self) -> Any:
@@ -137,7 +139,8 @@ def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
     have other channels.
     """
     setup = Setup()
-    right, longer = message(), message(names=(*NAMES, "alpha"))
+    right = message()
+    longer = message(names=(*NAMES, "alpha"))
     too_long = longer + bytes(len(longer) + 1)
     assert setup.poll(right, longer, right, too_long, of_size(MAX_SIZE)) == [
         True,
@@ -159,7 +162,8 @@ def test_report_may_be_much_longer_than_the_one_before() -> None:
     """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout
     later.
     """
-    right, long = message(), message(names=(*NAMES, *(f"c{k}" for k in range(800))))
+    right = message()
+    long = message(names=(*NAMES, *(f"c{k}" for k in range(800))))
     setup = Setup(max_size=len(long))
     assert setup.poll(right, long, long + bytes(1)) == [True, True, False]
 

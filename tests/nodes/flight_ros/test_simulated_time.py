@@ -34,7 +34,9 @@ class Simulation:
     """A simulator that publishes /clock `speed` times as fast as the time of the host."""
 
     def __init__(self, world: World, speed: float = 1.0) -> None:
-        self.world, self.speed, self.now_ns = world, speed, 0
+        self.world = world
+        self.speed = speed
+        self.now_ns = 0
         self.publisher = world.publisher(Clock, "/clock")
 
     def run(self, duration: float) -> None:

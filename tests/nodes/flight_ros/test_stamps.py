@@ -44,12 +44,11 @@ NODES: Mapping[NodeSpec, type[FlightNode[Any]]] = {
     GUIDANCE: GuidanceNode,
 }
 NOW_NS = 1000 * NANOSECONDS
-CONTROLLER_AGE, GUIDANCE_AGE = (
-    SCENARIO.controller.max_age,
-    SCENARIO.guidance.max_age if SCENARIO.guidance else 0.0,
-)
+CONTROLLER_AGE = SCENARIO.controller.max_age
+GUIDANCE_AGE = SCENARIO.guidance.max_age if SCENARIO.guidance else 0.0
 DELAY = 0.05  # s, of the sensors of the aircraft
-U_M_AGE, U_AGE = SCENARIO.reference_model.live.max_age, SCENARIO.aircraft.max_age + DELAY
+U_M_AGE = SCENARIO.reference_model.live.max_age
+U_AGE = SCENARIO.aircraft.max_age + DELAY
 LIMITS = {
     "controller": {"y": CONTROLLER_AGE, "y_m": CONTROLLER_AGE},
     "aircraft": {"u": U_AGE},

@@ -84,7 +84,8 @@ def test_in_lockstep_reference_waits_for_u_m_and_repeats_bytes_of_one_process(os
         "--params-file", str(osprey), "-p", "lockstep:=true", "-p", "u_m_rate:=50.0"
     ) as world:
         node = world.make(ReferenceModelNode)
-        clock, u_m = world.publisher(Clock, "/clock"), world.publisher(JointState, "/u_m")
+        clock = world.publisher(Clock, "/clock")
+        u_m = world.publisher(JointState, "/u_m")
         for number in range(31):
             clock.publish(instant(number * 2 * MS))
         for number in range(0, 30, 10):

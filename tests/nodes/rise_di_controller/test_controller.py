@@ -143,7 +143,9 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenari
         flight.run(MAX_AGE + hold + ramp + 0.1, silent=True)
         resumed = len(flight.world.sent["/internals"])
         flight.run(0.1)
-        mode, at, u = flight.column("mode", begin), flight.at(begin), flight.u(begin)
+        mode = flight.column("mode", begin)
+        at = flight.at(begin)
+        u = flight.u(begin)
         failsafe = int(np.flatnonzero(mode == Mode.HOLD)[0])
         # the first tick at which y is stale
         assert 0 < at[failsafe] - last - nanoseconds(MAX_AGE) <= nanoseconds(PERIOD)
@@ -319,7 +321,8 @@ def test_gains_change_in_flight_bumpless(osprey_gust: Scenario) -> None:
 def test_saturation_limits_can_be_added_in_flight(flight: Flight) -> None:
     flight.engage()
     assert flight.set(upper=[0.001, 0.001, 0.001, 0.001]) == (True, "")
-    before, flight.y = len(flight.world.sent["/u"]), -0.2
+    before = len(flight.world.sent["/u"])
+    flight.y = -0.2
     flight.run(1.0)
     assert flight.u()[-1] == pytest.approx(0.001, rel=1e-9)  # to rounding
     assert flight.u(before).max() <= 0.001
@@ -431,13 +434,15 @@ def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
     """
     flight.engage()
     flight.run(2.0, silent=True)  # in the failsafe each tick publishes internals
-    begin, before = len(flight.world.sent["/internals"]) - 1, missed(flight)
+    begin = len(flight.world.sent["/internals"]) - 1
+    before = missed(flight)
     for periods in (3.4, 5.0, 1.2, 7.9):
         with flight.world.stopped(flight.node):
             flight.world.run(periods * PERIOD)
         flight.run(0.1, silent=True)
     flight.run(1.0, silent=True)
-    number, late = flight.column("number"), flight.column("late", begin)
+    number = flight.column("number")
+    late = flight.column("late", begin)
     assert number.tolist() == [*range(1, len(number) + 1)]  # none is lost
     assert ((late >= 0.0) & (late < PERIOD)).all()
     assert late.max() > 0.0

@@ -50,7 +50,8 @@ def actuator(
 def positions(
     commands: list[float], dt: float, params: Actuators, start: float = 0.0
 ) -> list[float]:
-    position, history = np.array([start]), []
+    position = np.array([start])
+    history = []
     for command in commands:
         position = step(position, np.array([command]), np.array(dt), params)
         history.append(float(position[0]))
@@ -132,7 +133,8 @@ def position_history(times_ms: range, command: float, **actuators: Any) -> Float
     all four.
     """
     params = osprey(10.0, **actuators)
-    state, history = plant.initial_state(params), []
+    state = plant.initial_state(params)
+    history = []
     for t in times_ms:
         state = advance(t * MS, state, np.full(4, command), 10 * MS, params)
         history.append(state.position)
@@ -176,10 +178,8 @@ def test_fault_within_step_acts_from_next_step_on() -> None:
 
 
 def test_lost_aileron_acts_like_zero_column_of_b() -> None:
-    params, u = (
-        osprey(faults=["aileron lost 0"]),
-        np.array([0.01, 0.1, -0.02, 0.03]),
-    )
+    params = osprey(faults=["aileron lost 0"])
+    u = np.array([0.01, 0.1, -0.02, 0.03])
     without = osprey()
     without = without._replace(
         aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0])
@@ -202,7 +202,8 @@ def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float
 def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
     # From 50 ms on at 0.2 (1 - exp(-2.5)) with a lag of 0.2 s; the thrust, which has 1 s, stays as
     # it is.
-    lag, faults = [0.02, 1.0, 0.02, 0.02], ["elevator slow 0.05", "thrust slow 0.05"]
+    lag = [0.02, 1.0, 0.02, 0.02]
+    faults = ["elevator slow 0.05", "thrust slow 0.05"]
     slow = position_history(range(0, 100, 10), 0.2, lag=lag, faults=faults)
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
     assert (slow[:5] == healthy[:5]).all()
@@ -223,7 +224,8 @@ def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> N
     ).actuators
     position = np.array([0.1, 0.0, 0.0, 0.0])
     command = np.array([0.1, 0.0, -0.2, 0.0])
-    history, means = [], []
+    history = []
+    means = []
     for k in range(30):
         position, mean = move(0.01 * k, position, command, 0.01, params)
         history.append(position)
@@ -246,7 +248,8 @@ def test_runaway_without_a_rate_limit_is_at_its_stop_at_once() -> None:
 def test_loose_surface_follows_play_operator() -> None:
     # Half-width 0.1: the position stays while the command is within 0.1 of it, and trails it by 0.1
     # otherwise.
-    params, position = Actuators(loose_at=np.array([1.0]), loose_play=np.array([0.1])), np.zeros(1)
+    params = Actuators(loose_at=np.array([1.0]), loose_play=np.array([0.1]))
+    position = np.zeros(1)
     history = []
     for t, command in ((0.0, 0.05), (1.0, 0.1), (1.0, 0.3), (1.0, 0.15), (1.0, 0.05), (1.0, -0.2)):
         position, _ = move(t, position, np.array([command]), 0.01, params)
@@ -256,7 +259,8 @@ def test_loose_surface_follows_play_operator() -> None:
 
 def test_drift_ends_as_the_drifted_aircraft() -> None:
     ice = aircraft_parameters(drift={"start": 1.0, "duration": 2.0, "A": 0.3, "B": 0.2})
-    after, before = plant.aircraft_at(3000 * MS, ice.plant()), ice.plant().aircraft
+    after = plant.aircraft_at(3000 * MS, ice.plant())
+    before = ice.plant().aircraft
     airframe = ice.drifted_airframe()
     expected = (airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_gusts())
     for matrix, first, last in zip(
@@ -289,7 +293,8 @@ def test_rate_and_stops_hold_for_any_command(
 
 
 def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
-    params, u = osprey(), np.array([0.01, 0.1, -0.02, 0.03])
+    params = osprey()
+    u = np.array([0.01, 0.1, -0.02, 0.03])
     x: FloatArray = np.linspace(-0.1, 0.1, 8)
     state = advance(0, AircraftState(x, np.zeros(4)), u, 10 * MS, params)
     for k in range(5):
@@ -303,12 +308,11 @@ def test_late_command_acts_as_that_command_given_later(every: int) -> None:
     """To the last bit, also where every second sample is left out: u is then held over two
     periods.
     """
-    scenario, periods = find_scenario("osprey_servo"), 3
+    scenario = find_scenario("osprey_servo")
+    periods = 3
     late = {"actuators": scenario.aircraft.actuators.model_dump() | {"delay": 0.006}}
-    delayed, at_once = (
-        Simulator(scenario.vary(aircraft=late).aircraft),
-        Simulator(scenario.aircraft),
-    )
+    delayed = Simulator(scenario.vary(aircraft=late).aircraft)
+    at_once = Simulator(scenario.aircraft)
     # over the periods 0 and 1, 2 and 3, ...
     held = np.repeat(0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0)
     shifted = np.vstack([np.zeros((periods, 4)), held])
@@ -335,7 +339,8 @@ def continuous(
             min(max(state[0], -stop), stop),
         ]
 
-    state, history = np.zeros(2), []
+    state = np.zeros(2)
+    history = []
     for command in commands:
         # The largest step bounds the overshoot of a stop: rate or command / lag times 1e-4 s.
         found = solve_ivp(
@@ -348,7 +353,9 @@ def continuous(
 
 def travelled(commands: list[float], tick: float, dt: float, params: Actuators) -> FloatArray:
     """The same integral by mean positions over steps of dt."""
-    position, total, history = np.zeros(1), 0.0, []
+    position = np.zeros(1)
+    total = 0.0
+    history = []
     for command in commands:
         for _ in range(round(tick / dt)):
             position, mean = move(0.0, position, np.array([command]), dt, params)
@@ -378,10 +385,8 @@ def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: floa
 
 
 def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
-    position, command = (
-        np.linspace(-0.04, 0.04, 12).reshape(6, 2),
-        np.linspace(0.3, -0.3, 12).reshape(6, 2),
-    )
+    position = np.linspace(-0.04, 0.04, 12).reshape(6, 2)
+    command = np.linspace(0.3, -0.3, 12).reshape(6, 2)
     columns = Actuators(*(None if value is None else value[:, None] for value in SIX))
     with enable_x64():
         together = move(0.0, jnp.asarray(position), jnp.asarray(command), 0.01, columns)
@@ -393,10 +398,13 @@ def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
 
 def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
     # Against SciPy's integrator of lags and plant together, with u held.
-    u, lag, params = np.array([0.02, 0.0, 0.03, 0.01]), np.array([0.02, 0.1, 0.02, 0.02]), osprey()
+    u = np.array([0.02, 0.0, 0.03, 0.01])
+    lag = np.array([0.02, 0.1, 0.02, 0.02])
+    params = osprey()
 
     def rates(t: float, state: FloatArray) -> FloatArray:
-        x, position = state[:8], state[8:]
+        x = state[:8]
+        position = state[8:]
         return np.concatenate([x_dot(t, x, position, params.aircraft), (u - position) / lag])
 
     exact = solve_ivp(rates, (0.0, 0.1), np.zeros(12), method="DOP853", rtol=1e-12, atol=1e-14).y[

@@ -46,7 +46,8 @@ def test_without_f_plant_follows_matrix_exponential() -> None:
     # (0.026)^5 / 120 a step, about 1e-9 over a second.
     aircraft = osprey()
     aircraft = aircraft._replace(gravity=np.zeros_like(aircraft.gravity))
-    x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
+    x_0 = np.linspace(-0.1, 0.1, 8)
+    u = np.array([0.02, 0.1, -0.01, 0.03])
     block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
     exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
     assert final_state(x_0, u, NANOSECONDS, 2 * MS, aircraft) == approx(exact, abs=1e-8)
@@ -54,7 +55,8 @@ def test_without_f_plant_follows_matrix_exponential() -> None:
 
 def test_halving_step_divides_integration_error_by_sixteen() -> None:
     aircraft = osprey()
-    x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
+    x_0 = np.linspace(-0.2, 0.2, 8)
+    u = np.zeros(4)
     finest = final_state(x_0, u, NANOSECONDS, MS // 4, aircraft)
     errors = [
         np.abs(final_state(x_0, u, NANOSECONDS, step, aircraft) - finest).max()
@@ -93,7 +95,8 @@ def test_gust_stays_between_zero_and_speed_with_bounded_derivative(
 
 
 def test_gust_of_speed_zero_is_exactly_no_gust() -> None:
-    undisturbed, zero = osprey(), osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
+    undisturbed = osprey()
+    zero = osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
     x = np.linspace(-0.1, 0.1, 8)
     assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, undisturbed)).all()
 
@@ -160,7 +163,8 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
     params = aircraft_parameters(rate=25.0, **EVERYTHING).plant()
     filters = params.turbulence
     assert filters is not None
-    u, T = np.array([0.05, 0.1, -0.04, 0.03]), 20
+    u = np.array([0.05, 0.1, -0.04, 0.03])
+    T = 20
     state = initial_state(params)._replace(x=np.linspace(-0.5, 0.5, 8))
     end = advance(7 * 40 * MS, state, u, 40 * MS, params)
 
@@ -178,11 +182,9 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
 
 def test_equation_1_is_sum_of_parts() -> None:
     aircraft = aircraft_parameters(rate=25.0, **EVERYTHING).load()[1]
-    x, u, turbulent = (
-        np.linspace(-0.3, 0.3, 8),
-        np.array([0.01, 0.1, 0.02, 0.03]),
-        np.array([0.5, -1.0, 2.0]),
-    )
+    x = np.linspace(-0.3, 0.3, 8)
+    u = np.array([0.01, 0.1, 0.02, 0.03])
+    turbulent = np.array([0.5, -1.0, 2.0])
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
     assert x_dot == approx(
         aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14

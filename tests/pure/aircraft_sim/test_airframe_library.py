@@ -177,7 +177,8 @@ def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
     M_alpha = -q_S * 0.35714 * 0.4629 / 0.165
     M_q = -q_S * 0.35714 * 1.30124 * 0.35714 / (2.0 * 18.0) / 0.165
     airframe = load_airframe("x8_elevons")
-    A, rows = airframe.matrix_a(), [airframe.index("alpha"), airframe.index("q")]
+    A = airframe.matrix_a()
+    rows = [airframe.index("alpha"), airframe.index("q")]
     assert_allclose(A[rows, rows], [Z_alpha, M_q], rtol=0.01)
     assert A[airframe.index("q"), airframe.index("alpha")] == approx(M_alpha, rel=0.01)
 
@@ -269,7 +270,8 @@ def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]
             np.linalg.solve(inertia, np.array([c["l_" + key], c["n_" + key]])) * pressure * c["b"]
         )
 
-    force, rate = pressure / c["mass"], c["b"] / (2.0 * c["V"])
+    force = pressure / c["mass"]
+    rate = c["b"] / (2.0 * c["V"])
     A = np.zeros((4, 4))
     A[0] = [
         force * c["Y_beta"] / c["V"],
@@ -370,7 +372,9 @@ def test_input_that_drives_another_output_gets_new_pairing() -> None:
 def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
     generator = np.random.default_rng(7)
     airframe = load_airframe("osprey")
-    A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
+    C = airframe.matrix_c()
     expected = invariant_zeros(A, B, C)
     for _ in range(50):
         T = generator.standard_normal((8, 8))

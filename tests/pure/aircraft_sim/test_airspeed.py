@@ -53,7 +53,8 @@ def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
     (slow, at_slow), (fast, at_fast) = (
         level_flight(OSPREY, ratio, "thrust") for ratio in (0.8, 1.25)
     )
-    alpha, V0 = OSPREY.index("alpha"), OSPREY.speed
+    alpha = OSPREY.index("alpha")
+    V0 = OSPREY.speed
     # that of the trim, of rad
     lift = -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
     for x, ratio in ((slow, 0.8), (fast, 1.25)):

@@ -53,7 +53,8 @@ def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
 
 
 def test_gust_comes_again_after_its_time() -> None:
-    once, again = single(Gusts, 2.0, 5.0, 15.0), single(Gusts, 2.0, 5.0, 15.0, 7.0)
+    once = single(Gusts, 2.0, 5.0, 15.0)
+    again = single(Gusts, 2.0, 5.0, 15.0, 7.0)
     t = np.linspace(0.0, 6.0, 50)[:, None]
     np.testing.assert_array_equal(
         one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0))

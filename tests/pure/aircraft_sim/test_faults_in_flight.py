@@ -25,7 +25,8 @@ GUST = {"start": 0.5, "speed": 4.0, "length": 3.0}
 
 def flown(before: AircraftConfig, after: AircraftConfig) -> FloatArray:
     """Rows of y and truth of a flight with another set from BEGIN on; u rolls and pitches."""
-    simulator, rows = Simulator(before), []
+    simulator = Simulator(before)
+    rows = []
     for number in range(SAMPLES):
         if number == CHANGE:
             simulator.retune(after)
@@ -69,7 +70,8 @@ def test_fault_that_begins_now_is_one_that_was_scheduled(
         faults = [text.format(begin).replace("thrust", THRUST[name]) for text in sentences]
         return {"actuators": {"upper": [0.1] * 4, "faults": faults}}
 
-    now, scheduled = section(0.0), section(BEGIN)
+    now = section(0.0)
+    scheduled = section(BEGIN)
     scenario = find_scenario(name).vary(
         aircraft={
             "gusts": {},

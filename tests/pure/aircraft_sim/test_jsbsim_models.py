@@ -181,7 +181,8 @@ def throttle_step(airframe: str) -> FloatArray:
     none = np.zeros(len(AXES))
     condition = FlightCondition(require_aircraft(airframe), 46.3, 1219.2, STEP_NS)
     model = JsbsimModel(condition, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
-    u, V = np.array([0.1 * (name == "throttle") for name in INPUTS]), []
+    u = np.array([0.1 * (name == "throttle") for name in INPUTS])
+    V = []
     for k in range(400):
         model.advance(k * STEP_NS, u, STEP_NS)
         V.append(model.y()[1])

@@ -90,7 +90,8 @@ def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number
     """
     thrust = 1.5 * GRAVITY / 6.0
     angle = math.radians(30.0 + 60.0 * (number - 1))  # from the nose to the right
-    north, east = 0.275 * math.cos(angle), 0.275 * math.sin(angle)
+    north = 0.275 * math.cos(angle)
+    east = 0.275 * math.sin(angle)
     roll, pitch = np.array([-east, north]) * thrust / 0.02  # of a thrust up: r x F
     yaw = 0.016 * thrust / 0.035 * (1.0 if number % 2 else -1.0)
     found = accelerations(HEXAROTOR, f"rotor_{number}")
@@ -100,7 +101,8 @@ def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number
 
 
 def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
-    position, at = np.zeros(len(commands)), []
+    position = np.zeros(len(commands))
+    at = []
     for k in range(5):
         position, mean = move(0.01 * k, position, np.array(commands), 0.01, params.actuator_model())
         at += [position, mean]
@@ -123,7 +125,8 @@ def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
     other faults.
     """
     frame = load_airframe(airframe)
-    place, count = list(frame.inputs).index(effector), len(frame.inputs)
+    place = list(frame.inputs).index(effector)
+    count = len(frame.inputs)
     nothing = {"osprey_twin": -0.5, "osprey_vtail": -0.5, "x8_elevons": -3.46, HEXAROTOR: -2.45}[
         airframe
     ]

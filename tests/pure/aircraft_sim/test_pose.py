@@ -39,7 +39,12 @@ def test_heading_wrapped_to_half_turn_either_way(angle: float) -> None:
 
 
 def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_down() -> None:
-    speed, alpha, beta, phi, theta, psi = 40.0, 0.1, -0.05, 0.6, 0.2, 2.5
+    speed = 40.0
+    alpha = 0.1
+    beta = -0.05
+    phi = 0.6
+    theta = 0.2
+    psi = 2.5
     body = speed * np.array(
         [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
     )
@@ -97,7 +102,8 @@ def test_euler_kinematics_turn_body_rates_as_attitude_turns() -> None:
 def test_level_turn_keeps_attitude_and_costs_lift() -> None:
     # q = psi_dot sin(phi), r = psi_dot cos(phi), psi_dot = (g/V) tan(phi): the rates of a level
     # turn hold phi and theta.
-    phi, turn = 0.5, GRAVITY / 25.0 * math.tan(0.5)
+    phi = 0.5
+    turn = GRAVITY / 25.0 * math.tan(0.5)
     rates = euler_rates({"phi": phi, "q": turn * math.sin(phi), "r": turn * math.cos(phi)})
     assert abs(rates["phi"]) < 1e-15
     assert abs(rates["theta"]) < 1e-15
@@ -125,10 +131,12 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     """
     simulator = Simulator(aircraft_parameters(kinematics="euler"))
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
-    states, u = list(airframe.states), np.array([0.0, 0.0, 0.01, 0.0])
+    states = list(airframe.states)
+    u = np.array([0.0, 0.0, 0.01, 0.0])
 
     def derivative(t: float, z: Any) -> Any:
-        x, psi = z[:8], z[8]
+        x = z[:8]
+        psi = z[8]
         V, alpha, q, theta, beta, _, r, phi = (x[states.index(name)] for name in states)
         air = (25.0 + V) * np.array(
             [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
@@ -161,10 +169,13 @@ def guided(signal: Signal) -> dict[str, Any]:
 @pytest.mark.parametrize("scenario", [OSPREY, C172P], ids=lambda scenario: scenario.name)
 def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
     short = scenario.vary(flight={"duration": 3.0}, aircraft=QUIET)
-    still, windy = simulate(short), simulate(short.vary(aircraft={"wind": [-4.0, 3.0]}))
+    still = simulate(short)
+    windy = simulate(short.vary(aircraft={"wind": [-4.0, 3.0]}))
     for topic in ("y", "u", "truth"):
         assert still[topic].values.tobytes() == windy[topic].values.tobytes()
-    before, after, t = guided(still["pose"]), guided(windy["pose"]), still.time("pose")
+    before = guided(still["pose"])
+    after = guided(windy["pose"])
+    t = still.time("pose")
     for name, moved in (
         ("north", -4.0 * t),
         ("east", 3.0 * t),
@@ -179,8 +190,11 @@ def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
 
 def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     tape = simulate(C172P.vary(flight={"duration": 20.0}, aircraft=QUIET))
-    found, t, truth = tape["pose"], tape.time("pose"), tape["truth"].group("x")
-    speed, altitude = C172P.aircraft.speed, C172P.aircraft.altitude
+    found = tape["pose"]
+    t = tape.time("pose")
+    truth = tape["truth"].group("x")
+    speed = C172P.aircraft.speed
+    altitude = C172P.aircraft.altitude
     assert (found["v_north"][0], found["altitude"][0]) == (
         approx(speed, rel=1e-3),
         approx(altitude, rel=1e-6),
@@ -232,7 +246,8 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
     specified.
     """
     simulator = Simulator(aircraft_parameters(pose=POOR, rate=100.0))
-    truth, arrived = {}, []
+    truth = {}
+    arrived = []
     for number in range(100 * 100 + 1):
         simulator.sample(number, np.zeros(4))
         truth[number * 10_000_000] = simulator.pose()

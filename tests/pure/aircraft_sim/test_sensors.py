@@ -109,7 +109,8 @@ def test_after_missed_ticks_due_samples_arrive_together_oldest_first() -> None:
 
 def test_sample_is_output_with_noise_or_dropped() -> None:
     parameters = aircraft_parameters(step=0.01, sensors={"noise": NOISE, "dropout": 0.5})
-    simulator, model = Simulator(parameters), StateSpaceModel(parameters)
+    simulator = Simulator(parameters)
+    model = StateSpaceModel(parameters)
     u = np.array([0.01, 0.1, 0.02, 0.03])
     arrivals = []
     for k in range(20):
@@ -181,7 +182,8 @@ def test_variance_of_drift_grows_with_time_at_any_rate() -> None:
 
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
-    slow, controller = {"rate": 100.0}, {"delay": 0.0, "softening": 3.0}
+    slow = {"rate": 100.0}
+    controller = {"delay": 0.0, "softening": 3.0}
     return PROTOTYPE_SERVO.vary(
         aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller
     )
@@ -198,7 +200,8 @@ def test_truth_holds_whole_error_of_sensors_with_every_fault(servo: Scenario) ->
         "quantisation": [1e-3, 0.0, 1e-3, 5e-4],
     }
     tape = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
-    y, truth = tape["y"], tape["truth"]
+    y = tape["y"]
+    truth = tape["truth"]
     at = np.searchsorted(truth.stamp_ns, y.stamp_ns)
     for name in y.names:
         assert y[name] == approx(truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15)

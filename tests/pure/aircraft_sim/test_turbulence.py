@@ -39,7 +39,9 @@ def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
     """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega
     = omega / V0.
     """
-    L, sigma, space = model.length[axis], model.sigma[axis], omega / V0
+    L = model.length[axis]
+    sigma = model.sigma[axis]
+    space = omega / V0
     if axis == 0:
         return np.asarray(sigma**2 * 2.0 * L / np.pi / (1.0 + (L * space) ** 2) / V0)
     return np.asarray(
@@ -99,7 +101,8 @@ def test_lengths_and_intensities_are_those_published(
 def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
     """F and G of the docstring's z_dot = F z + G n."""
     a = V0 / model.length
-    F, G = np.zeros((5, 5)), np.zeros((5, 3))
+    F = np.zeros((5, 5))
+    G = np.zeros((5, 3))
     for axis, first in enumerate((0, 1, 3)):
         F[first, first], G[first, axis] = -a[axis], math.sqrt(2.0 * a[axis])
     for first, rate in ((1, a[1]), (3, a[2])):
@@ -125,7 +128,8 @@ def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
     # at h = 5 the covariance has lost four digits of sixteen, so the comparison ends there.
     model = dryden(altitude, 7.7, 1.5)
     params = filters(model, V0, dt, ALL, 1)
-    transition, added = params.transition, params.spread @ params.spread.T
+    transition = params.transition
+    added = params.spread @ params.spread.T
     stationary = params.stationary @ params.stationary.T
     assert transition @ stationary @ transition.T + added == approx(stationary, abs=1e-14)
     if dt * V0 / model.length.min() < 5.0:
@@ -192,7 +196,8 @@ def test_rotary_gusts_have_the_published_intensities(dt: float) -> None:
     found = [float(np.sqrt(row @ spread @ spread.T @ row)) for row in (p, q, r)]
 
     def phi_p(omega: float) -> float:
-        L, sigma = SMALL.length[2], SMALL.sigma[2]
+        L = SMALL.length[2]
+        sigma = SMALL.sigma[2]
         share = 0.8 * (np.pi * L / (4.0 * SPAN)) ** (1.0 / 3.0)
         lag = 4.0 * SPAN / np.pi * omega / V0
         return float(sigma**2 / L / V0 * share / (1.0 + lag**2))
@@ -260,7 +265,8 @@ def test_rotary_gusts_need_a_span_and_matrices() -> None:
 
 
 def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
-    params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.array([0.01, 0.1, 0.0, 0.0])
+    params = aircraft_parameters(turbulence=TURBULENCE).plant()
+    u = np.array([0.01, 0.1, 0.0, 0.0])
     whole = plant.advance(0, plant.initial_state(params), u, 400 * MS, params)
     cut = plant.initial_state(params)
     for k in range(40):
@@ -279,7 +285,8 @@ def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
 def test_truth_holds_wind_that_acts_from_now_on_and_f_includes_it() -> None:
     gusts = {"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}}
     parameters = aircraft_parameters(turbulence=TURBULENCE, gusts=gusts)
-    simulator, params = Simulator(parameters), parameters.plant()
+    simulator = Simulator(parameters)
+    params = parameters.plant()
     air = params.turbulence
     assert air is not None
     z = turbulence.initial_state(air)

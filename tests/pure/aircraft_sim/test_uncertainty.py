@@ -59,7 +59,8 @@ def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
 
 def test_sampled_airframe_keeps_zeros_angles_and_everything_but_and_b() -> None:
     sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
-    A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
+    A = OSPREY.matrix_a()
+    B = OSPREY.matrix_b()
     for angle in ("theta", "phi"):
         assert sampled.A[sampled.index(angle)] == OSPREY.A[sampled.index(angle)]
     assert ((sampled.matrix_a() == 0.0) == (A == 0.0)).all()
@@ -77,16 +78,15 @@ def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
     # of that wind: A x and the effect of the wind cancel. The airframe file rounds its effect of
     # wind to two or three digits: 3e-3 at most.
     sampled = sample_airframe(OSPREY, 0.5, 0.0, seed=7)
-    A, effect = sampled.matrix_a(), sampled.matrix_gusts()
+    A = sampled.matrix_a()
+    effect = sampled.matrix_gusts()
     for axis, state, drift in (
         ("vertical", "alpha", 1.0 / 25.0),
         ("lateral", "beta", 1.0 / 25.0),
         ("longitudinal", "V", 1.0),
     ):
-        by_state, by_wind = (
-            A[:, OSPREY.index(state)] * drift,
-            effect[:, list(OSPREY.gusts).index(axis)],
-        )
+        by_state = A[:, OSPREY.index(state)] * drift
+        by_wind = effect[:, list(OSPREY.gusts).index(axis)]
         assert by_wind == approx(-by_state, rel=5e-3, abs=0.0), axis
         published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
         # what it would feel otherwise

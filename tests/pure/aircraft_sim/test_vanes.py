@@ -105,7 +105,8 @@ def test_vane_of_jsbsim_reads_its_air_angles() -> None:
 
 def test_frozen_vane_keeps_its_angle_and_lost_reading_repeats_one_before() -> None:
     params = vanes.Vanes([0, 1], np.array([0.5, np.inf]), 0.3, 1)
-    state, readings = vanes.initial_state(params), []
+    state = vanes.initial_state(params)
+    readings = []
     for number in range(1000):
         state = vanes.turned(0.001 * number, np.array([1.0, 2.0]) * number, state, params)
         state = vanes.read(number, state.angle, state, params)
@@ -135,7 +136,8 @@ def test_a_vane_freezes_in_flight() -> None:
 
 
 def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
-    controller, airframe = SHIPPED.rise_di(), load_airframe("osprey")
+    controller = SHIPPED.rise_di()
+    airframe = load_airframe("osprey")
     model = model_for(airframe, controller, np.array([0.0017, 0.0017, 0.0017, 0.03]))
     names = Names(
         tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts)
@@ -149,7 +151,8 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
     found = vane_correction(sampled, model, (weights, weights), row, 0.0035)
     L = np.column_stack([aircraft_correction(sampled, model, weights), np.zeros(len(row))]) + found
     # the same filter by scipy
-    H, noise = np.vstack([sampled.H, row]), np.diag(np.append(model.noise, 0.0035) ** 2)
+    H = np.vstack([sampled.H, row])
+    noise = np.diag(np.append(model.noise, 0.0035) ** 2)
     size = [
         weights.loose * model.size,
         np.full(4, 1e-6),
@@ -165,12 +168,11 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
 def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
     params = SHIPPED.controller.tuned_law().params
     assert params.vanes is not None
-    s, generator = len(params.Phi), np.random.default_rng(1)
-    z, e, reading = (
-        generator.standard_normal(s),
-        generator.standard_normal(4),
-        np.array([0.1, -0.2]),
-    )
+    s = len(params.Phi)
+    generator = np.random.default_rng(1)
+    z = generator.standard_normal(s)
+    e = generator.standard_normal(4)
+    reading = np.array([0.1, -0.2])
     zero = np.zeros(4)
     measured = Measurements(e, zero, zero, zero, zero, vane=reading, vane_m=np.zeros(2))
     none = np.zeros(2)
@@ -209,7 +211,8 @@ def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
 
 def test_frozen_vane_is_left_out_and_told() -> None:
     _, tape = frozen()
-    measures, t = tape["internals"].group("vane_measures"), tape.time("internals")
+    measures = tape["internals"].group("vane_measures")
+    t = tape.time("internals")
     assert measures["alpha"][t > 9.0].max() == 0.0  # five time constants later
     assert measures["beta"][t > 3.0].min() == 1.0
     (event,) = (event for event in events(tape, {}) if event.name.startswith("vane"))

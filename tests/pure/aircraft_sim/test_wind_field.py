@@ -68,7 +68,8 @@ def test_largest_outflow_of_a_microburst_is_at_its_height() -> None:
 
 def flown(aircraft: AircraftConfig, samples: int, u: FloatArray) -> FloatArray:
     """Rows of y, pose and truth.gust."""
-    simulator, rows = Simulator(aircraft), []
+    simulator = Simulator(aircraft)
+    rows = []
     for number in range(samples):
         simulator.sample(number, u)
         truth = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
@@ -105,7 +106,8 @@ def test_aircraft_that_climbs_into_a_head_wind_gains_airspeed_and_keeps_its_grou
     altitude = 4 + POSE.index("altitude")
     assert calm[:, altitude].max() > 0.5
     inside = np.flatnonzero(into[:, altitude] > 0.21)
-    first, last = inside[0], inside[0] + 80  # ms
+    first = inside[0]
+    last = inside[0] + 80  # ms
     gained = (into[last, 1] - into[first, 1]) - (calm[last, 1] - calm[first, 1])
     head = 5.0 * (into[last, altitude] - into[first, altitude])
     assert head > 0.5

@@ -39,7 +39,8 @@ def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
     require_signs(autopilot.channel_map, scenario)
     require_limits(autopilot, scenario)
     tape = simulate(scenario)
-    y, y_m = tape["y"], tape["y_m"]
+    y = tape["y"]
+    y_m = tape["y_m"]
     for output in y.names:
         assert (
             abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max()

@@ -289,7 +289,8 @@ def test_stamps_of_autopilot_bounded_both_ways(name: str) -> None:
     channel_map = named_map(name)
     sources = {trim_key(name): row for name, row in channel_map.trims.items()}
     for key, row in (channel_map.outputs | channel_map.pose | sources).items():
-        bridge, limit = new_bridge(channel_map), row.max_age
+        bridge = new_bridge(channel_map)
+        limit = row.max_age
         for offset in (-10.0, -1.01 * limit, -0.99 * limit, 0.0, 0.99 * limit, 1.01 * limit, 10.0):
             side = "before" if offset < 0.0 else "after"
             expected = f"{key} is stamped {abs(offset):.3f} s {side} now"
@@ -1001,10 +1002,8 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
         "not engaged yet",
         "not engaged yet",
     ]
-    waiting, announced = (
-        [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")],
-        list[str](),
-    )
+    waiting = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")]
+    announced = list[str]()
     processes = SimpleNamespace(
         learner_ended=str,
         start_time=1000.0,
@@ -1058,7 +1057,8 @@ def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
     """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its
     nodes without end.
     """
-    before, clean = signal.getsignal(signal.SIGINT), False
+    before = signal.getsignal(signal.SIGINT)
+    clean = False
     with suppress(KeyboardInterrupt), handle_signals(interrupt):
         try:
             signal.raise_signal(signal.SIGINT)

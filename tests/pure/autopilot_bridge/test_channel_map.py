@@ -129,10 +129,8 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
             assert path in PUBLISHED[row.type]
         assert not row.stamped or "header" in PUBLISHED[row.type]
     for channel, input_row in channel_map.inputs.items():
-        message, kind_ = (
-            messages[f"messages.{input_row.message}"],
-            channel_map.messages[input_row.message].type,
-        )
+        message = messages[f"messages.{input_row.message}"]
+        kind_ = channel_map.messages[input_row.message].type
         ((field, place), *_) = STEP.findall(input_row.field)
         element, length, is_array, _ = kind(PUBLISHED[kind_][field])
         assert is_array, channel
@@ -323,7 +321,8 @@ def test_attitude_of_map_is_that_of_body_frd_in_ned(
     """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP
     103).
     """
-    frd_in_ned, channel_map = Rotation.from_euler("ZYX", [psi, theta, phi]), shipped(name)
+    frd_in_ned = Rotation.from_euler("ZYX", [psi, theta, phi])
+    channel_map = shipped(name)
     x, y, z, w = (
         (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD)
         .as_quat()

@@ -225,7 +225,8 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     this host.
     """
     made, port, queue = ends.started("ATTITUDE")
-    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot = ends.peer(port)
+    second = ends.peer(port)
     autopilot.attitude(0.1, since_boot=50.0)
     until(lambda: queue, autopilot.received)
     second.attitude(0.9, since_boot=50.0)  # also with the right time since boot
@@ -258,7 +259,8 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
 ) -> None:
     monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
     made, port = ends.started(HEARTBEAT=5.0)
-    first, second = ends.peer(port), ends.peer(port)
+    first = ends.peer(port)
+    second = ends.peer(port)
     until(first.received, first.beat)
     until(second.received, second.beat)
     first.received()
@@ -277,7 +279,8 @@ def test_conflict_of_second_sender_ends_after_its_last_message(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, port = ends.started()
-    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot = ends.peer(port)
+    second = ends.peer(port)
     autopilot.beat()
     until(lambda: made.conflict, second.beat)
     now = time.monotonic
@@ -386,7 +389,8 @@ def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) 
     of the map, has none.
     """
     made, port = ends.started(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
-    peer, messages = ends.peer(port), list[Any]()
+    peer = ends.peer(port)
+    messages = list[Any]()
 
     def take() -> None:
         peer.beat()

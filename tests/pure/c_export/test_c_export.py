@@ -138,7 +138,9 @@ def any_numbers(sets: list[RiseDiConfig]) -> Recording:
     """Ticks of the guard with y and y_m of any size, infinite and NaN too, at stamps up to both
     ends of int64.
     """
-    rng, recorder, m = np.random.default_rng(5), Recorder(sets), len(sets[0].outputs)
+    rng = np.random.default_rng(5)
+    recorder = Recorder(sets)
+    m = len(sets[0].outputs)
     special = np.array(
         [0.0, 1e-320, 1.0, -30.0, 1e6, 1e150, -1e200, 1e308, -1.7e308, np.inf, -np.inf, np.nan]
     )
@@ -472,7 +474,8 @@ def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPa
     """New gains in flight are an event of the recording, and every u is that of the log; without
     the changes it is refused.
     """
-    scenario, change = find_scenario("osprey_servo", 2.0), {"k_g": 2.0}
+    scenario = find_scenario("osprey_servo", 2.0)
+    change = {"k_g": 2.0}
     tuned = vary(scenario.controller, change)
 
     class Tuned(Controller):

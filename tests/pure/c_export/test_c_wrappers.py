@@ -78,7 +78,8 @@ def jittering_calls(count: int, seed: int) -> list[Call]:
     """Calls at 250 Hz, late by up to a quarter of a period; a fifth of y and a tenth of y_m lost; a
     second without y.
     """
-    rng, calls = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    calls = []
     for k in range(1, count):
         stamp_ns = k * NANOSECONDS // 250
         now_ns = stamp_ns + int(rng.integers(0, 1_000_000))
@@ -105,8 +106,10 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
             .vary(controller={"rate": 250.0}, aircraft={"rate": 250.0, "step": 0.004})
             .controller
         )
-    python, c = Controller(controller), c_controller(exportable(controller))
-    modes, moved = set(), np.zeros(4)
+    python = Controller(controller)
+    c = c_controller(exportable(controller))
+    modes = set()
+    moved = np.zeros(4)
     for call in jittering_calls(1500, 3):
         for stamp_ns, value in call.y_m:
             python.take_y_m(StampedVector(stamp_ns, value), call.now_ns)
@@ -363,8 +366,11 @@ def test_wrong_samples_are_lost_as_by_controller(
     """A spike, a jump that stays, noise that grows, y_m beyond its bound: the same samples are
     lost, u has the same bits.
     """
-    config, rng = exportable(find_scenario("osprey_observer").controller), np.random.default_rng(4)
-    python, c, lost = Controller(config), c_controller(config), 0
+    config = exportable(find_scenario("osprey_observer").controller)
+    rng = np.random.default_rng(4)
+    python = Controller(config)
+    c = c_controller(config)
+    lost = 0
     for k in range(700):
         now_ns = k * NANOSECONDS // 100
         y, y_m = (0.1 * np.sin(0.01 * k + np.arange(8.0)) + 0.002 * rng.normal(size=8)).reshape(

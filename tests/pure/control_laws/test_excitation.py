@@ -113,7 +113,8 @@ def test_multisine_has_band_alone_and_low_peak() -> None:
 
 def test_flight_commands_timetable_whatever_y_does() -> None:
     tape = simulate(flight())
-    u, params = tape["u"], controller().law_params()
+    u = tape["u"]
+    params = controller().law_params()
     t = (u.stamp_ns - u.stamp_ns[0]) * 1e-9
     order = [u.names.index(name) for name in controller().inputs]
     expected = np.array([params.amplitude * excitation.signal(instant, params) for instant in t])

@@ -70,7 +70,8 @@ def sections() -> dict[str, dict[str, Any]]:
     gains = gains_by_rule(model_for(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
     observed = with_aircraft_observer(rise, AIRFRAME, [gains], NOISE, 0.02).controller.model_dump()
     extended = {key: observed[key] for key in ("feedforward", "observer")}
-    pi, l1 = SECTIONS["pi"], SECTIONS["l1"]
+    pi = SECTIONS["pi"]
+    l1 = SECTIONS["l1"]
     return {
         "rise_di": rise.model_dump(),
         "rise_di, implicit": rise.model_dump() | {"sign": "implicit"},
@@ -157,10 +158,8 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
     scale = np.array(parameters.input_scale)
     # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
     if law == "l1":
-        passed, Omega = (
-            1.0 - np.exp(-np.array(parameters.bandwidth) * DT),
-            np.reshape(parameters.Omega, (4, 4)),
-        )
+        passed = 1.0 - np.exp(-np.array(parameters.bandwidth) * DT)
+        Omega = np.reshape(parameters.Omega, (4, 4))
         moved = np.array(parameters.K) * np.abs(e) + DT / 2.0 * (np.abs(Omega) @ np.abs(u))
         return np.asarray(np.abs(np.linalg.inv(Omega)) @ (passed * moved))
     K = (
@@ -175,7 +174,8 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
 @EVERY_LAW
 @pytest.mark.parametrize("size", [1e-6, 1e6])
 def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
-    parameters, u = controller(name, lower=None, upper=None), np.array([0.1, -0.2, 0.3, -0.4])
+    parameters = controller(name, lower=None, upper=None)
+    u = np.array([0.1, -0.2, 0.3, -0.4])
     e = size * np.array([1.0, -2.0, 3.0, -4.0])
     engaged = tick(parameters, guard.initial_state(4)._replace(u=u), 0, e)
     assert engaged.u.tolist() == engaged.u_trim.tolist() == u.tolist()
@@ -204,7 +204,9 @@ def test_limits_hold_for_any_error(name: str) -> None:
     """The limits of magnitude and rate hold for any error."""
     parameters = controller(name, lower=[-0.02] * 4, upper=[0.01] * 4, slew=[0.05] * 4)
     # u_o of lqg is 0.6 of the limits within 0.1 s: 0.09 /s
-    generator, state, us = np.random.default_rng(1), guard.initial_state(4), [np.zeros(4)]
+    generator = np.random.default_rng(1)
+    state = guard.initial_state(4)
+    us = [np.zeros(4)]
     for k in range(300):
         state = tick(
             parameters,
@@ -332,7 +334,8 @@ def test_another_law_or_observer_refused_in_flight() -> None:
 @EVERY_LAW
 def test_linear_model_predicts_step_of_law(name: str) -> None:
     law = controller(name).tuned_law()
-    linear, generator = linear_law(law, 4, DT), np.random.default_rng(1)
+    linear = linear_law(law, 4, DT)
+    generator = np.random.default_rng(1)
     state = law.control_law.engage(at(0.0), law.params)
     if isinstance(state, ObserverState):
         state = state._replace(sigma=np.ones(1))
@@ -340,25 +343,20 @@ def test_linear_model_predicts_step_of_law(name: str) -> None:
     for _ in range(50):
         y = 1e-9 * generator.standard_normal(4)  # inside every softened or implicit sign
         state, u = law.control_law.step(state, at(y), np.float64(DT), law.params)
-        predicted, z = linear.C @ z + linear.D @ y, linear.A @ z + linear.B @ y
+        predicted = linear.C @ z + linear.D @ y
+        z = linear.A @ z + linear.B @ y
         assert_allclose(u, predicted, rtol=1e-6, atol=1e-6 * np.abs(predicted).max())
 
 
 def responses(name: str, parameters: Any, z: complex) -> FloatArray:
     """The transfer matrix from y to u at z, worked out by hand."""
-    T, K = (
-        DT,
-        np.array(
-            parameters.K
-            if hasattr(parameters, "K")
-            else gain(np.array(1.0), np.array(parameters.k_d))
-        ),
+    T = DT
+    K = np.array(
+        parameters.K if hasattr(parameters, "K") else gain(np.array(1.0), np.array(parameters.k_d))
     )
     if name == "l1":
-        Omega, passed = (
-            np.reshape(parameters.Omega, (4, 4)),
-            1.0 - np.exp(-np.array(parameters.bandwidth) * T),
-        )
+        Omega = np.reshape(parameters.Omega, (4, 4))
+        passed = 1.0 - np.exp(-np.array(parameters.bandwidth) * T)
         # and a pole of 1 1/s in the adaptation
         low_pass = np.diag(passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0))
         # u = -Omega^-1 (K y + F ((1 - 1/z) y - T / z Omega u))
@@ -461,7 +459,9 @@ def matrices(parameters: ControllerConfig) -> Matrices:
 
 def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     generator = np.random.default_rng(1)
-    s, m, wide = 6, 2, np.full(2, np.inf)
+    s = 6
+    m = 2
+    wide = np.full(2, np.inf)
     Phi, Gamma, L, F = (
         0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s))
     )
@@ -488,10 +488,12 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
 
 @pytest.mark.parametrize("name", OBSERVED)
 def test_a_re_engagement_restarts_the_observer(name: str) -> None:
-    parameters, state = controller(name), guard.initial_state(4)
+    parameters = controller(name)
+    state = guard.initial_state(4)
     for k in range(100):
         state = tick(parameters, state, 10 * k, 1e-3 * np.sin(k / 5.0))
-    law, old = parameters.tuned_law(), sample(990, 0.0)
+    law = parameters.tuned_law()
+    old = sample(990, 0.0)
     held, _ = guard.tick(state, 1300 * MS, old, [old], parameters.guard(), law)
     assert held.mode is Mode.HOLD
     assert bits(held.law) == bits(state.law)  # nothing is estimated from what is not measured
@@ -505,7 +507,8 @@ def test_a_re_engagement_restarts_the_observer(name: str) -> None:
 
 @pytest.mark.parametrize("name", OBSERVED)
 def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
-    parameters, state = controller(name), guard.initial_state(4)
+    parameters = controller(name)
+    state = guard.initial_state(4)
     e = 1e-3 * np.array([1.0, -1.0, 2.0, -2.0])
     for k in range(50):
         state = tick(parameters, state, 10 * k, e)
@@ -633,7 +636,8 @@ def test_invalid_parameter_of_law_refused(
 def test_an_invalid_observer_is_refused() -> None:
     values = sections()["pi, observer"]
     observer = values["observer"]
-    states, s = list(observer["states"]), len(observer["states"])
+    states = list(observer["states"])
+    s = len(observer["states"])
 
     def observed(**changes: Any) -> dict[str, Any]:
         return values | {"observer": observer | changes}

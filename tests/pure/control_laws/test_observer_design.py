@@ -77,10 +77,12 @@ def uncertain(count: int) -> NominalModel:
 
 
 def test_step_of_aircraft_model_is_motion_of_equations() -> None:
-    model, wind_time = osprey(), np.array([4.7, 0.6, 1.9])
+    model = osprey()
+    wind_time = np.array([4.7, 0.6, 1.9])
     sampled = observer_design.aircraft_model(model, NAMES, wind_time)
     generator = np.random.default_rng(2)
-    z, u = 0.1 * generator.standard_normal(19), 0.1 * generator.standard_normal(4)
+    z = 0.1 * generator.standard_normal(19)
+    u = 0.1 * generator.standard_normal(4)
 
     def motion(_: float, z: FloatArray) -> FloatArray:
         x, position, wind, d = np.split(z, [8, 12, 15])
@@ -97,10 +99,12 @@ def test_step_of_aircraft_model_is_motion_of_equations() -> None:
 
 
 def test_extended_state_step_solves_equations() -> None:
-    model, decay = osprey(), np.array([7.3, 5.8, 2.8, 4.6])
+    model = osprey()
+    decay = np.array([7.3, 5.8, 2.8, 4.6])
     sampled = observer_design.extended_state_model(model, NAMES, decay)
     generator = np.random.default_rng(3)
-    z, u = 0.1 * generator.standard_normal(16), 0.1 * generator.standard_normal(4)
+    z = 0.1 * generator.standard_normal(16)
+    u = 0.1 * generator.standard_normal(4)
 
     def motion(_: float, z: FloatArray) -> FloatArray:
         _y, position, d, rate = np.split(z, 4)
@@ -116,7 +120,8 @@ def test_extended_state_step_solves_equations() -> None:
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])
 def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
-    model, size = osprey(), np.array([0.1, 1.0, 0.1, 0.1])
+    model = osprey()
+    size = np.array([0.1, 1.0, 0.1, 0.1])
     chosen: Weights | ExtendedStateWeights
     if kind == "aircraft":
         chosen = weights()
@@ -126,17 +131,18 @@ def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
         chosen = extended_weights()
         design = observer_design.extended_state_observer(model, NAMES, chosen)
         noise = [np.zeros(M), np.full(M, 1e-6), chosen.drift * size, chosen.rate_drift * size]
-    Phi, Gamma, H = design.Phi, design.Gamma, design.H
-    Q, R = (
-        H.T @ np.diag(1.0 / size**2) @ H,
-        np.diag((chosen.effort / model.input_scale / size) ** 2),
-    )
+    Phi = design.Phi
+    Gamma = design.Gamma
+    H = design.H
+    Q = H.T @ np.diag(1.0 / size**2) @ H
+    R = np.diag((chosen.effort / model.input_scale / size) ** 2)
     P = solve_discrete_are(Phi, Gamma, Q, R)
     expected = np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)
     # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit
     # circle
     assert_allclose(design.F, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-    process, measured = np.diag(np.concatenate(noise) ** 2 * model.period), np.diag(model.noise**2)
+    process = np.diag(np.concatenate(noise) ** 2 * model.period)
+    measured = np.diag(model.noise**2)
     S = solve_discrete_are(Phi.T, H.T, process, measured)
     expected = S @ H.T @ np.linalg.inv(H @ S @ H.T + measured)
     assert_allclose(design.L, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
@@ -148,14 +154,17 @@ def test_extended_state_observer_holds_aircraft_with_unknown_dynamics() -> None:
     model = osprey()
     design = observer_design.extended_state_observer(model, NAMES, extended_weights())
     plant = observer_design.aircraft_model(model, NAMES, np.ones(3))
-    x, z, u = np.zeros(19), np.zeros(16), np.zeros(4)
+    x = np.zeros(19)
+    z = np.zeros(16)
+    u = np.zeros(4)
     x[15:] = [0.5, 0.5, 0.5, 0.5]  # rad/s^2 and m/s^2
     largest = []
     for _ in range(3000):
         y = plant.H @ x
         z = z + design.L @ (y - design.H @ z)
         u = -design.F @ z
-        z, x = design.Phi @ z + design.Gamma @ u, plant.Phi @ x + plant.Gamma @ u
+        z = design.Phi @ z + design.Gamma @ u
+        x = plant.Phi @ x + plant.Gamma @ u
         largest.append(np.abs(y).max())
     # alone, the moment would turn the aircraft at 0.05 rad/s in 0.1 s and the force accelerate it
     # to 15 m/s in 30 s

@@ -32,7 +32,8 @@ COLUMN = (1, 1)
 
 def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) -> NominalModel:
     """One output that integrates its input: y_dot = Omega u."""
-    one, wide = np.ones(1), np.full(1, limit)
+    one = np.ones(1)
+    wide = np.full(1, limit)
     return NominalModel(
         A=np.zeros(COLUMN),
         B=np.full(COLUMN, Omega),
@@ -87,7 +88,9 @@ def fly(
     = 0, actuators ideal.
     """
     response = model.Omega[0, 0] if Omega is None else Omega
-    measured, ys, us = at(y), [], []
+    measured = at(y)
+    ys = []
+    us = []
     state = law.engage(measured, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
@@ -118,11 +121,9 @@ def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, A
 def test_inversion_cancels_model_and_leaves_error_own_dynamics(
     osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
 ) -> None:
-    x, y_m_dot, K = (
-        np.array(x_of)[:, None],
-        np.array(y_m_dot_of)[:, None],
-        np.array([[9.0], [8.0], [4.0], [2.0]]),
-    )
+    x = np.array(x_of)[:, None]
+    y_m_dot = np.array(y_m_dot_of)[:, None]
+    K = np.array([[9.0], [8.0], [4.0], [2.0]])
     control_law, params = law_of("di", osprey, K=K)
     y = osprey.C @ x
     measured = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
@@ -133,7 +134,8 @@ def test_inversion_cancels_model_and_leaves_error_own_dynamics(
 
 
 def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -> None:
-    x, air = np.zeros((8, 1)), np.zeros((8, 1))
+    x = np.zeros((8, 1))
+    air = np.zeros((8, 1))
     air[1] = 0.05
     y = osprey.C @ x
     measured = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
@@ -182,10 +184,8 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
 
 
 def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
-    size, weights = (
-        osprey.C @ osprey.size,
-        gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0),
-    )
+    size = osprey.C @ osprey.size
+    weights = gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
     found = lqi.lqi_params(weights, osprey).gain[..., 0]
     Q = E.T @ np.diag(np.concatenate([1.0 / size**2, (2.0 / size) ** 2])) @ E
@@ -255,7 +255,9 @@ def test_l1_rejects_constant_disturbance_with_wrong_input_gain() -> None:
 def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
     model = integrator()
     control_law, params = law_of("l1_ff", model, K=3.0, bandwidth=20.0)
-    y, state, u = 0.0, None, np.zeros(COLUMN)
+    y = 0.0
+    state = None
+    u = np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model with d
     for k in range(500):
@@ -282,7 +284,11 @@ def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     model = integrator(period=1e-4)
     K, gamma, d = 2.0, 20.0, 0.7
     control_law, params = law_of("mrac", model, K=K, adaptation=gamma, bias=gamma, leak=0.0)
-    W, y, u, values, decay = control_law.engage(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
+    W = control_law.engage(at(0.3), params)
+    y = 0.3
+    u = np.zeros(COLUMN)
+    values = []
+    decay = 0.0
     for _ in range(10_000):
         # the weights to be learned: 0 of x, d of the constant
         values.append(
@@ -309,9 +315,13 @@ def self_tuner_gains(**changes: float) -> dict[str, float]:
 
 
 def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
-    model, A, Omega, y = integrator(Omega=2.0), -1.5, 3.0, 0.0  # the nominal model has an A of 0
+    model = integrator(Omega=2.0)
+    A = -1.5
+    Omega = 3.0
+    y = 0.0  # the nominal model has an A of 0
     control_law, params = law_of("self_tuner", model, **self_tuner_gains())
-    state, u = control_law.engage(at(y), params), np.zeros(COLUMN)
+    state = control_law.engage(at(y), params)
+    u = np.zeros(COLUMN)
     for k in range(600):
         state, u = control_law.step(
             state, at(y, 0.1 * (-1.0) ** (k // 100), u_before=u), np.array(DT), params
@@ -322,13 +332,11 @@ def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
 
 
 def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
-    model, a, ticks, memory, deviation = (
-        integrator(),
-        1.0 - np.exp(-10.0 * DT),
-        40,
-        0.5,
-        np.array([2.0, 3.0, 5.0]),
-    )
+    model = integrator()
+    a = 1.0 - np.exp(-10.0 * DT)
+    ticks = 40
+    memory = 0.5
+    deviation = np.array([2.0, 3.0, 5.0])
     own = self_tuner_gains(memory=memory, prior_A=2.0, prior_Omega=3.0, prior_bias=5.0)
     control_law, params = law_of("self_tuner", model, **own)
     y, u = np.random.default_rng(1).normal(0.0, [[1.0], [3.0]], (2, ticks))
@@ -358,7 +366,8 @@ def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
 
 def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalModel) -> None:
     control_law, params = law_of("self_tuner", osprey)
-    state, calm = control_law.engage(at(np.zeros(4)), params), at(np.zeros(4))
+    state = control_law.engage(at(np.zeros(4)), params)
+    calm = at(np.zeros(4))
     before = state._replace(theta=state.theta + 1.0, P=0.5 * state.P)
     for _ in range(5):
         before, _ = control_law.step(before, calm, 5.0 * params.memory[0, 0], params)
@@ -425,9 +434,11 @@ def test_super_twisting_rejects_a_ramp_disturbance() -> None:
 
 
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
-    K, Lambda = np.array([[9.0], [8.0], [4.0], [2.0]]), np.array([[3.0], [2.0], [1.0], [0.5]])
+    K = np.array([[9.0], [8.0], [4.0], [2.0]])
+    Lambda = np.array([[3.0], [2.0], [1.0], [0.5]])
     control_law, params = law_of("pi", osprey, K=K, Lambda=Lambda)
-    e, measured = np.array([[0.1], [0.2], [0.0], [-0.3]]), at(np.zeros(4))
+    e = np.array([[0.1], [0.2], [0.0], [-0.3]])
+    measured = at(np.zeros(4))
     state = control_law.engage(measured, params)
     for k in range(1, 6):
         state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
@@ -442,14 +453,19 @@ def test_observer_converges(osprey: NominalModel) -> None:
     # s: faster than the 30 s below
     values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}
     _, params = law_of("lqg", osprey, **values)
-    Phi, Gamma, H, correction = params.Phi[..., 0], params.Gamma, params.H, params.L[..., 0]
+    Phi = params.Phi[..., 0]
+    Gamma = params.Gamma
+    H = params.H
+    correction = params.L[..., 0]
     Gamma = Gamma[..., 0] if Gamma.ndim > 2 else Gamma
     generator = np.random.default_rng(1)
-    z, z_hat = 0.01 * generator.standard_normal(len(Phi)), np.zeros(len(Phi))
+    z = 0.01 * generator.standard_normal(len(Phi))
+    z_hat = np.zeros(len(Phi))
     for _ in range(3000):
         u = 0.01 * generator.standard_normal(4)
         z_hat = z_hat + correction @ (H @ (z - z_hat))
-        z, z_hat = Phi @ z + Gamma @ u, Phi @ z_hat + Gamma @ u
+        z = Phi @ z + Gamma @ u
+        z_hat = Phi @ z_hat + Gamma @ u
     # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of
     # them is left after 30 s; the combination that acts on the outputs is observable: compare the
     # prediction of e one second ahead
@@ -475,14 +491,10 @@ def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
         Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes))
         for _ in range(4)
     ]
-    state, single = (
-        control_law.engage(looks[0], params),
-        [np.asarray(signal)[..., :1] for signal in looks[0][:9]],
-    )
-    compiled, alone = (
-        jax.tree.map(jax.numpy.asarray, state),
-        control_law.engage(Measurements(*single), params),
-    )
+    state = control_law.engage(looks[0], params)
+    single = [np.asarray(signal)[..., :1] for signal in looks[0][:9]]
+    compiled = jax.tree.map(jax.numpy.asarray, state)
+    alone = control_law.engage(Measurements(*single), params)
     step = jax.jit(control_law.step)
     for measured in looks:
         state, u = control_law.step(state, measured, np.array(DT), params)

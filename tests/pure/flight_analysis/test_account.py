@@ -209,7 +209,8 @@ def test_samples_that_busy_host_withheld_are_no_lack_of_log(
     """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the
     pose was sent.
     """
-    begin_ns, until = NANOSECONDS * 1_795_000_000, 1.8 if of_y == "after" else 2.0
+    begin_ns = NANOSECONDS * 1_795_000_000
+    until = 1.8 if of_y == "after" else 2.0
     withheld = ("y", "truth", "pose") if of_y == "without" else ("pose",)
     signals = {}
     for name in ("y", "y_m", "u", "truth", "pose"):
@@ -336,12 +337,15 @@ def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays(late
 def test_clock_step_is_found_across_batches() -> None:
     stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
     log_ns = np.concatenate([*stamps(range(1000, 1200))])
-    clock, taken, usable = StampClock(), 0, 0
+    clock = StampClock()
+    taken = 0
+    usable = 0
     while taken < len(stamp_ns):
         end = min(taken + 15, len(stamp_ns))
         more = end < len(stamp_ns)
         keep, count = clock.usable(stamp_ns[taken:end], log_ns[taken:end], more=more, end=not more)
-        taken, usable = taken + count, usable + int(keep.sum())
+        taken = taken + count
+        usable = usable + int(keep.sum())
     of = clock.recording()
     assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
 

@@ -44,7 +44,8 @@ def test_csv_and_parquet_hold_every_sample_to_last_bit(
     read = pl.read_parquet(tmp_path / "run.parquet")
     assert len(rows) == len(read) == 1501
     for topic, name in (("y", "q"), ("u", "thrust"), ("internals", "Pi.r"), ("truth", "x.alpha")):
-        column, expected = f"{topic}.{name}", flight.tape[topic][name].tolist()
+        column = f"{topic}.{name}"
+        expected = flight.tape[topic][name].tolist()
         assert [float(row[column]) for row in rows if row[column]] == expected
         assert read[column].drop_nulls().to_list() == expected
     # 100 Hz of 500

@@ -97,7 +97,8 @@ def test_account_of_summary_has_time_outside() -> None:
 
 def test_notices_say_when_an_aircraft_is_outside() -> None:
     """While the pose is lost, `fence.clearance` is LARGEST: unknown."""
-    notices, log = Notices(0.0, 0.2, lambda speed: 100.0), dict.fromkeys(Notices.CHANNELS, 0.0)
+    notices = Notices(0.0, 0.2, lambda speed: 100.0)
+    log = dict.fromkeys(Notices.CHANNELS, 0.0)
     texts = [
         notice.text
         for t, clearance in enumerate((5.0, -5.0, LARGEST, -300.0, -20.0, 3.0, 50.0))

@@ -24,8 +24,10 @@ from flight_analysis.report.layouts import MAP_TOPICS, channels_of, foxglove, pl
 from flight_core.tape import Tape
 
 CHANNELS = channels_of(find_scenario("osprey_gust"))
-JSON, XML = foxglove({"": CHANNELS}), plotjuggler({"": CHANNELS})
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
+JSON = foxglove({"": CHANNELS})
+XML = plotjuggler({"": CHANNELS})
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "aileron", "rudder", "thrust")
 CURVES = {
     *(f"{topic} {name}" for topic in ("y", "y_m") for name in OUTPUTS),
     *(f"internals {group}.{name}" for group in ("e", "integral_e", "Pi") for name in OUTPUTS),

@@ -43,7 +43,8 @@ def proportional(k: FloatArray) -> LinearLaw:
 
 
 def plant_of(scenario: Scenario) -> LinearPlant:
-    airframe, controller = load_airframe(scenario.aircraft.airframe), scenario.controller
+    airframe = load_airframe(scenario.aircraft.airframe)
+    controller = scenario.controller
     rows, columns = law_order(airframe, controller)
     A = airframe.matrix_a() + airframe.matrix_gravity()
     return LinearPlant(A, airframe.matrix_b()[:, columns], airframe.matrix_c()[rows])
@@ -95,7 +96,8 @@ def test_law_is_linearised_at_all_values_at_once(monkeypatch: pytest.MonkeyPatch
 
 def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
-    plant, k = LinearPlant(np.eye(1), np.eye(1), np.eye(1)), 4.0
+    plant = LinearPlant(np.eye(1), np.eye(1), np.eye(1))
+    k = 4.0
     found = loop_margins(plant, proportional(np.array([[k]])), NO_LAG)
     # at w = 0, seen at the lowest frequency
     assert found.gain_decrease[0] == approx(1.0 / k, rel=1e-3)
@@ -136,7 +138,8 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     # [a, s]] / (s + 1). Seiler, Packard, Gahinet (2020): one loop at a time 2, both 0.0997, since
     # max norm(S - I/2)^2 is the eigenvalue below.
     a = 10.0
-    A, C = np.array([[0.0, a], [-a, 0.0]]), np.array([[1.0, a], [-a, 1.0]])
+    A = np.array([[0.0, a], [-a, 0.0]])
+    C = np.array([[1.0, a], [-a, 1.0]])
     found = loop_margins(
         LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3)
     )
@@ -169,7 +172,8 @@ def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
     """K(z) of RISE-DI inside its softened sign, from (20) to (22): a trapezoid and backward Euler;
     u = -K e.
     """
-    params, T = scenario.rise_di().law_params(), 1.0 / scenario.controller.rate
+    params = scenario.rise_di().law_params()
+    T = 1.0 / scenario.controller.rate
     z = control.tf([1.0, 0.0], [1.0], T)
     slope = params.beta / params.eps
     entries = [
@@ -193,8 +197,10 @@ def loops_of_python_control(
     """L_i with the other inputs closed, and the closed loop, in python-control; delay 0 or one
     period.
     """
-    plant, controller = plant_of(scenario), scenario.controller
-    T, m = 1.0 / controller.rate, len(controller.inputs)
+    plant = plant_of(scenario)
+    controller = scenario.controller
+    T = 1.0 / controller.rate
+    m = len(controller.inputs)
     lags = control.append(*(control.ss(control.tf([1.0], [lag, 1.0])) for lag in controller.lag))
     P = control.c2d(control.ss(plant.A, plant.B, plant.C, np.zeros((m, m))) * lags, T, "zoh")
     if controller.delay > 0.0:
@@ -261,14 +267,18 @@ def test_phase_margin_over_crossover_is_delay_margin(name: str) -> None:
     # crossover. The two differ by the sampled delay, 0.1 ms of bisection and a further crossover: 3
     # %
     scenario = find_scenario(name)
-    found, plant, loop = margins_of(scenario), plant_of(scenario), loop_of(scenario.controller)
+    found = margins_of(scenario)
+    plant = plant_of(scenario)
+    loop = loop_of(scenario.controller)
     for i, tolerated in enumerate(found.phase / found.crossover):
         assert delay_margin(plant, law_of(scenario), loop, i) == approx(tolerated, rel=0.03)
 
 
 def test_uncertain_aircraft_have_the_margins_of_each() -> None:
     scenario = find_scenario("osprey_servo")
-    nominal, law, loop = plant_of(scenario), law_of(scenario), loop_of(scenario.controller)
+    nominal = plant_of(scenario)
+    law = law_of(scenario)
+    loop = loop_of(scenario.controller)
     airframe = load_airframe("osprey")
     A, B = nominal_and_sampled(airframe, 0.3, 20, seed=3)
     _, columns = law_order(airframe, scenario.controller)

@@ -40,7 +40,8 @@ def test_error_formed_at_stamps_of_y_by_name() -> None:
 
 
 def test_y_outside_the_reference_is_left_out() -> None:
-    y, y_m = signal([0, 1, 2, 3], q=[9.0, 1.0, 1.0, 9.0]), signal([1, 2], q=[0.0, 0.0])
+    y = signal([0, 1, 2, 3], q=[9.0, 1.0, 1.0, 9.0])
+    y_m = signal([1, 2], q=[0.0, 0.0])
     assert metrics.tracking_error(tape(y=y, y_m=y_m))["q"].tolist() == [1.0, 1.0]
 
 
@@ -149,7 +150,8 @@ def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None
     # Second differences of +-1 are +-4: the floor is 4 / (0.6745 sqrt(6)). Four floors exceed 1 %
     # of a reference of 10.
     stamps = [10.0 * k for k in range(100)]
-    noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=10.0)
+    noisy = signal(stamps, q=[1.0, -1.0] * 50)
+    y_m = signal(stamps, q=10.0)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
     assert metrics.settling_bands(tape(y=noisy, y_m=y_m)) == {"q": approx(4.0 * floor)}
     truth = signal(stamps, **{"x.q": 10.0})

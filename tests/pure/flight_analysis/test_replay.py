@@ -104,7 +104,8 @@ class Tick(NamedTuple):
 
 def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
     """The tape of a controller that meets these events."""
-    outputs, controller = parameters.outputs, Controller(parameters)
+    outputs = parameters.outputs
+    controller = Controller(parameters)
     rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
     for k, tick in enumerate(ticks):
         now_ns = start_ns + k * controller.period_ns + tick.late * 1000
@@ -147,7 +148,10 @@ def signal(names: Sequence[str], samples: Sequence[tuple[int, FloatArray]]) -> S
     return Signal(stamps[order], tuple(names), np.array([value for _, value in samples])[order])
 
 
-FLY, LOST_Y, LOST_Y_M, OFF = Tick(), Tick(y_age=None), Tick(y_m_age=None), Tick(active=False)
+FLY = Tick()
+LOST_Y = Tick(y_age=None)
+LOST_Y_M = Tick(y_m_age=None)
+OFF = Tick(active=False)
 AGES = st.one_of(st.none(), st.integers(0, 30))
 EVENTS = st.sampled_from(["", "", "", "", "configured", "replaced"])
 ACTIVE = st.sampled_from([True, True, True, False])
@@ -369,7 +373,8 @@ def test_open_loop_equals_controller_on_recorded_inputs() -> None:
         {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4},
     )
     tape = simulate(GUST)
-    controller, us = Controller(others), []
+    controller = Controller(others)
+    us = []
     for number, (stamp_ns, y) in enumerate(
         zip(tape["y"].stamp_ns.tolist(), tape["y"].values, strict=True)
     ):
@@ -419,7 +424,8 @@ def test_change_to_same_value_changes_no_bit() -> None:
 
 def busy_scenario(folder: Path, **controller: object) -> Path:
     """The default scenario with changes to the controller and commands on all channels, 2 s."""
-    flight, reference_model = {"duration": 2.0}, {"pulses": BUSY}
+    flight = {"duration": 2.0}
+    reference_model = {"pulses": BUSY}
     path = folder / "busy.yaml"
     return scenario_file(
         path, GUST.path, flight=flight, reference_model=reference_model, controller=controller
@@ -482,10 +488,8 @@ def test_log_cut_short_checked_as_far_as_it_goes(run: Path) -> None:
 
 
 def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
-    csv_file, gains = (
-        tmp_path / "u.csv",
-        ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]"),
-    )
+    csv_file = tmp_path / "u.csv"
+    gains = ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]")
     result = command(str(run), *gains, "--csv", str(csv_file))
     assert result.exit_code == 1
     assert result.stdout.count(OPEN_LOOP) == 1  # in the notes
@@ -537,7 +541,8 @@ def test_changes_of_parameters_read_from_log(tmp_path: Path) -> None:
         channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
         for number, message in enumerate(events):
             bag.write(channel, number, number, number, message)
-    nodes, known = ("/controller", "/one/controller"), RiseDiConfig.model_fields
+    nodes = ("/controller", "/one/controller")
+    known = RiseDiConfig.model_fields
     assert {node: parameter_changes(tmp_path / "run", node, known) for node in nodes} == {
         "/controller": [{"upper": [1.0, 2.0]}, {"k_g": 2.5, "sign": "soft", "upper": None}],
         "/one/controller": [{"Lambda": [1.0, 2.0]}],

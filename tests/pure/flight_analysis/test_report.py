@@ -31,7 +31,8 @@ from rise_di_controller.internals import Saturation
 
 pytestmark = pytest.mark.slow
 
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "aileron", "rudder", "thrust")
 # headings on every page with a linear loop
 OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")
 DEG = np.pi / 180.0

@@ -69,7 +69,8 @@ def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> N
     # 677 % commanded, undershoot 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; with anti-windup
     # (conditional integration) 60 %, 0.00, 4.1, 0.44. Measured 681, 1.41, 12.5, 0.946 and 60.6,
     # 0.001, 4.08, 0.438.
-    back, metrics = 30.0, {}
+    back = 30.0
+    metrics = {}
     for guarded in (False, True):
         held = with_stops("thrust", 0.15, guarded=guarded)
         tape = simulate(
@@ -77,7 +78,8 @@ def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> N
                 flight={"duration": 60.0}, reference_model={"pulses": {"V": pulse(10.0, back, 4.0)}}
             )
         )
-        e, t = error(tape)["V"], tape.time("truth")
+        e = error(tape)["V"]
+        t = tape.time("truth")
         metrics[guarded] = [
             100.0 * np.abs(tape["internals"]["u_free.thrust"]).max(),
             -state(tape, "V")[t > back].min(),

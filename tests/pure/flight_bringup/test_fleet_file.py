@@ -59,7 +59,8 @@ def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
     def of(*nodes: str) -> dict[str, Any]:
         return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
 
-    own, blue = "/red/controller#1", of("/blue/controller#2")
+    own = "/red/controller#1"
+    blue = of("/blue/controller#2")
     assert fleet.foreign_samples({"red": of(own), "blue": blue}) == [
         "samples from outside of the aircraft: 0 of 6"
     ]

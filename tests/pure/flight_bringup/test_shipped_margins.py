@@ -59,7 +59,8 @@ def test_every_file_is_found() -> None:
 @pytest.mark.parametrize("path", FILES, ids=[f"{path.parent.name}_{path.stem}" for path in FILES])
 def test_margins_of_what_ships(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)  # the examples name their airframes from there
-    scenario, line = find_scenario(str(path)), first_line(path)
+    scenario = find_scenario(str(path))
+    line = first_line(path)
     if not has_softened_loop(scenario):
         assert line.startswith(STATED[0]), line
         return

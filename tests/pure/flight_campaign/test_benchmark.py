@@ -55,7 +55,9 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> Sets:
 def own_steps(task: Task) -> Callable[[float, FloatArray, FloatArray], FloatArray]:
     """PI of the stack as a function, with the equations that the fleet compiles."""
     law, params, limits = _law({**task.controller, **PI})
-    state, u, none = None, np.zeros(4), np.zeros(4)
+    state = None
+    u = np.zeros(4)
+    none = np.zeros(4)
 
     def step(t: float, y: FloatArray, y_m: FloatArray) -> FloatArray:
         nonlocal state, u
@@ -222,7 +224,8 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
     """
     scenario = sets.scenario(name)
     published: dict[str, Any] = yaml.safe_load(OSPREY.read_text())
-    states, V0 = list(published["states"]), published["speed"]
+    states = list(published["states"])
+    V0 = published["speed"]
     v, alpha, q, theta, beta, p, r, phi = range(8)
     A, B = (
         np.moveaxis(values, 0, -1)
@@ -240,7 +243,8 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
         wind[states.index(state)] = (
             effect / V0 * A[states.index(state), alpha] / published["A"][states.index(state)][alpha]
         )
-    actuators, rng = scenario.aircraft.actuators, np.random.default_rng(1)
+    actuators = scenario.aircraft.actuators
+    rng = np.random.default_rng(1)
     lag, stop, fastest = (
         np.array(values)[:, None] for values in (actuators.lag, actuators.upper, actuators.rate)
     )
@@ -250,7 +254,8 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
         return 5.06 * (1.0 - np.cos(np.pi * along)) if 0.0 < along < 2.0 else 0.0
 
     def x_dot(t: float, x: FloatArray, u: FloatArray) -> FloatArray:
-        aircraft, position = x[:8], x[8:]
+        aircraft = x[:8]
+        position = x[8:]
         change = (
             np.einsum("ijn,jn->in", A, aircraft)
             + np.einsum("ijn,jn->in", B, position)
@@ -265,8 +270,12 @@ def second_plant_scores(sets: Sets, name: str, count: int, late: int) -> FloatAr
         *(np.asarray(value)[:, None] if np.ndim(value) == 1 else value for value in params)
     )
     limits = Limits(*(values[:, None] for values in limits))
-    y_m, h = build_course(scenario).segments.y_m, 0.0025
-    x, u, state, squares = np.zeros((12, count)), np.zeros((4, count)), None, np.zeros((4, count))
+    y_m = build_course(scenario).segments.y_m
+    h = 0.0025
+    x = np.zeros((12, count))
+    u = np.zeros((4, count))
+    state = None
+    squares = np.zeros((4, count))
     sent = [u] * (late + 1)
     for k, wanted in enumerate(y_m):
         true = x[[q, p, r, v]]

@@ -84,10 +84,8 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
 @given(VALUES, st.data())
 def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
-    whole, parts = (
-        Figure.from_values(values),
-        Figure.from_values(values[:cut]) + Figure.from_values(values[cut:]),
-    )
+    whole = Figure.from_values(values)
+    parts = Figure.from_values(values[:cut]) + Figure.from_values(values[cut:])
     assert parts.count == len(values)
     assert parts.bins == whole.bins
     assert parts.largest == values.max()
@@ -143,7 +141,8 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(campaign.definition.aircraft_scenario(worst.number)))
     again = load_scenario(path)
-    true, outputs = error(simulate(again)), again.controller.outputs
+    true = error(simulate(again))
+    outputs = again.controller.outputs
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
@@ -155,10 +154,8 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score
     with a unit of its own.
     """
-    units, entries = (
-        {"V": 0.2},
-        {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035},
-    )
+    units = {"V": 0.2}
+    entries = {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
     of = define(SHORT, 4, 0.2, 7, 4, spread=Spread(entries, "corners"), units=units)
     campaign = fly_campaign(tmp_path / "own", of)
     rows = campaign.rows().collect()
@@ -186,7 +183,8 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     assert 2.0 * equipment.references(SHORT, of.entries)["delay"] == 0.03
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
     assert again.aircraft.actuators.delay == rows["delay"][worst.number] == 0.03
-    true, outputs = error(simulate(again)), again.controller.outputs
+    true = error(simulate(again))
+    outputs = again.controller.outputs
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs, units)
@@ -238,12 +236,15 @@ MISSIONS = {
 def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: str) -> None:
     # As of fleets without guidance: the nonlinear remainder is held over a tick (10 ms). Where u
     # holds a lost y, the node's extrapolation of y_m differs: 1e-2 there.
-    definition, within = define(MISSIONS[name], 2, 0.3, 7, 2), 1e-2 if "lost" in name else 1e-3
+    definition = define(MISSIONS[name], 2, 0.3, 7, 2)
+    within = 1e-2 if "lost" in name else 1e-3
     chunk = fly_chunk_figures(definition.model_dump_json(), (0, 0))
     assert not chunk.diverged.any()
     figures = {key: values[1] for key, values in chunk.figures.items()}
     tape = simulate(definition.aircraft_scenario(1))
-    log, errors, true = tape["guidance"], control_errors(tape), error(tape)
+    log = tape["guidance"]
+    errors = control_errors(tape)
+    true = error(tape)
     assert log["leg"].max() == 2  # the fillet has been reached, the orbit has not
     xtrack = errors["xtrack"]
     expected = {
@@ -339,7 +340,8 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
     model = find_scenario("osprey_observer").rise_di()
     bare = model.model_copy(update={"observer": None})
     campaign = flown_rows(tmp_path / "learn", learning(2.0), proposing(model, bare), 2)
-    rows, tally = campaign.rows().collect(), campaign.tally(0)
+    rows = campaign.rows().collect()
+    tally = campaign.tally(0)
     assert rows.select("first_model", "models", "refused", "fallbacks").rows() == [
         (1.5, 1, 0, 0),
         (None, 0, 1, 0),
@@ -463,7 +465,8 @@ def test_row_of_aircraft_has_its_figures_outcome_and_drawn_entries(tmp_path: Pat
     assert set(table["seed"]) == {7}
     assert table["score"].max() == campaign.tally(0).figures["score"].largest
     frame = campaign.definition.aircraft_scenario(20).aircraft.sampled_airframe()
-    A, B = frame.matrix_a(), frame.matrix_b()
+    A = frame.matrix_a()
+    B = frame.matrix_b()
     row = table.row(20, named=True)
     assert row["A[q,alpha]"] == A[frame.index("q"), frame.index("alpha")]
     assert row["B[V,thrust]"] == B[frame.index("V"), list(frame.inputs).index("thrust")]
@@ -553,7 +556,8 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
 @pytest.fixture
 def flown(tmp_path: Path) -> Campaign:
     """A campaign of one chunk, whose figures are made up."""
-    campaign, score = Campaign.begin(tmp_path, definition(20, 20)), np.linspace(1.0, 2.0, 20)
+    campaign = Campaign.begin(tmp_path, definition(20, 20))
+    score = np.linspace(1.0, 2.0, 20)
     (tmp_path / CHUNKS / "0-000000.parquet").write_bytes(made_up(score))
     return campaign
 

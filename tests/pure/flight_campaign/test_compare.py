@@ -67,11 +67,9 @@ def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
 
 
 def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark) -> None:
-    law, begin, objective = (
-        LAWS["pi"],
-        initial_gains(LAWS["pi"], short.model),
-        OBJECTIVES["gust_turbulence"],
-    )
+    law = LAWS["pi"]
+    begin = initial_gains(LAWS["pi"], short.model)
+    objective = OBJECTIVES["gust_turbulence"]
     found = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
     assert found[0] == found[1]
     assert found[0].cost == min(found[0].costs)
@@ -79,7 +77,8 @@ def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark)
     control_law = law.control_law(short.model)
 
     def cost(gains: Gains) -> float:
-        params, total = law.params(gains, short.model), 0.0
+        params = law.params(gains, short.model)
+        total = 0.0
         for part in tuning.evaluations(objective, short):
             course = short.courses[part.wind][law.feedforward]
             result = batch.fly(part.fleet, short.vehicle, course, control_law, params)
@@ -144,10 +143,8 @@ def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benc
 
 
 def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path) -> None:
-    path, found = (
-        tmp_path / "one" / "two" / "gains.yaml",
-        TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100),
-    )
+    path = tmp_path / "one" / "two" / "gains.yaml"
+    found = TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100)
     tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
     assert tuned_gains.load(path) == {"pi": {"gust": found}}
     with refusing(r"cannot be written \(.*\), expected a file of tuned gains that can$"):
@@ -262,7 +259,8 @@ def test_registered_law_flies_as_that_of_catalogue(short: Benchmark) -> None:
 def test_interrupted_tuning_resumes_with_missing_laws(
     short: Benchmark, brief_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, tuned = tmp_path / "gains.yaml", list[str]()
+    path = tmp_path / "gains.yaml"
+    tuned = list[str]()
     names = {law.title: name for name, law in LAWS.items()}
 
     def tune(law: Any, objective: Any, benchmark: Any, seeds: Any, progress: Any) -> TuningResult:
@@ -285,8 +283,10 @@ def test_interrupted_tuning_resumes_with_missing_laws(
 def test_margins_of_tuned_gains_are_those_of_the_registered_law(short: Benchmark) -> None:
     # The catalogue's laws for many sets of gains at once, the registered laws one controller at a
     # time
-    lag, D = short.model.lag.tolist(), [int(sign) for sign in short.model.D]
-    scale, Omega = short.model.input_scale.tolist(), short.model.Omega.ravel().tolist()
+    lag = short.model.lag.tolist()
+    D = [int(sign) for sign in short.model.D]
+    scale = short.model.input_scale.tolist()
+    Omega = short.model.Omega.ravel().tolist()
     for name, own in (("pi", {"input_scale": scale}), ("l1", {"Omega": Omega})):
         gains = initial_gains(LAWS[name], short.model)
         values = {key: gain[:, 0].tolist() for key, gain in gains.items()}
@@ -328,16 +328,17 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
     )
     assert (read.feedforward is None) == (LAWS[name].feedforward == "none")
     law, params = read.tuned_law()
-    of_catalogue, sets = (
-        LAWS[name].control_law(short.model),
-        LAWS[name].params(tuning.as_gains(result), short.model),
-    )
-    generator, dt = np.random.default_rng(1), np.float64(short.model.period)
+    of_catalogue = LAWS[name].control_law(short.model)
+    sets = LAWS[name].params(tuning.as_gains(result), short.model)
+    generator = np.random.default_rng(1)
+    dt = np.float64(short.model.period)
     y = np.cumsum(0.002 * generator.standard_normal((60, 4)), axis=0)
-    zero, none = np.zeros(4), np.zeros((4, 1))
+    zero = np.zeros(4)
+    none = np.zeros((4, 1))
     state = law.engage(Measurements(y[0], zero, zero, zero, zero), params)
     wide = of_catalogue.engage(Measurements(y[0][:, None], none, none, none, none), sets)
-    u, found = zero, none
+    u = zero
+    found = none
     for sample in y[1:]:
         state, u = law.step(state, Measurements(sample, zero, zero, zero, u), dt, params)
         wide, found = of_catalogue.step(

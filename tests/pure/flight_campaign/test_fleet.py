@@ -77,7 +77,8 @@ def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     effect = scenario.aircraft.uncertainty.wind
     uncertainty = {"A": 0.3, "B": 0.3, "wind": effect, "seed": 5, "number": number}
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertainty}))
-    true, period = error(tape), round(1e9 / scenario.controller.rate)
+    true = error(tape)
+    period = round(1e9 / scenario.controller.rate)
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
     u = np.array([tape["u"][name] for name in scenario.controller.effectors])
     # a tick without a new y publishes no u
@@ -166,10 +167,8 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
     # (2 ms); the simulation does not. In the gust the difference is at most 1e-4 of the error; 1e-3
     # bounds it. A quantised y sometimes rounds to the next step, after which u differs: 2e-2.
     scenario = SERVO.vary(**VARIATIONS[name])
-    within, params = (
-        2e-2 if scenario.aircraft.sensors.quantisation else 1e-3,
-        batch.shared(scenario.controller.law_params()),
-    )
+    within = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3
+    params = batch.shared(scenario.controller.law_params())
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
     # the second one: what would fly as the first differs
     for number in range(2) if name == "turbulence" else (1,):
@@ -203,7 +202,8 @@ def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> N
 
 def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
     """A tick from drawn effectors, with demands inside the stops and up to 30 times beyond."""
-    generator, stops = np.random.default_rng(1), np.linspace(0.2, 1.0, 7)
+    generator = np.random.default_rng(1)
+    stops = np.linspace(0.2, 1.0, 7)
     effect = generator.normal(size=(4, 7))
     T = stops[:, None] * np.linalg.pinv(effect * stops)
     params = allocation(T, effect, (2, 0, 3, 1), Limits(-stops, stops, np.full(7, 20.0)))
@@ -222,7 +222,8 @@ def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
 
 def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
     A, B = sampled(0.3, 5, 1)
-    wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
+    wind = np.array([1.0, 0.0, 1.0, 1.0])
+    late = np.array([0, 0, 2, 0])
     beta = PARAMS.beta * np.array([1.0, 1.0, 1.0, 0.5])
     together = fly(
         SERVO, np.repeat(A, 4, 0), np.repeat(B, 4, 0), wind, late, params=PARAMS._replace(beta=beta)
@@ -311,7 +312,8 @@ class Ticks(NamedTuple):
 
 
 def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
-    course, plant = build_course(SERVO), SERVO.aircraft.plant()
+    course = build_course(SERVO)
+    plant = SERVO.aircraft.plant()
     A, B = sampled(0.3, 5, 2)
     directions = gust_directions(load_airframe("osprey"), A, "air_relative")
     assembled = batch_matrices.assemble(A, B, plant, course, gust_directions=directions)
@@ -357,7 +359,8 @@ def test_late_u_acts_that_many_ticks_later() -> None:
 
 
 def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
-    course, vehicle = build_course(SERVO), batch.vehicle(SERVO)
+    course = build_course(SERVO)
+    vehicle = batch.vehicle(SERVO)
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
     unlimited = vehicle.actuators._replace(lower=None, upper=None, rate=None)

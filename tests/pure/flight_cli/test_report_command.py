@@ -24,7 +24,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two flights of two seconds, of different scenarios."""
-    folder, runs = tmp_path_factory.mktemp("runs"), []
+    folder = tmp_path_factory.mktemp("runs")
+    runs = []
     for name in ("osprey_gust", "osprey_servo"):
         scenario = find_scenario(name, 2.0)
         run = new_run(scenario, folder)

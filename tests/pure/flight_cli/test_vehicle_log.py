@@ -36,7 +36,8 @@ from flight_view.flight import Flight as View
 
 pytestmark = pytest.mark.slow
 
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "thrust", "aileron", "rudder")
 OMEGA = np.array([40.0, 8.0, 80.0, 30.0])  # SI, by channel
 DAMPING = np.array([6.0, 0.3, 8.0, 3.0])  # 1/s
 # rad as in the maps ardupilot and px4; m/s; throttle in trim
@@ -65,10 +66,13 @@ def flight() -> Flight:
     """First-order channels y_dot = -damping y + Omega v, with servos v_dot = (u - v) / lag, behind
     held random inputs.
     """
-    random, steps, dt = np.random.default_rng(1), round(DURATION * RATE), 1.0 / RATE
+    random = np.random.default_rng(1)
+    steps = round(DURATION * RATE)
+    dt = 1.0 / RATE
     held = np.repeat(random.choice([-1.0, 0.0, 1.0], (steps // 15 + 1, 4)), 15, axis=0)[:steps]
     u = held * [0.04, 0.1, 0.04, 0.06]
-    y, v = np.zeros((steps, 4)), np.zeros(4)
+    y = np.zeros((steps, 4))
+    v = np.zeros(4)
     for k in range(1, steps):
         v += (u[k - 1] - v) * -np.expm1(-dt / LAG)
         y[k] = y[k - 1] + dt * (OMEGA * v - DAMPING * y[k - 1])
@@ -127,10 +131,8 @@ def dataflash(
     """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
-    y, pulses = (
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([sticks(part.u) for part in parts]),
-    )
+    y = np.concatenate([part.y for part in parts])
+    pulses = np.concatenate([sticks(part.u) for part in parts])
     servos = pulses.copy()
     for column, number in enumerate(range(1, 5)):
         if parameters.get(f"RC{number}_REVERSED", 0.0) != parameters.get(
@@ -161,7 +163,8 @@ def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (
     """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
-    y, u = np.concatenate([part.y for part in parts]), np.concatenate([part.u for part in parts])
+    y = np.concatenate([part.y for part in parts])
+    u = np.concatenate([part.u for part in parts])
     lift = u[:, 1] + THROTTLE * (np.array(stamps) >= flight.stamp_us[0])
     messages = {
         "MODE": (("Mode", "ModeNum"), [(1, (0, 0))]),
@@ -194,7 +197,8 @@ def tlog(
         for stamp, y, pulses in zip(
             part.stamp_us, part.y, np.rint(sticks(part.u)).astype(int).tolist(), strict=True
         ):
-            ms, at = stamp // 1000, EPOCH + stamp
+            ms = stamp // 1000
+            at = EPOCH + stamp
             messages.append(
                 (at, mavlink.MAVLink_attitude_message(ms, 0.1, -0.03, -0.2, y[2], y[0], y[3]))
             )
@@ -300,7 +304,8 @@ WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
 @pytest.mark.parametrize("name", WRITERS)
 def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path: Path) -> None:
     write, map_name = WRITERS[name]
-    path, bag = write(tmp_path / name, flight), tmp_path / "bag"
+    path = write(tmp_path / name, flight)
+    bag = tmp_path / "bag"
     result = imported(path, bag, map_name=map_name)
     assert result.exit_code == 0, result.output
     tape = read_run(bag).tape
@@ -325,7 +330,8 @@ def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path)
 
 
 def test_sticks_outside_of_manual_are_no_commands(flight: Flight, tmp_path: Path) -> None:
-    path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11), tmp_path / "bag"
+    path = dataflash(tmp_path / "flight.bin", flight, mode=11)
+    bag = tmp_path / "bag"
     refused = imported(path, bag)
     assert str(refused.exception) == (
         "the log: found no flight in MANUAL in the log, expected it, for only there the sticks "
@@ -346,10 +352,8 @@ def test_servos_give_u_of_the_stick_that_moved_them(
     content["inputs"]["elevator"]["positive"] = "nose down" if stick_reversed else "nose up"
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     parameters = {**PARAMETERS, "RC2_REVERSED": stick_reversed, "SERVO2_REVERSED": servo_reversed}
-    path, bag = (
-        dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters),
-        tmp_path / "bag",
-    )
+    path = dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters)
+    bag = tmp_path / "bag"
     assert imported(path, bag, "--servos", map_name=str(tmp_path / "map.yaml")).exit_code == 0
     tape = read_run(bag).tape
     assert tape["u"].names == INPUTS
@@ -408,7 +412,8 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
     """A servo that was reversed in flight and is not after it, as on an aircraft that is built
     otherwise on the ground.
     """
-    bag, end = tmp_path / "bag", flight.stamp_us[-1]
+    bag = tmp_path / "bag"
+    end = flight.stamp_us[-1]
     changes = [(end + 20_000_000, "SERVO2_REVERSED", 0.0), (end + 20_000_000, "RC2_MIN", 1100.0)]
     path = dataflash(tmp_path / "flight.bin", flight, mode=11, changes=changes)
     result = imported(path, bag, "--servos")
@@ -427,7 +432,8 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
 def test_change_between_the_samples_is_refused_and_left_out_by_the_window(
     flight: Flight, tmp_path: Path
 ) -> None:
-    bag, half = tmp_path / "bag", flight.stamp_us[len(flight.stamp_us) // 2]
+    bag = tmp_path / "bag"
+    half = flight.stamp_us[len(flight.stamp_us) // 2]
     path = dataflash(tmp_path / "flight.bin", flight, changes=[(half, "SERVO2_REVERSED", 0.0)])
     assert str(imported(path, bag).exception) == (
         "the log: found SERVO2_REVERSED changes from 1 to 0 at 30.0 s of the log, expected no "
@@ -461,7 +467,8 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
     require_map_of_import(ChannelMap.validate_mapping(content, "map"), read_run(bag))
     identify = [str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
     for key, value in (("sign", -1), ("scale", 0.4), ("positive", "nose down")):
-        path, inputs = tmp_path / f"{key}.yaml", content["inputs"]
+        path = tmp_path / f"{key}.yaml"
+        inputs = content["inputs"]
         inputs_by_another = inputs | {"elevator": inputs["elevator"] | {key: value}}
         path.write_text(
             yaml.safe_dump(content | {"inputs": inputs_by_another}, sort_keys=False),
@@ -493,7 +500,8 @@ def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
     """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half
     of the usual thrust.
     """
-    quadrotor, bag = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml"), tmp_path / "bag"
+    quadrotor = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml")
+    bag = tmp_path / "bag"
     log = multicopter(tmp_path / "flight.bin", flight)
     assert imported(log, bag, map_name=quadrotor).exit_code == 0
     tape = read_run(bag).tape
@@ -629,7 +637,8 @@ def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path:
     """The other one stands, half a sample later: its gyroscopes have noise alone."""
     still = Flight([stamp + 10_000 for stamp in flight.stamp_us], 0.01 * flight.y, flight.u)
     path, alone = two_systems(tmp_path, flight, still)
-    both, expected = read_vehicle_log(path), read_vehicle_log(alone)
+    both = read_vehicle_log(path)
+    expected = read_vehicle_log(alone)
     assert both.taken == (("system", "1 of 7 and 1: it alone moves"),)
     assert both.parameters == expected.parameters
     for name, table in expected.tables.items():
@@ -832,7 +841,8 @@ def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(
 
 
 def test_vtol_of_px4_is_flown_by_its_surfaces_as_a_plane(flight: Flight, tmp_path: Path) -> None:
-    path, bag = ulog(tmp_path / "vtol.ulg", flight, vtol=True), tmp_path / "bag"
+    path = ulog(tmp_path / "vtol.ulg", flight, vtol=True)
+    bag = tmp_path / "bag"
     result = imported(path, bag, map_name="px4")
     assert result.exit_code == 0, result.output
     assert "1 of 0 and 1: the surfaces of a VTOL" in " ".join(result.stdout.split())

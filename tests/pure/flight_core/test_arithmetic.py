@@ -95,7 +95,8 @@ def test_jax_is_near() -> None:
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
         for _ in range(20):
-            matrix, vector = rng.normal(size=(8, 8)), rng.normal(size=8)
+            matrix = rng.normal(size=(8, 8))
+            vector = rng.normal(size=8)
             scale = np.abs(matrix) @ np.abs(vector)
             assert (
                 np.abs(jax.jit(product)(matrix, vector) - product(matrix, vector))

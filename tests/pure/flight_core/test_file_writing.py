@@ -82,7 +82,8 @@ def test_failed_write_keeps_old_content(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", ["file", "nothing"])
 def test_link_is_replaced_not_followed(tmp_path: Path, target: str) -> None:
-    elsewhere, path = tmp_path / "elsewhere", tmp_path / "page"
+    elsewhere = tmp_path / "elsewhere"
+    path = tmp_path / "page"
     if target == "file":
         elsewhere.write_text("precious")
     path.symlink_to(elsewhere)

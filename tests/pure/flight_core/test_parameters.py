@@ -111,11 +111,9 @@ def test_a_bad_scenario_is_one_sentence(
 
 
 # Section of the aircraft -> its values and the sentence of the error, a pattern.
-GUST, STEP, SINE = (
-    {"start": 0.0, "speed": 1.0, "length": 9.0},
-    {"start": 0.0, "value": 1.0, "rise": 0.0},
-    {"amplitude": 1.0},
-)
+GUST = {"start": 0.0, "speed": 1.0, "length": 9.0}
+STEP = {"start": 0.0, "value": 1.0, "rise": 0.0}
+SINE = {"amplitude": 1.0}
 AIR = {"wind": 7.7, "sigma": 1.0}
 PRODUCT = {"into": "p", "product": ["q", "p"], "gain": 1.0}
 FOUR = "found 1 values, expected 4, one for each of"
@@ -415,7 +413,8 @@ def schemas(base: type[Config] = Config) -> Iterator[type[Config]]:
 
 def rules_of_numbers(annotation: Any, rules: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The rules of each number in a type, those in lists and tables included."""
-    origin, parts = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    parts = get_args(annotation)
     if origin is Annotated:
         own = {rule: limit for field in parts[1:] for rule, limit in field.rules.items()}
         yield from rules_of_numbers(parts[0], own | dict(rules))

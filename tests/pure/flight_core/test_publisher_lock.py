@@ -75,8 +75,10 @@ def test_delayed_reference_awaited_up_to_age_limit(
     """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once
     above it.
     """
-    controller, period_ns = Controller(osprey_gust.controller), 10_000_000
-    visited, stamps = set(), []
+    controller = Controller(osprey_gust.controller)
+    period_ns = 10_000_000
+    visited = set()
+    stamps = []
     for k in range(200):
         now_ns = k * period_ns
         controller.take_y(StampedVector(now_ns, np.zeros(4)), now_ns)

@@ -46,7 +46,9 @@ from flight_design.identification.response_identification import Response, ident
 
 pytestmark = pytest.mark.slow
 
-MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
+MAP = load_map("ardupilot")
+SPEED = 25.0
+DELAY = 0.05  # m/s; s, by which y is late
 OSPREY = load_airframe("osprey")
 
 
@@ -94,7 +96,8 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
 
 
 def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None:
-    response, channels = identified.response, identified.channels
+    response = identified.response
+    channels = identified.channels
     rows = [OSPREY.outputs.index(name) for name in response.outputs]
     columns = [list(OSPREY.inputs).index(name) for name in response.inputs]
     known = np.diag((OSPREY.matrix_c() @ OSPREY.matrix_b())[np.ix_(rows, columns)])
@@ -152,7 +155,8 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels,
             {"q": 25.0, "r": 2.0},
         )
     )
-    Omega, none = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs]), 0.0 * damping
+    Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
+    none = 0.0 * damping
     found = Channels(Omega, none, none + 0.02, none + 0.1, damping, stiffness, zero, none)
     return found, flying_scenario(
         MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml")
@@ -165,8 +169,10 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
     # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its
     # derivative
     found, flying = of_second_order
-    controller, k = flying.controller, list(MAP.outputs).index("q")
-    params, i = controller.law_params(), controller.outputs.index("q")
+    controller = flying.controller
+    k = list(MAP.outputs).index("q")
+    params = controller.law_params()
+    i = controller.outputs.index("q")
     gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
     # the softened sign is one too
     integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])
@@ -182,7 +188,8 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
 
 
 def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
-    response, models = identified.response, identified.models
+    response = identified.response
+    models = identified.models
     refused = response._replace(
         refusal=("", "V by thrust: found no movement, expected one", "", "")
     )
@@ -213,7 +220,9 @@ class Known(NamedTuple):
                 for instant in np.floor(t / 0.01 + 1e-9) * 0.01
             ]
         )
-        v, z, y = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+        v = np.zeros_like(t)
+        z = np.zeros_like(t)
+        y = np.zeros_like(t)
         for k in range(len(t) - 1):
             v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / self.lag
             y[k + 1] = y[k] + 0.001 * (
@@ -279,7 +288,8 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
     here 0.09 Hz.
     """
     params = experiment(MAP, SPEED, amplitude, "airframe.yaml").controller
-    arrays, step = params.law_params(), 0.01  # s, exact for a u that is held so long
+    arrays = params.law_params()
+    step = 0.01  # s, exact for a u that is held so long
     place = params.inputs.index("thrust")
     t = np.arange(0.0, params.duration, step)
     u = np.array([(arrays.amplitude * excitation.signal(instant, arrays))[place] for instant in t])
@@ -303,7 +313,8 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
 
 
 def test_thrust_told_from_phugoid_by_climb() -> None:
-    tape, whole = thrust_with_phugoid(0.2), [(0, 10**18)]
+    tape = thrust_with_phugoid(0.2)
+    whole = [(0, 10**18)]
     place = channel_pairs(MAP)[0].outputs.index("V")
     model = channel_models(MAP, tape, whole, SPEED)[place]
     assert model is not None
@@ -318,7 +329,8 @@ def test_thrust_told_from_phugoid_by_climb() -> None:
 
 def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    new, below_file = tmp_path / "found", tmp_path / "file" / "found"
+    new = tmp_path / "found"
+    below_file = tmp_path / "file" / "found"
     for name, folder, sentence in (
         (str(MAP_FILES["ardupilot_2024"]), new, "map ardupilot_2024: envelope: found none of"),
         ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),

@@ -29,7 +29,8 @@ from rise_di_controller.laws import AnyLaw
 pytestmark = pytest.mark.slow
 
 MAPS = sorted(MAP_FILES)
-OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
+OUTPUTS = ("q", "p", "r", "V")
+INPUTS = ("elevator", "aileron", "rudder", "thrust")
 AIRFRAME = load_airframe("osprey")
 OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
 
@@ -71,7 +72,8 @@ def test_through_map_of_right_signs_omega_is_that_of_airframe() -> None:
 @pytest.mark.parametrize("channel", INPUTS)
 @pytest.mark.parametrize("name", MAPS)
 def test_input_with_wrong_sign_changes_own_d_only(name: str, channel: str) -> None:
-    original, k = named_map(name), INPUTS.index(channel)
+    original = named_map(name)
+    k = INPUTS.index(channel)
     row = original.inputs[channel]
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
     flipped = changed(
@@ -98,10 +100,8 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_contradiction(channel: str) 
 
 
 def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
-    path, flipped = (
-        tmp_path / "ardupilot.yaml",
-        changed(load_map("ardupilot"), "inputs", "elevator", sign=-1),
-    )
+    path = tmp_path / "ardupilot.yaml"
+    flipped = changed(load_map("ardupilot"), "inputs", "elevator", sign=-1)
     # lists in place of tuples, for YAML
     content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))
     path.write_text(yaml.safe_dump(content, sort_keys=False))
@@ -116,7 +116,8 @@ def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
 
 def test_channels_of_quadrotor_go_by_their_motions() -> None:
     folder = REPOSITORY / "examples" / "px4_quadrotor"
-    hover, frame = load_map(str(folder / "map.yaml")), load_airframe(str(folder / "airframe.yaml"))
+    hover = load_map(str(folder / "map.yaml"))
+    frame = load_airframe(str(folder / "airframe.yaml"))
     Omega = frame.matrix_b()
     # outputs are the states, in one order
     np.testing.assert_array_equal(through(hover, Omega), Omega)

@@ -143,7 +143,8 @@ def test_gain_that_22_does_not_allow_refused() -> None:
 
 @pytest.mark.equation(27)
 def test_bounds_of_U_are_those_of_worst_sample() -> None:
-    lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
+    lower = np.array([[0.9, 0.0], [0.0, 0.9]])
+    upper = np.array([[1.1, 0.3], [0.2, 1.1]])
     places = np.array(list(product((0.0, 0.5, 1.0), repeat=4))).reshape(-1, 2, 2)
     # the corners of the interval, and points between them
     samples = lower + places * (upper - lower)
@@ -154,7 +155,8 @@ def test_bounds_of_U_are_those_of_worst_sample() -> None:
 @pytest.mark.equation(16, 17, 18)
 def test_n_d_is_minus_D_U_v_dot() -> None:
     # M Omega v_dot with M = S^-1, for any Omega: the disturbance that the ideal control cancels
-    Omega, v_dot = np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.3, -0.7], [1.0, 2.0]])
+    Omega = np.array([[1.0, 2.0], [2.0, 1.0]])
+    v_dot = np.array([[0.3, -0.7], [1.0, 2.0]])
     expected = [-np.linalg.solve(decompose(Omega).S, Omega @ row) for row in v_dot]
     assert_allclose(gain_conditions.N_d(Omega, v_dot), expected, atol=1e-12)
 
@@ -278,12 +280,11 @@ def osprey_loop(
     """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags
     wide.
     """
-    A, B, C = (
-        AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity(),
-        AIRFRAME.matrix_b(),
-        AIRFRAME.matrix_c(),
-    )
-    scale, eps = 1.0 / np.abs(np.diag(C @ B)), factor * OSPREY_LOOP.total / np.array(K)
+    A = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity()
+    B = AIRFRAME.matrix_b()
+    C = AIRFRAME.matrix_c()
+    scale = 1.0 / np.abs(np.diag(C @ B))
+    eps = factor * OSPREY_LOOP.total / np.array(K)
     params = law_params(K, Lambda, 1.0, sign=Sign.SOFT, input_scale=scale, eps=eps)
     return LinearPlant(A, B, C), linear(params)
 
@@ -326,7 +327,9 @@ def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
     dt, ticks, period = 0.00025, 40, 0.01
     fading = math.exp(-dt / lag)
     y = np.array([1e-6])
-    state, position, u = engage(np.zeros(1), np.zeros(1)), 0.0, 0.0
+    state = engage(np.zeros(1), np.zeros(1))
+    position = 0.0
+    u = 0.0
     line = deque([0.0] * round(delay / dt))
     peaks = [0.0, 0.0]
     seconds = 12.0

@@ -91,7 +91,8 @@ def test_omega_and_lags_of_linear_system_identified(
 def test_tangent_of_damped_rate_is_initial_slope() -> None:
     # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s)
     # and, at its middle, no lag.
-    a, b = 8.0, -5.0
+    a = 8.0
+    b = -5.0
     t = DT * np.arange(101)
     found = steepest_tangent(b / a * (1.0 - np.exp(-a * t)), DT)
     assert found is not None
@@ -114,14 +115,16 @@ def test_a_constant_response_has_no_tangent() -> None:
 
 
 def test_drift_and_even_parts_of_response_cancel() -> None:
-    known, lag = np.diag([3.0, -2.0]), np.array([0.05, 0.02])
+    known = np.diag([3.0, -2.0])
+    lag = np.array([0.05, 0.02])
     straight = lagged(known, lag)
 
     def drifting(u: FloatArray, duration: float) -> FloatArray:
         t = DT * np.arange(round(duration / DT) + 1)[:, None]
         return np.asarray(straight(u, duration) + 0.3 * t**2 + 5.0 * t * (u @ u))
 
-    found, clean = respond(drifting), respond(straight)
+    found = respond(drifting)
+    clean = respond(straight)
     assert found.Omega == approx(clean.Omega, abs=1e-9)
     assert found.lag == approx(clean.lag, abs=1e-9)
 
@@ -178,7 +181,8 @@ def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: flo
     params = ReferenceModelConfig.validate_mapping(
         reference_parameters(speed, authority), "reference_model"
     )
-    y_m, row = Reference(params), list(params.outputs).index("V")
+    y_m = Reference(params)
+    row = list(params.outputs).index("V")
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
     assert steepest <= min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
@@ -223,7 +227,8 @@ def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> 
 
 
 def test_shipped_learner_begins_with_sketch(cessna: IdentifiedAircraft) -> None:
-    shipped, gains = find_scenario("jsbsim_c172p_learn").rise_di(), cessna.selection.chosen
+    shipped = find_scenario("jsbsim_c172p_learn").rise_di()
+    gains = cessna.selection.chosen
     learned = that_learns(cessna.selection, cessna.condition, cessna.responses.Omega, 0.015).chosen
     assert shipped.feedforward is not None
     assert learned.feedforward is not None

@@ -78,7 +78,8 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    run, lines = tmp_path_factory.mktemp("learn"), list[str]()
+    run = tmp_path_factory.mktemp("learn")
+    lines = list[str]()
     chosen = written(scenario(), run / "learn.yaml")
     learned = made_learner(chosen)
     assert (
@@ -104,7 +105,8 @@ def record_rest(made: Learner) -> None:
 
 def error(tape: Tape, first: float, last: float) -> FloatArray:
     """True rms error of q, V, p, r between two flight times, s."""
-    truth, y_m = tape["truth"], tape["y_m"]
+    truth = tape["truth"]
+    y_m = tape["y_m"]
     within = (tape.time("y_m") >= first) & (tape.time("y_m") < last)
     return np.array(
         [np.sqrt(np.mean((truth[f"x.{name}"] - y_m[name])[within] ** 2)) for name in NAMES]
@@ -144,12 +146,14 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
     run, lines, _ = flown
     tape = read_run(run).tape
     alone = simulate(scenario(learn=None))
-    before, after = error(alone, SWITCH, END), error(tape, SWITCH, END)
+    before = error(alone, SWITCH, END)
+    after = error(tape, SWITCH, END)
     # the model of the second simulator of the prototype: 1.64 to 0.81 in all outputs together, here
     # at least a fifth less
     units = np.array([0.01, 0.1, 0.02, 0.01])
     assert np.sum(after / units) < 0.8 * np.sum(before / units)
-    u, t = tape["u"].values, tape.time("u")
+    u = tape["u"].values
+    t = tape.time("u")
     step = np.abs(np.diff(u, axis=0))
     at = int(np.searchsorted(t, SWITCH))
     # in turbulence u moves in each tick; u_o goes to -F z within `observer.within`, 0.1 s: 31 mrad
@@ -187,7 +191,8 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
     result = invoke("learn", flown.run, "--write", model)
     assert result.exit_code == 0, result.output
     assert flown.lines[-1].partition(" flies ")[2] in " ".join(result.output.split())
-    B, of_file = load_airframe(model).matrix_b(), load_airframe("osprey").matrix_b()
+    B = load_airframe(model).matrix_b()
+    of_file = load_airframe("osprey").matrix_b()
     found = {entry.name: entry.error for entry in flown.learner.identification.entries}  # type: ignore[union-attr]
     assert B[2, 0] / of_file[2, 0] - 1.0 == approx(found["B[q, elevator]"])
     assert learner(scenario(learn={"prior": {"file": str(model)}})) is not None
@@ -226,7 +231,8 @@ def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: P
 
 def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     tape = read_run(flown.run).tape
-    ticks, t = tape["internals"], tape.time("internals")
+    ticks = tape["internals"]
+    t = tape.time("internals")
     changed = ticks.values.copy()
     changed[(t > 5.0) & (t < 6.0), ticks.names.index("mode")] = Mode.INACTIVE
     # from there on y is two ticks late: an instant is that of the tick
@@ -256,7 +262,8 @@ def test_log_without_outputs_that_controller_gave_up_is_refused(flown: Flown) ->
 
 
 def test_lost_ticks_are_unknown_in_record() -> None:
-    made, period_ns = made_learner(scenario()), 10_000_000
+    made = made_learner(scenario())
+    period_ns = 10_000_000
     for k in (0, 1, 3, 3, 6):
         made.take(k * period_ns + 400, np.full(4, float(k)), np.array([1.0, 2.0, 3.0, 4.0]) * k, 0)
     recorded = made._record.recording()
@@ -278,10 +285,8 @@ def test_short_record_is_refused() -> None:
 def test_identification_is_due_where_last_proposal_does_not_fly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made, identified = (
-        made_learner(scenario(learn={"updates": [15.0]})),
-        Mock(return_value=SimpleNamespace(parts=())),
-    )
+    made = made_learner(scenario(learn={"updates": [15.0]}))
+    identified = Mock(return_value=SimpleNamespace(parts=()))
     monkeypatch.setattr(design_learner, "identify", identified)
     record_rest(made)
     rough = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).controller
@@ -296,7 +301,8 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
 
 def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Designed for a model that errs, beside parts that are learned; then the law of the start."""
-    made, start = made_learner(scenario()), scenario().rise_di()
+    made = made_learner(scenario())
+    start = scenario().rise_di()
     rough = made.propose(start.digest()).controller
     assert rough is not None
     assert rough.feedforward is not None
@@ -387,7 +393,8 @@ def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made, start = made_learner(scenario()), scenario().rise_di()
+    made = made_learner(scenario())
+    start = scenario().rise_di()
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
 
     def part(outputs: tuple[str, ...], *entries: Entry) -> Part:
@@ -437,7 +444,8 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
     # a later proposal, which lost the race with the fallback
-    learned._proposed, learned._last = (0, start)
+    learned._proposed = 0
+    learned._last = start
     again = learned.propose(fallen.digest(), ["q", "V"]).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
@@ -587,7 +595,8 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
         flown = vary(flown, change)
     # a delay within 5 ms, and its deviations
     assert flown.observer.margin == approx(0.04 + 0.01, abs=0.01)
-    true, loop = late.aircraft.sampled_airframe(), Loop(np.array(flown.lag), 0.04, 0.01)
+    true = late.aircraft.sampled_airframe()
+    loop = Loop(np.array(flown.lag), 0.04, 0.01)
     assert is_stable(
         plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4)
     )
@@ -613,7 +622,8 @@ def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
     """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this
     test.
     """
-    made, test = made_learner(scenario(learn={"updates": [10.0]})), Mock(return_value=())
+    made = made_learner(scenario(learn={"updates": [10.0]}))
+    test = Mock(return_value=())
     monkeypatch.setattr(design_learner, "change_test", test)
     made._known = {("p", "r"): Known(0, {}, 0.0, False, (0.0, 0.0))}
     before, meanwhile, after = flown
@@ -638,7 +648,8 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     late = scenario(learn={"updates": [6.0], "latency": 0.0}, **margin).vary(
         aircraft={"sensors": {"delay": 0.03}}, flight={"duration": 12.0}
     )
-    start, shipped = late.rise_di(), find_scenario("osprey_observer").rise_di().observer
+    start = late.rise_di()
+    shipped = find_scenario("osprey_observer").rise_di().observer
     assert shipped is not None
     given = {f"observer.{key}": getattr(shipped, key) for key in ("Phi", "Gamma", "L")}
     strong = tuple(8.0 * value for value in shipped.F)

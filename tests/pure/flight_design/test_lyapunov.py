@@ -133,7 +133,8 @@ def test_constant_of_lemma_2_is_hand_worked_one() -> None:
     # zeta = 4 - 1 = 3
     one = np.ones((1, 1))
     plant = KnownPlant(-one, one, one, lambda t, x: 0.0 * x)
-    column, zero = np.array([[2.0], [1.0], [0.0]]), np.zeros(3)
+    column = np.array([[2.0], [1.0], [0.0]])
+    zero = np.zeros(3)
     flight = Evidence(
         np.arange(3.0),
         column,

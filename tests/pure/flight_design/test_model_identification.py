@@ -82,7 +82,9 @@ def identified(air: str, uncertainty: float) -> Identification:
 
 def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, float]:
     """Relative errors of the nominal entries."""
-    A, B, inputs = aircraft.matrix_a(), aircraft.matrix_b(), list(aircraft.inputs)
+    A = aircraft.matrix_a()
+    B = aircraft.matrix_b()
+    inputs = list(aircraft.inputs)
     values = {}
     for entry in entries:
         row = aircraft.index(entry.row)
@@ -205,12 +207,11 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll
     pitches it.
     """
-    A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
-    row, aileron, elevator = (
-        OSPREY.index("p"),
-        list(OSPREY.inputs).index("aileron"),
-        list(OSPREY.inputs).index("elevator"),
-    )
+    A = OSPREY.matrix_a()
+    B = OSPREY.matrix_b()
+    row = OSPREY.index("p")
+    aileron = list(OSPREY.inputs).index("aileron")
+    elevator = list(OSPREY.inputs).index("elevator")
     coupled = {
         "B[p, elevator]": 0.1 * B[row, aileron],
         "A[q, p]": 0.1 * A[OSPREY.index("q"), OSPREY.index("q")],
@@ -256,7 +257,8 @@ def test_lost_samples_are_predicted_over() -> None:
 
 def test_y_taken_at_stamps_of_u() -> None:
     tape = flight("gust", 0.5)
-    y, u = tape["y"], tape["u"]
+    y = tape["y"]
+    u = tape["u"]
     fast = np.repeat(y.values, 5, axis=0) + np.tile(
         [[0.0], [9.0], [9.0], [9.0], [9.0]], (len(y.values), 1)
     )
@@ -274,7 +276,8 @@ def test_log_that_shows_no_model_is_refused() -> None:
     samples.
     """
     tape = flight("gust", 0.5)
-    y, u = tape["y"], tape["u"]
+    y = tape["y"]
+    u = tape["u"]
     still = Signal(y.stamp_ns, y.names, y.values * [name != "p" for name in y.names])
     with refusing("^record: found a constant p, expected outputs that move"):
         signals = {"y": still, "u": u}
@@ -321,13 +324,16 @@ def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     )
     bank = innovation_filters.filter_bank(model, names, 25.0, np.ones((1, 2)))
     # simulate the filter's own model with the noise for which it is designed
-    generator, Phi, H = np.random.default_rng(1), bank.sampled.Phi[0, 0], bank.sampled.H
+    generator = np.random.default_rng(1)
+    Phi = bank.sampled.Phi[0, 0]
+    H = bank.sampled.H
     wind = [
         bank.sampled.states.index("x.wind.vertical"),
         bank.sampled.states.index("x.wind.longitudinal"),
     ]
     _, gust = innovation_filters.wind_model(names.winds, 25.0)
-    z, y = np.zeros(len(Phi)), np.zeros((20_000, 2))
+    z = np.zeros(len(Phi))
+    y = np.zeros((20_000, 2))
     for k in range(len(y)):
         y[k] = H @ z + model.noise * generator.standard_normal(2)
         z = Phi @ z
@@ -347,7 +353,8 @@ def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
 
 
 def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_coloured_noise() -> None:
-    generator, held_out = np.random.default_rng(1), np.arange(60_000) % 300 >= 200
+    generator = np.random.default_rng(1)
+    held_out = np.arange(60_000) % 300 >= 200
     white = generator.standard_normal((60_000, 50))
     # n (1 + 0.8 rho_1^2 ..): the mean of 50 figures has a standard deviation of 0.32 / sqrt(50)
     assert whiteness(white, held_out).mean() == approx(1.0, abs=0.2)
@@ -358,7 +365,8 @@ def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_colour
 
 
 def test_correlation_is_one_for_independent_noises_and_that_of_what_follows_later() -> None:
-    generator, used = np.random.default_rng(1), np.ones(20_000, dtype=bool)
+    generator = np.random.default_rng(1)
+    used = np.ones(20_000, dtype=bool)
     before, noise = generator.standard_normal((2, 20_000, 20))
     # the mean of 400 figures with a deviation of 0.32 each
     assert correlation(noise, before, used).mean() == approx(1.0, abs=0.05)
@@ -375,7 +383,8 @@ def run_folder(folder: Path) -> Path:
     """A run with a turbulent flight."""
     run = folder / "run"
     run.mkdir()
-    scenario, notes = run / "turbulent.yaml", run / "provenance.yaml"
+    scenario = run / "turbulent.yaml"
+    notes = run / "provenance.yaml"
     scenario.write_text(scenario_yaml(servo("turbulence", 0.3)))
     notes.write_text("host: {name: test}\n")
     write_run(flight("turbulence", 0.3), run, LogAttachments(scenario, (), notes))

@@ -136,7 +136,8 @@ def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not()
 def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
     # q, V, p, r in gusts: measured 0.94, 0.15, 0.14, 0.46; the rule is a start, and the gains of a
     # search are better still
-    alone, observed = rms_alone(), rms(simulate(with_observer(by_rule().controller)))
+    alone = rms_alone()
+    observed = rms(simulate(with_observer(by_rule().controller)))
     assert (observed < [1.0, 0.5, 0.5, 0.5] * alone).all()
 
 

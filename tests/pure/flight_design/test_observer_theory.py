@@ -86,9 +86,12 @@ def random_plant(seed: int, U_12: float = 0.0) -> Plant:
     rng = np.random.default_rng(seed)
     zero_dynamics = rng.normal(size=(N - M, N - M))
     zero_dynamics -= (eigvals(zero_dynamics).real.max() + 1.0) * np.eye(N - M)
-    top, left = rng.normal(size=(M, N)), rng.normal(size=(N - M, M))
+    top = rng.normal(size=(M, N))
+    left = rng.normal(size=(N - M, M))
     root = 0.3 * rng.normal(size=(M, M))
-    S, D, U = np.eye(M) + root @ root.T, np.array([1.0, -1.0]), np.array([[1.0, U_12], [0.0, 1.0]])
+    S = np.eye(M) + root @ root.T
+    D = np.array([1.0, -1.0])
+    U = np.array([[1.0, U_12], [0.0, 1.0]])
     change = np.eye(N) + 0.3 * np.vstack([np.zeros((M, N)), rng.normal(size=(N - M, N))])
     A = np.vstack([top, np.hstack([left, zero_dynamics])])
     back = np.linalg.inv(change)
@@ -137,11 +140,9 @@ def extended(plant: Plant, observer: Observer) -> Plant:
 
 def osprey() -> tuple[Airframe, Plant]:
     airframe = load_airframe("osprey")
-    A, B, C = (
-        airframe.matrix_a() + airframe.matrix_gravity(),
-        airframe.matrix_b(),
-        airframe.matrix_c(),
-    )
+    A = airframe.matrix_a() + airframe.matrix_gravity()
+    B = airframe.matrix_b()
+    C = airframe.matrix_c()
     return airframe, Plant(A, B, C, np.eye(4), np.ones(4), np.eye(4))
 
 
@@ -153,8 +154,10 @@ def osprey_observer() -> Observer:
     s.
     """
     airframe, plant = osprey()
-    unit, noise = np.array([0.1, 1.0, 0.1, 0.1]), np.array([1.7e-3, 0.03, 1.7e-3, 1.7e-3])
-    effort, drift = np.array([0.03, 0.09, 0.065, 0.06]), np.array([0.26, 0.04, 2.0, 0.34])
+    unit = np.array([0.1, 1.0, 0.1, 0.1])
+    noise = np.array([1.7e-3, 0.03, 1.7e-3, 1.7e-3])
+    effort = np.array([0.03, 0.09, 0.065, 0.06])
+    drift = np.array([0.26, 0.04, 2.0, 0.34])
     axes = {"vertical": (0.9, 4.7), "lateral": (0.44, 0.57), "longitudinal": (0.36, 1.9)}
     gust, time_constant = np.array([axes[name] for name in airframe.gusts]).T
     wind = np.column_stack([airframe.gust_direction(name) for name in airframe.gusts])
@@ -203,7 +206,8 @@ def arbitrary_observer(rng: np.random.Generator) -> Observer:
     aircraft.
     """
     s = N + M
-    A_z, H = rng.normal(size=(s, s)), rng.normal(size=(M, s))
+    A_z = rng.normal(size=(s, s))
+    H = rng.normal(size=(M, s))
     L = place_poles(A_z.T, H.T, -rng.uniform(0.5, 5.0, size=s)).gain_matrix.T
     return Observer(A_z, rng.normal(size=(s, M)), H, 10.0 * rng.normal(size=(M, s)), L)
 
@@ -212,8 +216,10 @@ def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None
     unstable = 0
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        plant, observer = random_plant(seed, U_12=0.7), arbitrary_observer(rng)
-        both, filter_matrix = extended(plant, observer), observer.error_matrix
+        plant = random_plant(seed, U_12=0.7)
+        observer = arbitrary_observer(rng)
+        both = extended(plant, observer)
+        filter_matrix = observer.error_matrix
         expected = np.concatenate(
             [invariant_zeros(plant.A, plant.B, plant.C), eigvals(filter_matrix)]
         )
@@ -234,7 +240,8 @@ def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None
 def test_on_osprey_observer_adds_only_own_filter_to_zeros() -> None:
     _, plant = osprey()
     observer = osprey_observer()
-    both, poles = extended(plant, observer), eigvals(observer.error_matrix)
+    both = extended(plant, observer)
+    poles = eigvals(observer.error_matrix)
     assert np.array_equal(both.C @ both.B, plant.C @ plant.B)
     expected = np.concatenate([[-7.188, -0.69, 0.0, 0.0], poles])
     found = invariant_zeros(both.A, both.B, both.C)
@@ -274,9 +281,11 @@ def test_N_d_of_extended_plant_is_slew_that_feedforward_and_observer_leave(omega
     # extended plant.
     rng = np.random.default_rng(7)
     for seed in range(3):
-        plant, observer = random_plant(seed, U_12=0.7), arbitrary_observer(rng)
+        plant = random_plant(seed, U_12=0.7)
+        observer = arbitrary_observer(rng)
         f, y_m, u_ff = (rng.normal(size=(k, 2)) @ np.array([1.0, 1.0j]) for k in (N, M, M))
-        both, s = extended(plant, observer), 1j * omega
+        both = extended(plant, observer)
+        s = 1j * omega
         f_e = np.concatenate([f + plant.B @ u_ff, -observer.L @ y_m])
         x_e, _ = ideal(both, omega, f_e, y_m)
         N_d = np.linalg.solve(plant.S, both.C @ (both.A @ (s * x_e) + s * f_e) - s**2 * y_m)
@@ -315,7 +324,8 @@ def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
     mean of 20 at +-30 %.
     """
     airframe, _ = osprey()
-    observer, course = osprey_observer(), manoeuvre(short(), airframe)
+    observer = osprey_observer()
+    course = manoeuvre(short(), airframe)
     study = study_airframe(airframe, course, 0.3, 21)
     calm = study_airframe(airframe, course._replace(gusts={}), 0.0, 1)
     filtered = (observer.error_matrix, observer.B_z, observer.F, np.eye(4))
@@ -347,7 +357,8 @@ def test_on_osprey_observer_halves_slew_of_elevator_and_rudder_in_gusts() -> Non
 def test_without_fade_in_observer_moves_inputs_at_once() -> None:
     # zeta(0) = H'e(0) for e(0) = 0.1, 0.2, 0.1 rad/s of q, p, r and 2 m/s: -F H'e(0)
     airframe, _ = osprey()
-    observer, e_0 = osprey_observer(), {"q": 0.1, "p": 0.2, "r": 0.1, "V": 2.0}
+    observer = osprey_observer()
+    e_0 = {"q": 0.1, "p": 0.2, "r": 0.1, "V": 2.0}
     u_o = -observer.F @ observer.H.T @ np.array([e_0[name] for name in airframe.outputs])
     jump = dict(zip(airframe.inputs, u_o, strict=True))
     assert jump["thrust"] == approx(-3.65, rel=0.01)  # of 1: 365 %
@@ -375,7 +386,9 @@ class CrossTerms(NamedTuple):
 
 
 def cross_terms(plant: Plant) -> CrossTerms:
-    part, M_, one = hidden(plant), np.linalg.inv(plant.S), np.eye(len(plant.C))
+    part = hidden(plant)
+    M_ = np.linalg.inv(plant.S)
+    one = np.eye(len(plant.C))
     G = M_ @ (part.yy + one)
     return CrossTerms(
         G, G - one - M_ @ part.y_eta @ part.eta_y, -M_ @ part.y_eta @ part.eta, part.eta, part.eta_y
@@ -398,7 +411,8 @@ def form_of(terms: CrossTerms, of_r: FloatArray, P: FloatArray) -> FloatArray:
     """Q_w for w = [e, r, eta], Lambda = I: e'e + r'(of_r - G) r + r'(W_e e + W_eta eta) - eta'(A'P
     + P A) eta - 2 eta'P B e.
     """
-    m, n = len(terms.G), len(terms.A_eta)
+    m = len(terms.G)
+    n = len(terms.A_eta)
     lower = -P @ terms.A_eta - terms.A_eta.T @ P
     Q = np.block(
         [
@@ -418,9 +432,11 @@ def test_above_k_star_matrix_P_makes_form_of_lemma_A_positive(
     # The lemma of Kalman, Yakubovich and Popov, by its Riccati equation: r is eliminated, then e.
     plant = random_plant(seed)
     flown = extended(plant, observer_of(plant)) if with_observer else plant
-    terms, k = cross_terms(flown), 1.01 * least_gain(flown)
+    terms = cross_terms(flown)
+    k = 1.01 * least_gain(flown)
     inverse = np.linalg.inv(k * np.eye(M) - (terms.G + terms.G.T) / 2.0) / 4.0
-    R, cross = np.eye(M) - terms.W_e.T @ inverse @ terms.W_e, terms.W_eta.T @ inverse @ terms.W_e
+    R = np.eye(M) - terms.W_e.T @ inverse @ terms.W_e
+    cross = terms.W_eta.T @ inverse @ terms.W_e
     Q = terms.W_eta.T @ inverse @ terms.W_eta + 1e-9 * np.eye(len(terms.A_eta))
     P = np.asarray(
         -solve_continuous_are(terms.A_eta, terms.B_eta, -Q, R, s=-cross), dtype=np.float64
@@ -467,7 +483,8 @@ def flown_error(
     x_0 = np.zeros(len(flown.A))
     x_0[:N] = 0.3
     flight = fly(KnownPlant(flown.A, flown.B, flown.C, f), y_m, dt, params, x_0)
-    settled, e = t > 12.0, np.asarray(flight.x @ flown.C.T - y_m)
+    settled = t > 12.0
+    e = np.asarray(flight.x @ flown.C.T - y_m)
     return t[settled], e[settled]
 
 
@@ -482,7 +499,8 @@ def largest_error(
 def test_with_gains_of_lemma_A_error_falls_with_square_of_period(seed: int) -> None:
     plant = random_plant(seed)
     observer = observer_of(plant)
-    K, omega = 1.2 * least_gain(extended(plant, observer)), 1.2 * np.abs(np.diag(plant.C @ plant.B))
+    K = 1.2 * least_gain(extended(plant, observer))
+    omega = 1.2 * np.abs(np.diag(plant.C @ plant.B))
     least, beta = classical_beta(plant, seed, observer)
     params = law_params(K, 1.0, 1.1 * beta, plant.D, omega=omega)
     coarse, fine = (largest_error(plant, seed, observer, params, dt) for dt in (0.01, 0.005))
@@ -500,14 +518,18 @@ def test_with_gains_of_lemma_A_error_falls_with_square_of_period(seed: int) -> N
 # Lemma B
 
 
-NU, BETA, EPS = np.array([5.0, 5.0]), np.array([0.3, 0.2]), np.array([0.01, 0.01])
+NU = np.array([5.0, 5.0])
+BETA = np.array([0.3, 0.2])
+EPS = np.array([0.01, 0.01])
 
 
 def ultimate_bound(plant: Plant, K: FloatArray, zeta: float) -> float:
     """The smallest bound of Lemma B over a grid of kappa and k_2, with P of A_eta' P + P A_eta =
     -kappa I.
     """
-    U, terms, DUDK = np.abs(plant.U), cross_terms(plant), (plant.D[:, None] * plant.U * plant.D) * K
+    U = np.abs(plant.U)
+    terms = cross_terms(plant)
+    DUDK = (plant.D[:, None] * plant.U * plant.D) * K
     b = zeta + float(np.linalg.norm(U @ NU) + np.linalg.norm(U @ BETA))
     bounds = []
     for kappa in np.geomspace(1e-3, 1e2, 40):
@@ -530,16 +552,20 @@ def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
     adverse: u_o_dot = NU sgn((D U)' r), which raises r' D U u_o_dot most; bounded: the same between
     limits of 0.5; square: a sign that alternates every pi s.
     """
-    push, dt = Wave(0.5, np.random.default_rng(50).normal(size=N), np.zeros(M)), 4e-3
+    push = Wave(0.5, np.random.default_rng(50).normal(size=N), np.zeros(M))
+    dt = 4e-3
     state, _ = ideal(plant, push.omega, push.f, push.y_m)
-    amplitude, turn = slew_left(plant, push, None), np.exp(1j * np.linspace(0.0, np.pi, 200))
+    amplitude = slew_left(plant, push, None)
+    turn = np.exp(1j * np.linspace(0.0, np.pi, 200))
     zeta = float(np.max(np.linalg.norm((amplitude * turn[:, None]).real, axis=1)))
-    DU, T = plant.D[:, None] * plant.U, hidden(plant).T
+    DU = plant.D[:, None] * plant.U
+    T = hidden(plant).T
 
     def rates(t: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, u_law, u_o = np.split(w, [N, N + M])
         x_dot = plant.A @ x + (push.f * np.exp(1j * push.omega * t)).real + plant.B @ (u_law + u_o)
-        e, r = plant.C @ x, plant.C @ (x_dot + x)
+        e = plant.C @ x
+        r = plant.C @ (x_dot + x)
         u_o_dot = NU * (np.sign(np.sin(t)) if kind == "square" else np.sign(DU.T @ r))
         if kind == "bounded":
             u_o_dot = np.where((np.abs(u_o) >= 0.5) & (u_o_dot * u_o > 0.0), 0.0, u_o_dot)
@@ -547,7 +573,8 @@ def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
         eta = T @ (x - (state * np.exp(1j * push.omega * t)).real)
         return np.concatenate([x_dot, u_law_dot, u_o_dot]), np.concatenate([e, r, eta])
 
-    w, largest = np.zeros(N + 2 * M), 0.0
+    w = np.zeros(N + 2 * M)
+    largest = 0.0
     for k in range(round(12.0 / dt)):
         slope, signals = rates(k * dt, w)
         w = w + dt * rates((k + 0.5) * dt, w + dt / 2.0 * slope)[0]
@@ -558,7 +585,8 @@ def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_error_stays_within_lemma_B_for_any_bounded_slew_of_observer(seed: int) -> None:
-    plant, K = random_plant(seed, U_12=0.5), np.array([40.0, 30.0])
+    plant = random_plant(seed, U_12=0.5)
+    K = np.array([40.0, 30.0])
     flown = {kind: largest_w(plant, K, kind) for kind in ("adverse", "bounded", "square")}
     bound = ultimate_bound(plant, K, flown["adverse"][1])
     assert all(largest < bound for largest, _ in flown.values())
@@ -573,7 +601,9 @@ def test_error_stays_within_lemma_B_for_any_bounded_slew_of_observer(seed: int) 
 def test_inside_softened_sign_error_is_N_d_over_integral_gain(seed: int) -> None:
     # e_i = N_d,i / (K_i (Lambda_i + 1 / T_eps,i)) for a slow N_d and a K that is large against the
     # other terms of (24)
-    plant, K, T_eps = random_plant(seed), 40.0, 0.1
+    plant = random_plant(seed)
+    K = 40.0
+    T_eps = 0.1
     for observer in (None, observer_of(plant)):
         beta = 5.0 * classical_beta(plant, seed, observer)[1]
         params = law_params(K, 1.0, beta, plant.D, Sign.SOFT, eps=beta / K * T_eps)
@@ -642,7 +672,8 @@ def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> 
     """
     tuned = GAINS[law][objective]
     gains = {name: np.array(values) for name, values in tuned.gains.items()}
-    T_eps, replaced = gains["softening"] * course.model.total_lag, np.arange(4) < channels
+    T_eps = gains["softening"] * course.model.total_lag
+    replaced = np.arange(4) < channels
     Lambda = np.where(replaced, gains["Lambda"] + 1.0 / T_eps, gains["Lambda"])
     linear = tuned.gains | {
         "Lambda": Lambda.tolist(),

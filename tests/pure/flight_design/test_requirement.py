@@ -100,7 +100,8 @@ def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, fl
     """Phase margin, deg, and largest sensitivity of K (1 + integral dt z / (z - 1)) and the sampled
     lag and integrator.
     """
-    params, name = controller.law_params(), controller.inputs[channel]
+    params = controller.law_params()
+    name = controller.inputs[channel]
     integral = (
         params.Lambda[channel] + params.beta[channel] / params.eps[channel] / params.K[channel]
     )

@@ -12,10 +12,13 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import Response, identify_response
 from flight_design.identification.step_response_fit import begins_with_Omega
 
-OUTPUTS, INPUTS = ("p", "r"), ("aileron", "rudder")
+OUTPUTS = ("p", "r")
+INPUTS = ("aileron", "rudder")
 OMEGA: FloatArray = np.array([[40.0, 3.0], [-2.0, 8.0]])  # rad/s^2 per rad
 DAMPING = np.diag([6.0, 1.5])  # 1/s
-LAG, DELAY, STEP = np.array([0.03, 0.08]), 0.12, 0.001  # s
+LAG = np.array([0.03, 0.08])
+DELAY = 0.12
+STEP = 0.001  # s
 
 
 def flown(
@@ -36,7 +39,9 @@ def flown(
     shape = np.where(phase < 0.5, 1.0, np.where(phase < 1.0, -1.0, 0.0))
     u = doublets * np.stack([shape * (t % 8.0 < 4.0), shape * (t % 8.0 >= 4.0)], axis=1)
     late = np.vstack([np.zeros((round(DELAY / STEP), 2)), u])[:count]
-    x, gust, states = np.zeros(4), np.zeros(2), np.zeros((count, 2))
+    x = np.zeros(4)
+    gust = np.zeros(2)
+    states = np.zeros((count, 2))
     for k in range(count):
         states[k] = x[:2]
         gust += STEP * -2.0 * gust + np.sqrt(STEP) * 0.2 * generator.standard_normal(2)

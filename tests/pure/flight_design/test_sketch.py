@@ -18,7 +18,8 @@ from flight_design.identification.sketch import sketch, sketched
 from flight_design.learning.learner import Learner
 from flight_design.learning.scenario_learner import learner
 
-OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "throttle", "aileron", "rudder")
+OUTPUTS = ("q", "V", "p", "r")
+INPUTS = ("elevator", "throttle", "aileron", "rudder")
 # Omega_ii of docs/evidence/tables/experiments-jsbsim_omega.csv, true airspeed, m/s: light, fighter,
 # airliner
 STEPS = {
@@ -56,7 +57,8 @@ def test_parts_of_sketch_do_not_couple() -> None:
 
 def test_learner_begins_with_feedforward() -> None:
     scenario = find_scenario("jsbsim_c172p_learn")
-    controller, make = scenario.rise_di(), learner(scenario)
+    controller = scenario.rise_di()
+    make = learner(scenario)
     assert make is not None
     assert isinstance(make(controller), Learner)
     assert controller.observer is not None

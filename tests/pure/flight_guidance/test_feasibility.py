@@ -144,7 +144,8 @@ def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
     blocks = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    triangle, short = tmp_path / "triangle.yaml", tmp_path / "short.yaml"
+    triangle = tmp_path / "triangle.yaml"
+    short = tmp_path / "short.yaml"
     for path, block in zip((triangle, short), blocks, strict=True):
         path.write_text(block)
     assert len(guidance.plan(read_route(triangle)).legs) == 6  # three lines, two fillets, an orbit

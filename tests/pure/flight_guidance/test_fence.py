@@ -93,13 +93,16 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
     """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t =
     acos(-W / V).
     """
-    speed, bank = 25.0, math.radians(30.0)
+    speed = 25.0
+    bank = math.radians(30.0)
     rate = min(SHARES) * GRAVITY * math.tan(bank) / speed  # the wider of the two turns
     turned = math.acos(-wind / speed)
     ahead = speed / rate * math.sin(turned) + wind * turned / rate
-    north, east = math.cos(course), math.sin(course)
+    north = math.cos(course)
+    east = math.sin(course)
     for side, name in ((1.0, 0), (-1.0, 1)):
-        phi, air = np.float64(side * bank), (wind * north, wind * east)
+        phi = np.float64(side * bank)
+        air = (wind * north, wind * east)
         motion = Motion(np.float64(0.0), np.float64(0.0), phi, course, speed, air, bank, 1e9, 0.0)
         # Home is far behind. 64 points of the trapezoidal rule: 0.3 m.
         turns = turn_clearance(Fence((edge,), (-1900.0 * north, -1900.0 * east)), motion)
@@ -112,7 +115,9 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     """Along an edge, a turn towards the edge: nearest is R (1 - cos(w t)) + W t, where V sin(w t) =
     -W.
     """
-    speed, bank, gap = 25.0, math.radians(30.0), 600.0
+    speed = 25.0
+    bank = math.radians(30.0)
+    gap = 600.0
     rate = min(SHARES) * GRAVITY * math.tan(bank) / speed
     turned = math.pi + math.asin(wind / speed)
     nearest = gap - speed / rate * (1.0 - math.cos(turned)) - wind * turned / rate
@@ -137,7 +142,10 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a
     step of the prediction.
     """
-    speed, bank, lag, roll_rate = 25.0, math.radians(30.0), 3.0, 0.35
+    speed = 25.0
+    bank = math.radians(30.0)
+    lag = 3.0
+    roll_rate = 0.35
     edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
     # the bank to the other side turns by 10 deg before
     bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)
@@ -166,7 +174,8 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
 
 
 def test_turn_begins_at_last_moment() -> None:
-    fence, bank = Fence((FIELD,), (200.0, 0.0)), math.radians(30.0)
+    fence = Fence((FIELD,), (200.0, 0.0))
+    bank = math.radians(30.0)
 
     def motion(north: float, east: float, course: float = 0.0) -> Motion:
         return Motion(
@@ -202,7 +211,8 @@ def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
     scenario = find_scenario("osprey_route")
     assert scenario.guidance is not None
     params = scenario.guidance.params()
-    pose, y = dict.fromkeys(POSE, 0.0), {"q": 0.0, "V": 0.0, "p": 0.3, "r": 0.0}
+    pose = dict.fromkeys(POSE, 0.0)
+    y = {"q": 0.0, "V": 0.0, "p": 0.3, "r": 0.0}
     level = holding(0, pose, 25.0, params)
     assert motion_of(level, pose, y, 25.0, params).phi == approx(0.3 * 2.0 * 0.9 / 5.0, rel=0.15)
     assert motion_of(level, pose, y | {"p": 9.0}, 25.0, params).phi <= params.limits.bank
@@ -239,20 +249,23 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         benchmark.at(scaled.home, LEAST_RADIUS),
         LEAST_RADIUS,
     )
-    speed, bank, dt = 25.0, math.radians(30.0), 0.5
+    speed = 25.0
+    bank = math.radians(30.0)
+    dt = 0.5
     wind = 0.4 * speed * np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0]])
-    north, east, phi, psi, action = (
-        np.zeros(4),
-        np.zeros(4),
-        np.zeros(4),
-        np.array([0.0, 1.5, 3.0, -1.5]),
-        np.zeros(4),
-    )
-    has_been_inside, has_left = np.zeros(4, dtype=bool), np.zeros(4, dtype=bool)
+    north = np.zeros(4)
+    east = np.zeros(4)
+    phi = np.zeros(4)
+    psi = np.array([0.0, 1.5, 3.0, -1.5])
+    action = np.zeros(4)
+    has_been_inside = np.zeros(4, dtype=bool)
+    has_left = np.zeros(4, dtype=bool)
     # the longest way round against the wind
     for _ in range(math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)):
-        v_north, v_east = speed * np.cos(psi) + wind[0], speed * np.sin(psi) + wind[1]
-        course, ground_speed = np.arctan2(v_east, v_north), np.hypot(v_north, v_east)
+        v_north = speed * np.cos(psi) + wind[0]
+        v_east = speed * np.sin(psi) + wind[1]
+        course = np.arctan2(v_east, v_north)
+        ground_speed = np.hypot(v_north, v_east)
         motion = Motion(
             north,
             east,
@@ -274,7 +287,8 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         )
         phi = phi + np.clip(np.clip(wanted, -bank, bank) - phi, -0.35 * dt, 0.35 * dt)
         psi = psi + dt * GRAVITY * np.tan(phi) / speed
-        north, east = north + dt * v_north, east + dt * v_east
+        north = north + dt * v_north
+        east = east + dt * v_east
     assert has_been_inside.all()
     assert not has_left.any()
     assert (
@@ -286,7 +300,8 @@ def test_outside_is_a_state_of_its_own() -> None:
     """Outside the aircraft flies the course of the shortest way inside, until it is half a second
     of flight inside.
     """
-    fence, bank = Fence((FIELD,), (0.0, 0.0)), math.radians(30.0)
+    fence = Fence((FIELD,), (0.0, 0.0))
+    bank = math.radians(30.0)
 
     def escape(north: float, before: float, heading: float = 0.0) -> Escape:
         motion = Motion(
@@ -317,7 +332,8 @@ def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
     turn leaves by 200 m.
     """
     funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
-    phi, bank = np.float64(0.0), math.radians(30.0)
+    phi = np.float64(0.0)
+    bank = math.radians(30.0)
     motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
     escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion)
     assert 5.0 < float(escape.predicted) < 12.5
@@ -333,7 +349,10 @@ def test_way_home_leads_round_a_zone() -> None:
         (-500.0,) * 2 + (1700.0,) * 2 + (700.0,) * 2 + (500.0,) * 2,
     )
     fence = Fence((arms,), (0.0, 1200.0), 150.0)
-    chart, place, least, length = ways(fence), np.array([0.0, 0.0]), math.inf, 0.0
+    chart = ways(fence)
+    place = np.array([0.0, 0.0])
+    least = math.inf
+    length = 0.0
     while not chart.aim(fence, *place)[2]:
         north, east, _ = chart.aim(fence, *place)
         step = (
@@ -341,7 +360,8 @@ def test_way_home_leads_round_a_zone() -> None:
             * np.array([north - place[0], east - place[1]])
             / math.hypot(north - place[0], east - place[1])
         )
-        place, length = place + step, length + 20.0
+        place = place + step
+        length = length + 20.0
         least = min(least, float(clearance(fence.zones, *place)))
         # the corners at 1600 m, past which the way is 3000 m at least in right angles
         assert length < 3000.0
@@ -360,7 +380,8 @@ def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
         (0.0, 0.0),
         30.0,
     )
-    chart, place = ways(fence), np.array([200.0, -200.0])
+    chart = ways(fence)
+    place = np.array([200.0, -200.0])
     for _ in range(60):
         north, east, straight = chart.aim(fence, *place)
         assert not straight
@@ -467,7 +488,8 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
         reference_model={"rate": 100.0},
         guidance={"route": route},
     )
-    course, uncertain = build_course(scenario), {"A": 0.3, "B": 0.3, "seed": 5, "number": 1}
+    course = build_course(scenario)
+    uncertain = {"A": 0.3, "B": 0.3, "seed": 5, "number": 1}
     A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 2)
     mission = missions.build(scenario, course)
     mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
@@ -539,9 +561,11 @@ def test_lost_link_flies_home() -> None:
     """
     route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario = calm(5.0, route=route, home={"east": 300.0, "link_timeout": 3.0})
-    tape, section = simulate(scenario), scenario.guidance
+    tape = simulate(scenario)
+    section = scenario.guidance
     assert section is not None
-    log, t = tape["guidance"], tape.time("guidance")
+    log = tape["guidance"]
+    t = tape.time("guidance")
     homeward = t[log["mode.lateral"] == Lateral.ORBIT]
     assert homeward[0] - t[0] == approx(3.02)  # the first step after the limit
     assert log["target.east"][-1] == 300.0

@@ -74,7 +74,8 @@ def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
     phi, theta, phi_c, theta_c = 0.4, 0.1, 0.5, 0.15
     turn = GRAVITY * math.tan(phi) / SPEED
     r = turn * math.cos(phi) * math.cos(theta) - HOLD.k_theta * (theta_c - theta) * math.sin(phi)
-    rates, dt = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD), 1e-6
+    rates = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD)
+    dt = 1e-6
     assert rates.r == approx(r, rel=1e-12)
     moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
         np.array(rates) * dt
@@ -106,7 +107,8 @@ def test_sideslip_to_right_turns_nose_right() -> None:
 def test_climb_rate_is_smooth_and_brakes() -> None:
     """The climb rate is continuous in value and slope, and falls by half the acceleration."""
     free = CLIMB._replace(climb=1e3, sink=1e3)
-    near, step = 1.0 / (2.0 * 0.2**2), 1e-6
+    near = 1.0 / (2.0 * 0.2**2)
+    step = 1e-6
     assert climb_for(near - step, free) == approx(climb_for(near + step, free), abs=1e-6)
     slope = (climb_for(near + 2.0 * step, free) - climb_for(near + step, free)) / step
     assert slope == approx(0.2, abs=1e-4)
@@ -130,7 +132,8 @@ def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
         .params()
         .vertical
     )
-    lag, time = path_lag(stall_speed, 154.0), loop.alpha_time
+    lag = path_lag(stall_speed, 154.0)
+    time = loop.alpha_time
     poles = Polynomial([1.0, time, lag * time]).roots()
     assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
     # a gain margin of 2.5
@@ -175,7 +178,9 @@ def cross_track(e_0: float, times: FloatArray) -> FloatArray:
 def test_error_near_line_is_second_order() -> None:
     # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000
     # of v_g P zeta.
-    times, zeta, w = np.linspace(0.0, 40.0, 81), 0.75, 2.0 * math.pi / 20.0
+    times = np.linspace(0.0, 40.0, 81)
+    zeta = 0.75
+    w = 2.0 * math.pi / 20.0
     damped = w * math.sqrt(1.0 - zeta**2)
     exact = np.exp(-zeta * w * times) * (
         np.cos(damped * times) + zeta * w / damped * np.sin(damped * times)
@@ -219,7 +224,10 @@ def offset_from_a_circle(*, estimated: bool) -> float:
     bank's turn is missing.
     """
     speed, radius, dt = 50.0, 800.0, 0.05
-    north, east, course, slip = 0.0, -radius, 0.0, 0.0
+    north = 0.0
+    east = -radius
+    course = 0.0
+    slip = 0.0
     params = PathParams(20.0, 0.75, 0.5)
     for _ in range(6000):
         error = path.error(Arc((0.0, 0.0), radius), (north, east))
@@ -228,7 +236,8 @@ def offset_from_a_circle(*, estimated: bool) -> float:
         if estimated:
             slip = slip_estimate(slip, GRAVITY * math.tan(phi), speed * course_dot, 0.0, dt, 2.0)
         middle = course + dt * course_dot / 2.0
-        north, east = north + dt * speed * math.cos(middle), east + dt * speed * math.sin(middle)
+        north = north + dt * speed * math.cos(middle)
+        east = east + dt * speed * math.sin(middle)
         course += dt * course_dot
     return math.hypot(north, east) - radius
 
@@ -267,8 +276,10 @@ def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
     """T = 2 s at 50 Hz. A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 -
     exp(-dt/T): 0.07 deg of 1.
     """
-    dt, noise = 0.02, np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)
-    psi, off = math.radians(170.0), []
+    dt = 0.02
+    noise = np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)
+    psi = math.radians(170.0)
+    off = []
     for k, error in enumerate(noise.tolist()):
         true = math.radians(170.0) + 0.06 * dt * (k + 1)  # a turn of 0.06 rad/s
         psi = heading_estimate(psi, math.remainder(true + error, 2.0 * math.pi), 0.06, dt)
@@ -358,7 +369,9 @@ def test_protection_follows_from_the_stall_speed() -> None:
 def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None:
     """A point that climbs as commanded stays below the ceiling, and reaches it."""
     section = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=SPEED, ceiling=300.0)
-    params, altitude, dt = section.params(), 250.0, 0.02
+    params = section.params()
+    altitude = 250.0
+    dt = 0.02
     pose = {**dict.fromkeys(POSE, 0.0), "altitude": altitude, "v_north": SPEED}
     state = modes.holding(0, pose, SPEED, params)
     vertical = {"climb": Vertical.CLIMB, "theta": Vertical.THETA, "altitude": Vertical.ALTITUDE}[
@@ -373,6 +386,7 @@ def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None
         climb = SPEED * math.sin(commands.theta_c - state.alpha)
         altitude += dt * climb
         pose = pose | {"altitude": altitude, "climb": climb, "theta": commands.theta_c}
-        state, highest = state._replace(theta=commands.theta_c), max(highest, altitude)
+        state = state._replace(theta=commands.theta_c)
+        highest = max(highest, altitude)
     assert highest < 300.1
     assert altitude == approx(300.0, abs=0.5)

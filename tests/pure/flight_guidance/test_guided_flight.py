@@ -147,9 +147,11 @@ def test_small_corner_flown_with_small_bank() -> None:
 
 def test_each_step_follows_from_log_to_last_bit() -> None:
     scenario = calm(8.0, program=program(course=1.0, climb=1.0))
-    signal, section = simulate(scenario)["guidance"], scenario.guidance
+    signal = simulate(scenario)["guidance"]
+    section = scenario.guidance
     assert section is not None
-    params, state = section.params(), None
+    params = section.params()
+    state = None
     for stamp_ns, values in zip(signal.stamp_ns.tolist(), signal.values, strict=True):
         inputs, logged = guidance.restored(
             stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
@@ -179,7 +181,9 @@ def flying(**section: Any) -> Guidance:
 
 def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) -> Signal:
     """The log of steps with y alone; `rates` None: p and q of y follow u_m at once."""
-    stamps, rows, y = [], [], np.zeros(4)
+    stamps = []
+    rows = []
+    y = np.zeros(4)
     for k in range(first, last):
         made.take_y(StampedVector(20 * MS * k, y if rates is None else rates), 20 * MS * k)
         output = made.step(20 * MS * k, 20 * MS * k)
@@ -195,7 +199,8 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     """Dead reckoning levels the wings; later all rates are 0."""
     made = flying(hold=4.0)
     signal = run(made, 1, 300)
-    mode, phi = signal["mode"], signal["state.phi"]
+    mode = signal["mode"]
+    phi = signal["state.phi"]
     assert mode[8] == Mode.ENGAGED  # 0.18 s
     assert mode[10] == Mode.DEAD_RECKONING
     assert abs(math.degrees(phi[200])) < 1.0  # 4 s
@@ -214,7 +219,8 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
 
 @pytest.mark.parametrize("leg", [2.0, 0.5])
 def test_leg_that_route_does_not_have_refused(leg: float) -> None:
-    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
+    made = flying()
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     # a line and the orbit
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     with pytest.raises(
@@ -227,10 +233,8 @@ def test_leg_that_route_does_not_have_refused(leg: float) -> None:
 def test_new_route_voids_legs_of_program() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
-    made, section = (
-        flying(route=route, program=steps),
-        GuidanceConfig.validate_mapping(SECTION, "guidance"),
-    )
+    made = flying(route=route, program=steps)
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     # a line and the orbit
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     signal = run(made, 1, 5)
@@ -241,7 +245,8 @@ def test_new_route_voids_legs_of_program() -> None:
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
 def test_route_waits_for_engagement(by: str) -> None:
     """A route sent while guidance is off is flown from the engagement on."""
-    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
+    made = flying()
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
 
     def switch(*, on: bool) -> None:
         if by == "guidance/engage":

@@ -102,7 +102,9 @@ def test_flare_sinks_as_commanded_and_touches_in_the_time_said(across: Scenario)
     section = section_with(across)
     landing = section.landing_on(section.plan(section.waypoints()))
     assert landing is not None
-    height, elapsed, dt = landing.flare, 0.0, 1e-3
+    height = landing.flare
+    elapsed = 0.0
+    dt = 1e-3
     while height > 0.0:  # Euler's method, without the lag of the flight path
         height += dt * flare_climb(height, 1.25, landing)
         elapsed += dt

@@ -93,7 +93,8 @@ def test_north_and_east_of_tangent_plane(latitude: float, longitude: float) -> N
 
 def test_plane_errs_by_4_m() -> None:
     """At the largest distance the plane is 4 m short of the ground."""
-    lat, lon = 47.4, 8.5 + math.degrees(MAX_DISTANCE / (SEMI_MAJOR * math.cos(math.radians(47.4))))
+    lat = 47.4
+    lon = 8.5 + math.degrees(MAX_DISTANCE / (SEMI_MAJOR * math.cos(math.radians(47.4))))
     on_ground, _ = vdist(47.4, 8.5, lat, lon)
     assert on_ground - math.hypot(*local(lat, lon, ZURICH)) == approx(4.1, abs=0.1)
 

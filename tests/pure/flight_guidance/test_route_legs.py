@@ -96,7 +96,8 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
     """Lengths of the way onto a course to the north at the origin."""
-    at, north = (0.0, 0.0), 0.0
+    at = (0.0, 0.0)
+    north = 0.0
 
     def length(position: path.Point, flown: float) -> float:
         return float(path.joining_length(at, north, side * R, position, flown))
@@ -122,7 +123,8 @@ def test_wind_is_velocity_over_ground_less_through_air() -> None:
 
 
 def test_largest_wind_takes_whole_bank() -> None:
-    bank, wind = math.radians(30.0), 3.0
+    bank = math.radians(30.0)
+    wind = 3.0
     largest = largest_wind(SPEED, wind, bank)
     assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == approx(
         GRAVITY * math.tan(bank)
@@ -164,7 +166,8 @@ class Flown:
         start: path.Point = (0.0, 0.0),
         config: GuidanceConfig = CONFIG,
     ) -> None:
-        self.made, self._k = Guidance(config), 0
+        self.made = Guidance(config)
+        self._k = 0
         self.made.take_route(config.plan([Waypoint(*waypoint) for waypoint in waypoints]))
         self.at(*start)
 
@@ -172,7 +175,8 @@ class Flown:
         self, north: float, east: float, course: float = 0.0, altitude: float = 100.0
     ) -> dict[str, float]:
         """The log of a step at a position, on a course through calm air, rad."""
-        now, v = 20 * MS * self._k, (SPEED * math.cos(course), SPEED * math.sin(course))
+        now = 20 * MS * self._k
+        v = (SPEED * math.cos(course), SPEED * math.sin(course))
         self.made.take_pose(
             StampedVector(now, np.array([0.0, 0.0, course, north, east, altitude, *v, 0.0, 0.0])),
             now,
@@ -180,7 +184,8 @@ class Flown:
         self.made.take_y(StampedVector(now, np.zeros(4)), now)
         output = self.made.step(now, now)
         assert output is not None
-        self._k, self.notices = self._k + 1, output.notices
+        self._k = self._k + 1
+        self.notices = output.notices
         return dict(zip(self.made.names, output.log.tolist(), strict=True))
 
 
@@ -259,7 +264,8 @@ def test_skip_leaves_waypoint_ahead_out() -> None:
         (0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0)
     )
     assert flown.made.skip()
-    log, route = flown.at(100.0, 0.0), flown.made.route
+    log = flown.at(100.0, 0.0)
+    route = flown.made.route
     assert route is not None
     assert log["leg"] == 2.0  # the line after the fillet
     assert log["target.along"] == approx(path.length(route.legs[2]))

@@ -94,7 +94,8 @@ def test_the_scenario_is_stored_unchanged(recorded: Path, osprey_gust: Scenario)
 def test_attachments_and_metadata_are_stored_unchanged(
     tape: Tape, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
+    attached = tmp_path / "airframe.yaml"
+    metadata = tmp_path / "metadata.yaml"
     attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
     metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n")
     write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (attached,), metadata))
@@ -181,13 +182,15 @@ def test_damaged_chunk_left_out_and_all_others_read(
     begin, end = (
         np.array([getattr(chunks[number], f"message_{end}_time")]) for end in ("start", "end")
     )
-    stamps, kept = tape["y"].stamp_ns, back["y"].stamp_ns  # the log times, in one process
+    stamps = tape["y"].stamp_ns
+    kept = back["y"].stamp_ns  # the log times, in one process
     assert set(stamps[(stamps < begin) | (stamps > end)]) <= set(kept)
     assert len(kept) < len(stamps)
 
 
 def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -> None:
-    size, count = 8 << 20, 30
+    size = 8 << 20
+    count = 30
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
         for k in range(count):
@@ -406,7 +409,9 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
 
 def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
     """The content of the first chunk of a log, and the places of its messages."""
-    place, chunk, places = len(MCAP0_MAGIC), b"", list[int]()
+    place = len(MCAP0_MAGIC)
+    chunk = b""
+    places = list[int]()
     while True:
         opcode, length = RECORD.unpack_from(log, place)
         content = log[place + RECORD.size : place + RECORD.size + length]
@@ -513,7 +518,8 @@ def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) 
 def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> None:
     """Values that are not finite, and a name twice."""
     with BagWriter(tmp_path) as bag:
-        channel, only = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/u", JOINT_STATE, "")
+        channel = bag.add_topic("/y", JOINT_STATE, "")
+        only = bag.add_topic("/u", JOINT_STATE, "")
         for k, q in enumerate((1.0, math.nan, 3.0, math.inf)):
             bag.write(channel, k, k, k, vector(k + 1, ("q", "V"), (q, 50.0)))
             bag.write(only, k, k, k, vector(k + 1, ("thrust", "thrust"), (q, 50.0)))
@@ -564,10 +570,8 @@ def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None
     """A bridge publishes y before the reference model starts, and commands count from its start."""
     bag = BagWriter(tmp_path / "run")
     for name, first in (("y", 3), ("y_m", 5)):
-        channel, stamps = (
-            bag.add_topic(f"/{name}", JOINT_STATE, ""),
-            np.arange(first, 9) * NANOSECONDS,
-        )
+        channel = bag.add_topic(f"/{name}", JOINT_STATE, "")
+        stamps = np.arange(first, 9) * NANOSECONDS
         samples = encoded(Samples(("q",), stamps, np.zeros((len(stamps), 1)), "/node#1"))
         for stamp_ns, data in zip(stamps.tolist(), samples, strict=True):
             bag.write(channel, stamp_ns, stamp_ns, 1, data.tobytes())

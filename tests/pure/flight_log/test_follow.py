@@ -91,7 +91,8 @@ def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> 
 def test_logs_without_message_indexes_or_chunks_read(
     options: dict[str, object], tmp_path: Path
 ) -> None:
-    path, sent = tmp_path / "foreign.mcap", [vector(k, ["q"], [k / 7.0]) for k in range(50)]
+    path = tmp_path / "foreign.mcap"
+    sent = [vector(k, ["q"], [k / 7.0]) for k in range(50)]
     writer = Writer(str(path), chunk_size=2000, **options)  # type: ignore[arg-type]
     writer.start(profile="ros2", library="test")
     channel = writer.register_channel(
@@ -100,7 +101,8 @@ def test_logs_without_message_indexes_or_chunks_read(
     for k, data in enumerate(sent):
         writer.add_message(channel, k, data, k)
     writer.finish()  # type: ignore[no-untyped-call]
-    whole, follower = list(Follower(path, all_of).read()), Follower(path, all_of)
+    whole = list(Follower(path, all_of).read())
+    follower = Follower(path, all_of)
     assert [
         data for record in whole if isinstance(record, Messages) for data in record.data
     ] == sent
@@ -225,7 +227,8 @@ def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(
 
 @pytest.mark.parametrize("part", [0.4, 1.0])
 def test_replaced_file_is_not_read_on(part: float, run: Path) -> None:
-    path, content = run / "run_0.mcap", (run / "run_0.mcap").read_bytes()
+    path = run / "run_0.mcap"
+    content = (run / "run_0.mcap").read_bytes()
     path.write_bytes(content[: len(content) // 2])
     follower = Follower(run, all_of)
     assert list(follower.read())

@@ -172,7 +172,8 @@ def test_what_kept_for_end_survives_disk_that_fills_up(
 
 
 def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file, write_all = ReservedFile(tmp_path / "file"), os.write
+    file = ReservedFile(tmp_path / "file")
+    write_all = os.write
     monkeypatch.setattr(os, "write", lambda descriptor, data: write_all(descriptor, data[:3]))
     file.write(b"0123456789")
     assert file.tell() == 10

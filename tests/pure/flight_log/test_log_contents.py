@@ -41,7 +41,8 @@ from flight_log.tape_writer import write_run
 @pytest.fixture(scope="module")
 def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """A flight in one process, read back. Its duration differs from the scenario file's."""
-    scenario, run = osprey_gust.vary(flight={"duration": 0.5}), tmp_path_factory.mktemp("recorded")
+    scenario = osprey_gust.vary(flight={"duration": 0.5})
+    run = tmp_path_factory.mktemp("recorded")
     write_run(simulate(scenario), run, attachments_for(scenario, run))
     return read_run(run)
 
@@ -59,7 +60,8 @@ def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path
 def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) -> LogAttachments:
     node, prefix = (ONE_PROCESS, "recorder:") if one_process else (RECORDER, "")
     overrides: ParameterOverrides = parameter_overrides(node, scenario, run, 0.0, lockstep=True)
-    attach, metadata = overrides[f"{prefix}attach"], overrides[f"{prefix}metadata_file"]
+    attach = overrides[f"{prefix}attach"]
+    metadata = overrides[f"{prefix}metadata_file"]
     assert isinstance(attach, list)
     return LogAttachments(scenario.path, tuple(map(Path, map(str, attach))), Path(str(metadata)))
 
@@ -201,7 +203,8 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
     monkeypatch.setattr(columns, "IN_MEMORY", 1000)
     tape = read_run(tmp_path / "log.mcap").tape
     for name, signal in plain.signals.items():
-        in_file, half_ns = tape[name], int(signal.stamp_ns[len(signal.stamp_ns) // 2])
+        in_file = tape[name]
+        half_ns = int(signal.stamp_ns[len(signal.stamp_ns) // 2])
         assert in_file.values.tobytes("F") == signal.values.tobytes("F")
         assert in_file[signal.names[-1]].tobytes() == signal[signal.names[-1]].tobytes()
         assert in_file.until(half_ns).values.tobytes("F") == signal.until(half_ns).values.tobytes(

@@ -203,10 +203,8 @@ def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
 def test_two_aircraft_are_shown_one_at_time(
     messages: list[Recorded], osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    bag, shorter = (
-        tmp_path / "bag",
-        [message for message in messages if message.log_ns < EPOCH + 1000 * MS],
-    )
+    bag = tmp_path / "bag"
+    shorter = [message for message in messages if message.log_ns < EPOCH + 1000 * MS]
     both = [*in_namespace("/uav1", messages), *in_namespace("/uav2", shorter)]
     write_mcap(bag, sorted(both, key=lambda message: message.log_ns))
     for command in ("report", "replay", "check", "identify"):

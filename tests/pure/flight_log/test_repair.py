@@ -102,7 +102,8 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     file.write_bytes(content)
     assert repair(run).files[0].faults == "1 damaged parts"
-    kept, every = set(messages(run)), set(messages(recorded))
+    kept = set(messages(run))
+    every = set(messages(recorded))
     assert kept < every
     assert all(
         chunk.message_start_time <= stamp_ns <= chunk.message_end_time
@@ -146,8 +147,10 @@ def test_log_without_message_rejected_and_unchanged(size: int, run: Path) -> Non
 
 
 def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, run: Path) -> None:
-    file, generator = run / "run_0.mcap", np.random.default_rng(2)
-    content, repaired = file.read_bytes(), 0
+    file = run / "run_0.mcap"
+    generator = np.random.default_rng(2)
+    content = file.read_bytes()
+    repaired = 0
     data = {(topic, bytes_) for topic, _, bytes_ in messages(recorded)}
     for _ in range(40):
         damaged = bytearray(content)
@@ -168,7 +171,8 @@ def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
     """A folder from elsewhere may hold links: also to nothing, in the place of the copy of the
     damaged file.
     """
-    target, precious = tmp_path / "target", tmp_path / "precious"
+    target = tmp_path / "target"
+    precious = tmp_path / "precious"
     precious.write_bytes(b"mine")
     first = truncate(run, 0.9)
     (run / "run_0.mcap.damaged").symlink_to(target)

@@ -70,8 +70,10 @@ def test_empty_y_is_instant_and_invalid_sample_of_other_signal_is_none() -> None
 
 @given(st.lists(st.booleans(), min_size=80, max_size=80))
 def test_instants_do_not_depend_on_order_of_arrival(order: list[bool]) -> None:
-    flight, found = Arriving(), []
-    y, others = [sample(Y_NS * k) for k in range(21)], [sample(Y_NS * k) for k in range(21)]
+    flight = Arriving()
+    found = []
+    y = [sample(Y_NS * k) for k in range(21)]
+    others = [sample(Y_NS * k) for k in range(21)]
     for of_y in [*order, *[True] * 21, *[False] * 21]:
         if of_y and y:
             flight.y.append(y.pop(0))

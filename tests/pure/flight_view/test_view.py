@@ -61,10 +61,12 @@ def decoded(
 ) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
     """Head of an answer, and times (N,) and values (N, k) of its topics."""
     (size,) = struct.unpack_from("<I", content)
-    head, place = json.loads(content[4 : 4 + size]), 4 + size
+    head = json.loads(content[4 : 4 + size])
+    place = 4 + size
     columns = {}
     for topic in head["topics"]:
-        count, k = topic["count"], len(topic["channels"])
+        count = topic["count"]
+        k = len(topic["channels"])
         t = np.frombuffer(content, "<f8", count, place)
         place += 8 * count
         columns[topic["name"]] = (
@@ -118,8 +120,10 @@ def test_page_gets_ticks_of_flight_to_value(recorded: Path, tape: Tape) -> None:
 
 @pytest.mark.parametrize("piece", [1009, 30_000])
 def test_followed_flight_equals_replayed_flight(piece: int, recorded: Path, tmp_path: Path) -> None:
-    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
-    live, late = Flight(tmp_path), Flight(recorded)
+    content = (recorded / "run_0.mcap").read_bytes()
+    path = tmp_path / "run_0.mcap"
+    live = Flight(tmp_path)
+    late = Flight(recorded)
     late.update()
     for start in range(0, len(content), piece):
         with path.open("ab") as stream:
@@ -149,7 +153,8 @@ def test_description_holds_scenario(recorded: Path) -> None:
 
 
 def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Path) -> None:
-    now, path = 0.0, tmp_path / "run_0.mcap"
+    now = 0.0
+    path = tmp_path / "run_0.mcap"
     flight = Flight(tmp_path, now=lambda: now)
     flight.update()
     assert flight.state() == "waiting"
@@ -173,7 +178,8 @@ def test_long_logs_read_in_slices(
 ) -> None:
     """A short backlog counts as live."""
     monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
-    flight, slices = Flight(recorded), 0
+    flight = Flight(recorded)
+    slices = 0
     while flight.update(budget=0.0):
         slices += 1
         assert flight.state() in {state, "ended"} or not flight.samples
@@ -199,10 +205,8 @@ def test_long_flight_becomes_coarser_in_place() -> None:
     """A flight of any length needs no large temporary arrays."""
     # 12 MB: tracemalloc counts what threads of other tests allocate meanwhile, up to 1 MB
     rows, channels = (100_000, 30)
-    samples, values = (
-        Series(tuple(map(str, range(channels))), max_rows=rows),
-        np.random.default_rng(1).normal(size=(rows, channels)),
-    )
+    samples = Series(tuple(map(str, range(channels))), max_rows=rows)
+    values = np.random.default_rng(1).normal(size=(rows, channels))
     samples.append(np.arange(rows), values)
     tracemalloc.start()
     samples.append(np.arange(rows, rows + 4), values[:4])
@@ -292,10 +296,8 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
 
 
 def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
-    scenario, points = (
-        find_scenario("osprey_route"),
-        [(0.0, 0.0, 50.0), (600.0, 0.0, 55.0), (600.0, 400.0, 55.0)],
-    )
+    scenario = find_scenario("osprey_route")
+    points = [(0.0, 0.0, 50.0), (600.0, 0.0, 55.0), (600.0, 400.0, 55.0)]
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(scenario.path), 0)
         route, other = (bag.add_topic(name, ROUTE_TYPE, "") for name in ("/route", "/other/route"))
@@ -531,7 +533,8 @@ async def test_browser_waits_for_next_samples(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A browser that knows all rows gets the next samples as the answer."""
-    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    content = (recorded / "run_0.mcap").read_bytes()
+    path = tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
 
     async with serving(tmp_path) as server:
@@ -766,7 +769,8 @@ def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> Non
     before = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh"] if ignored else []
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*before, *command("watch", recorded, "--port", 0)], **pipes) as process:  # type: ignore[call-overload]
-        address, tunnel = process.stdout.readline(), process.stdout.readline()
+        address = process.stdout.readline()
+        tunnel = process.stdout.readline()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/#token=[\w-]{20,}\n", address)
         port = address.split(":")[2].partition("/")[0]
         assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel

@@ -120,7 +120,8 @@ async def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
     """A gain beyond the range is refused, an unknown name, and a value that is no number."""
     k_g = gains_of(osprey_gust.controller)["k_g"]
 
-    digest, before = (await desk.ask("state"))["digest"], dict(desk.nodes.values["controller"])
+    digest = (await desk.ask("state"))["digest"]
+    before = dict(desk.nodes.values["controller"])
     for values, expected in (
         ({"k_g": [2.1 * k_g]}, f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}"),
         ({"k_g": [-1.0]}, "k_g: found -1, expected"),
@@ -246,7 +247,8 @@ def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> No
 
 
 async def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
-    begun, end = threading.Event(), threading.Event()
+    begun = threading.Event()
+    end = threading.Event()
 
     def assess(scenario: Scenario, params: ControllerConfig) -> dict[str, Any]:
         begun.set()
@@ -357,7 +359,8 @@ async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
 async def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
     server = Server([desk.flight], TOKEN, desk.control)
     server.listen(0)
-    port, state = server.port, {"do": "state"}
+    port = server.port
+    state = {"do": "state"}
     try:
         for body, headers, expected in (
             (state, {TOKEN_HEADER: ""}, 401),

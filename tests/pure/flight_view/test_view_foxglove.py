@@ -40,7 +40,8 @@ def command(*words: object) -> list[str]:
 def test_viewer_gets_messages_of_log_with_definitions(
     recorded: Path, tape: Tape, tmp_path: Path
 ) -> None:
-    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    content = (recorded / "run_0.mcap").read_bytes()
+    path = tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
     rest = BytesIO(content[len(content) // 2 :])
 

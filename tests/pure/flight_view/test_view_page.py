@@ -133,7 +133,8 @@ def test_keys_step_ticks_and_play(browser: Browser, recorded: Path, tape: Tape) 
 
 
 def test_recording_flight_followed_to_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
-    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    content = (recorded / "run_0.mcap").read_bytes()
+    path = tmp_path / "run_0.mcap"
     with serving(tmp_path) as address:
         browser.open(address)
         browser.wait_for(f"{STATE} === 'WAITING'")
@@ -213,7 +214,9 @@ def test_attitude_drawn_with_right_signs(page: Browser) -> None:
 def test_rotation_is_euler_sequence_of_textbook(page: Browser) -> None:
     # Stevens, Lewis, Aircraft Control and Simulation, eq. (1.3-20), here as a product of plane
     # rotations.
-    phi, theta, psi = 0.7, -0.4, 2.1
+    phi = 0.7
+    theta = -0.4
+    psi = 2.1
 
     def plane(i: int, j: int, angle: float) -> Any:
         matrix = np.eye(3)
@@ -364,7 +367,8 @@ SAID = """(() => {
 def test_desk_has_parts_of_nodes_that_run(
     browser: Browser, recorded: Path, osprey_gust: Scenario
 ) -> None:
-    nodes, controls = NodesInMemory(osprey_gust, "controller"), list[Control]()
+    nodes = NodesInMemory(osprey_gust, "controller")
+    controls = list[Control]()
 
     with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
         take(browser)

@@ -71,7 +71,8 @@ def texts(browser: Browser, canvas: str) -> list[str]:
 def test_nothing_is_off_the_screen(
     browser: Browser, routed: Path, route: Scenario, width: int
 ) -> None:
-    nodes, controls = NodesInMemory(route, "aircraft", "controller", "guidance"), list[Control]()
+    nodes = NodesInMemory(route, "aircraft", "controller", "guidance")
+    controls = list[Control]()
     wide(browser, width)
     with shown(browser, routed, control=lambda flight: a_control(flight, nodes, controls)):
         take(browser)
@@ -95,7 +96,8 @@ def test_nothing_is_off_the_screen(
 def test_header_holds_flies_home_and_deactivates(
     browser: Browser, routed: Path, route: Scenario
 ) -> None:
-    nodes, controls = NodesInMemory(route, "controller", "guidance"), list[Control]()
+    nodes = NodesInMemory(route, "controller", "guidance")
+    controls = list[Control]()
     with shown(browser, routed, control=lambda flight: a_control(flight, nodes, controls)):
         assert browser.run("document.getElementById('pilot').hidden")
         take(browser)
@@ -111,7 +113,8 @@ def test_header_holds_flies_home_and_deactivates(
 def test_click_on_the_map_sends_a_target_in_half_a_second(
     browser: Browser, routed: Path, route: Scenario
 ) -> None:
-    nodes, controls = NodesInMemory(route, "guidance"), list[Control]()
+    nodes = NodesInMemory(route, "guidance")
+    controls = list[Control]()
     assert route.guidance is not None
     with shown(browser, routed, control=lambda flight: a_control(flight, nodes, controls)):
         take(browser)

@@ -68,14 +68,17 @@ def test_command_acts_from_step_after_it_and_no_earlier() -> None:
 
 
 def test_bank_is_dead_reckoned_by_y_m_that_was_published_where_samples_skipped() -> None:
-    model, bank, flown = reference(speed=25.0), math.radians(20.0), 0
+    model = reference(speed=25.0)
+    bank = math.radians(20.0)
+    flown = 0
     model.take(0, np.array([0.0, 0.0, 0.35, 0.0]), np.array([bank, 0.0]))
     p = model.sample(0)[2]
     # Of the 0.3 s after sample 90 the reference rolls back without a y_m: the law tracks the roll
     # rate of before.
     for number in [*range(1, 91), *range(150, 2000)]:
         bank += (number - flown) / RATE * p
-        p, flown = model.sample(number)[2], number
+        p = model.sample(number)[2]
+        flown = number
     # of an aircraft that tracks; 6 deg by the rates of the skipped samples
     assert abs(math.degrees(bank)) < 1.0
 
@@ -140,13 +143,14 @@ def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) ->
     varied = scenario.vary(
         reference_model={"live": {"speed": speed}, "pulses": {}, "coordinated_turn": None}
     )
-    aircraft, model, controller = (
-        Simulator(varied.aircraft),
-        Reference(varied.reference_model),
-        Controller(varied.controller),
-    )
-    names, u, attitude = varied.reference_model.outputs, np.zeros(4), np.zeros(len(POSE))
-    level, history = 0.0, []
+    aircraft = Simulator(varied.aircraft)
+    model = Reference(varied.reference_model)
+    controller = Controller(varied.controller)
+    names = varied.reference_model.outputs
+    u = np.zeros(4)
+    attitude = np.zeros(len(POSE))
+    level = 0.0
+    history = []
     for t_ns in range(0, int(duration * 1e9) + 1, min(aircraft.period_ns, model.period_ns)):
         t = t_ns / 1e9
         if t_ns % aircraft.period_ns == 0:

@@ -71,7 +71,8 @@ def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatA
 @pytest.mark.equation(2)
 def test_equation_2_agrees_with_exact_linear_simulation() -> None:
     params = parameters(pulses=PULSES)
-    matrices, profile = params.model(), params.profile()
+    matrices = params.model()
+    profile = params.profile()
     t = np.arange(0, 3001) * 0.002
     u_m = command(t, profile)  # piecewise linear with knots on the grid: lsim is exact for it
     _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)  # type: ignore[call-overload]
@@ -80,7 +81,9 @@ def test_equation_2_agrees_with_exact_linear_simulation() -> None:
 
 def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     params = parameters(pulses=PULSES)
-    matrices, profile, dt = params.model(), params.profile(), 0.05
+    matrices = params.model()
+    profile = params.profile()
+    dt = 0.05
     x_m = np.linspace(-0.2, 0.3, 6)
 
     def x_dot(t: float, x: FloatArray, _: None, params: model.Model) -> FloatArray:
@@ -96,7 +99,8 @@ def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
 
 def test_general_form_and_second_order_form_are_same_model() -> None:
     same = parameters().model()
-    A_m, B_m = same.A_m.ravel().tolist(), same.B_m.ravel().tolist()
+    A_m = same.A_m.ravel().tolist()
+    B_m = same.B_m.ravel().tolist()
     linear = {"states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"], "A_m": A_m, "B_m": B_m}
     for general_matrix, matrix in zip(
         parameters(second_order=None, linear=linear).model(), same, strict=True

@@ -37,7 +37,8 @@ def demands(
     seed: int, count: int, size: float, rate: float = np.inf
 ) -> list[tuple[Allocation, FloatArray]]:
     """Demands of `size` times the v of an effector position inside the stops."""
-    generator, pairs = np.random.default_rng(seed), []
+    generator = np.random.default_rng(seed)
+    pairs = []
     for _ in range(count):
         m = int(generator.integers(2, 5))
         params = drawn(generator, m, int(generator.integers(m, 9)), rate)
@@ -232,7 +233,8 @@ def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(
 
 def test_a_map_with_a_wrong_sign_contradicts_the_effect_of_an_effector() -> None:
     """The D of the law is I for any sign of an effector, so `effect` tells the sign."""
-    channel_map, frame = named_map("ardupilot"), load_airframe("osprey")
+    channel_map = named_map("ardupilot")
+    frame = load_airframe("osprey")
     assert not check_scenario(
         channel_map, find_scenario("osprey_servo").vary(controller=mixed()), frame, None
     ).contradictions

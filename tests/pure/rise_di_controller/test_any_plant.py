@@ -67,7 +67,8 @@ def random_task(n: int, m: int, seed: int) -> Task:
     """Random task of relative degree one, C B = S D U. The aircraft and its zero dynamics have at
     least MIN_DAMPING.
     """
-    m, rng = min(m, n - 1), np.random.default_rng(seed)  # n > m
+    m = min(m, n - 1)
+    rng = np.random.default_rng(seed)  # n > m
     directions = np.linalg.qr(rng.standard_normal((m, m)))[0]
     S = directions * rng.uniform(0.5, 2.0, m) @ directions.T
     D = rng.choice([-1.0, 1.0], m)
@@ -93,7 +94,9 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
     """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0, by
     finite differences.
     """
-    aircraft, rotation, dt = task.aircraft, task.rotation, 0.01
+    aircraft = task.aircraft
+    rotation = task.rotation
+    dt = 0.01
     m = len(task.D)
 
     def x_free(t: float, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +107,8 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
         rate: FloatArray = rotation[:, m:].T @ x_free(t, z)[1]
         return rate
 
-    z, v = np.zeros(len(rotation) - m), []
+    z = np.zeros(len(rotation) - m)
+    v = []
     Omega = aircraft.C @ aircraft.B * scale
     for k in range(round(DURATION / dt)):
         v.append(
@@ -133,7 +137,9 @@ def gains(task: Task, sign: Sign) -> LawParams:
     V = np.abs(task.D[:, None] * U * task.D)
     zeta = np.abs(slew_of_the_ideal_control(task, scale) @ (task.D[:, None] * U).T).max(axis=0)
     K_min = 10.0
-    K, k_d, beta = np.full(m, K_min), np.zeros(m), np.zeros(m)
+    K = np.full(m, K_min)
+    k_d = np.zeros(m)
+    beta = np.zeros(m)
     for i in reversed(range(m)):
         beta[i] = 1.5 * zeta[i] + V[i, i + 1 :] @ beta[i + 1 :]
         k_d[i] = 1.0 + (m - 1) * V[i, i + 1 :] ** 2 @ K[i + 1 :] if i < m - 1 else 0.0
@@ -188,7 +194,8 @@ def test_the_ultimate_bound_falls_with_dt(
     sign: Sign, largest: float, low: float, high: float, task: Task
 ) -> None:
     law = gains(task, sign)
-    coarse, fine = ultimate_bound(task, law, DT), ultimate_bound(task, law, DT / 2)
+    coarse = ultimate_bound(task, law, DT)
+    fine = ultimate_bound(task, law, DT / 2)
     assert coarse < largest
     assert low < coarse / fine < high
 
@@ -201,11 +208,9 @@ def test_error_decreases_from_engagement_to_ultimate_bound(task: Task) -> None:
     # often the ultimate bound, and 0.006 after 5 s.
     errors = np.abs(fly(task, gains(task, Sign.IMPLICIT), DT)).max(axis=1)
     second = round(1.0 / DT)
-    first, third, settled = (
-        errors[:second].max(),
-        errors[2 * second : 3 * second].max(),
-        errors[5 * second :].max(),
-    )
+    first = errors[:second].max()
+    third = errors[2 * second : 3 * second].max()
+    settled = errors[5 * second :].max()
     assert third < 0.02 * first
     assert settled < 0.02 * first
 

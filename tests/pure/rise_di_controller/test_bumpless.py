@@ -47,7 +47,8 @@ class Loop:
     def __init__(self, **changes: Any) -> None:
         self._scenario = SCENARIO.vary(controller=changes)
         self._controller = Controller(self._scenario.controller)
-        self._now_ns, self._last_ns = nanoseconds(1.0), 0
+        self._now_ns = nanoseconds(1.0)
+        self._last_ns = 0
         self._active, self._has_y, self._has_y_m, self._offset = True, True, True, 0.0
         self._u, self._u_ns, self._e, self._beyond = np.zeros(4), 0, np.zeros(4), np.zeros(4)
         # of the present failsafe: the largest abs(u), and the time to trim, s
@@ -87,7 +88,8 @@ class Loop:
 
     def receive(self, *, y: bool = True, y_m: bool = True) -> None:
         """Receive the samples of these topics from now on."""
-        self._has_y, self._has_y_m = y, y_m
+        self._has_y = y
+        self._has_y_m = y_m
 
     def replace_publisher(self) -> None:
         """Another publisher of y, whose sensors differ."""
@@ -140,7 +142,8 @@ class Loop:
         assert (du <= allowed + EXACT).all(), (
             f"{before.name} -> {self.mode.name}: u moves by {du}, above {allowed}"
         )
-        self._u, self._u_ns = output.u, now_ns
+        self._u = output.u
+        self._u_ns = now_ns
 
     def _step_of_the_law(self, logged: Mapping[str, float]) -> FloatArray:
         """The largest change of u in a tick of dt, e_p the error one tick ago; 0 at an engagement,
@@ -150,19 +153,16 @@ class Loop:
         the limits kept back one tick ago; but at most SLEW dt. SLEW dt where u is outside of new
         limits.
         """
-        law, limits = (
-            self._scenario.rise_di().law_params(),
-            self._scenario.controller.guard().limits,
-        )
-        e_p, self._e = (
-            self._e,
-            np.array([logged[f"e.{name}"] for name in SCENARIO.controller.outputs]),
-        )
+        law = self._scenario.rise_di().law_params()
+        limits = self._scenario.controller.guard().limits
+        e_p = self._e
+        self._e = np.array([logged[f"e.{name}"] for name in SCENARIO.controller.outputs])
         u, u_free = (
             np.array([logged[f"{key}.{name}"] for name in SCENARIO.controller.inputs])
             for key in ("u", "u_free")
         )
-        beyond, self._beyond = self._beyond, np.abs(u_free - u)
+        beyond = self._beyond
+        self._beyond = np.abs(u_free - u)
         self._dt = dt = logged["dt"]
         change = self._e - e_p + law.Lambda * dt * (self._e + e_p) / 2.0
         step = law.input_scale * (law.K * np.abs(change) + dt * law.beta) + beyond
@@ -329,7 +329,8 @@ def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
     periods of the ramp.
     """
     loop = engaged()
-    before, guard = loop.u, SCENARIO.controller.guard()
+    before = loop.u
+    guard = SCENARIO.controller.guard()
     aircraft = AppliedInput(4, guard.max_age_ns + guard.hold_ns, guard.ramp_ns)
     aircraft.take(before, 0, transfer=False)
     loop.overrun(duration)
@@ -399,7 +400,8 @@ class Engagement:
         self._received_t = self._t
 
     def _check_sent(self, now_ns: int) -> None:
-        rows, phase = list(self._map.inputs.values()), self.bridge.phase
+        rows = list(self._map.inputs.values())
+        phase = self.bridge.phase
         assert self.bridge.sends("joy", now_ns) == (phase is not Phase.DISENGAGED)
         raw = self.bridge.raw()
         if phase is not Phase.ENGAGED:
@@ -419,10 +421,8 @@ class Engagement:
         allowed = self._map.engage_within * np.where(u > 0.0, upper, -lower) + RATE * TICK
         du = u
         if self._sent is not None:
-            du, allowed = (
-                u - self._sent[0],
-                np.full(len(rows), RATE * (self._received_t - self._sent[1])),
-            )
+            du = u - self._sent[0]
+            allowed = np.full(len(rows), RATE * (self._received_t - self._sent[1]))
         assert (np.abs(du) <= allowed + EXACT).all(), (
             f"u sent to the autopilot moves by {du}, above {allowed}"
         )

@@ -28,7 +28,8 @@ def test_divergence_is_three_times_the_error_before(
     errors: tuple[float, float], expected: bool
 ) -> None:
     now, largest = (np.array([value**2, 0.0]) for value in errors)
-    state, least = divergence.Errors(now, largest), divergence.least(("q", "V"))
+    state = divergence.Errors(now, largest)
+    least = divergence.least(("q", "V"))
     assert divergence.diverging(state, least, np.array([True, True])).tolist() == [expected, False]
     assert not divergence.diverging(
         state, least, np.array([False, True])

@@ -89,17 +89,16 @@ def fly(
     New parameters are taken between two ticks by `guard.retune`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
-    aircraft, state, old = (
-        plant.initial_state(hardware),
-        guard.initial_state(4),
-        conditions(0).parameters.tuned_law(),
-    )
+    aircraft = plant.initial_state(hardware)
+    state = guard.initial_state(4)
+    old = conditions(0).parameters.tuned_law()
     aircraft = aircraft if x_0 is None else aircraft._replace(x=x_0)
     y: StampedVector | None = None
     samples: list[StampedVector] = []
     records = []
     for k, reference in enumerate(references() if y_m is None else y_m):
-        now_ns, now = k * PERIOD_NS, conditions(k)
+        now_ns = k * PERIOD_NS
+        now = conditions(k)
         if k > 0:
             aircraft = plant.advance(
                 now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware
@@ -107,7 +106,8 @@ def fly(
         measured = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
         y = StampedVector(now_ns, measured) if now.y else y
         samples = [*samples[-15:], StampedVector(now_ns, reference)] if now.y_m else samples
-        before, law = state, now.parameters.tuned_law()
+        before = state
+        law = now.parameters.tuned_law()
         if now.parameters != conditions(max(k - 1, 0)).parameters:
             state = guard.retune(state, old, law)
         state, inputs = guard.tick(
@@ -135,7 +135,9 @@ def step_of_the_law(tick: Tick) -> FloatArray:
     """
     assert tick.before.law is not None
     assert tick.after.law is not None
-    law, e, e_p = tick.new, tick.after.law.e, tick.before.law.e
+    law = tick.new
+    e = tick.after.law.e
+    e_p = tick.before.law.e
     # The literal sign uses Pi before its update, so the last increment before a change of the gains
     # is still pending.
     beta = np.maximum(tick.old.beta, law.beta)
@@ -230,7 +232,8 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
 
 def gains(rng: np.random.Generator, sign: str) -> ControllerConfig:
     """The scenario's gains, each times a random factor between 0.6 and 1.4."""
-    section, changes = SERVO.rise_di(), {}
+    section = SERVO.rise_di()
+    changes = {}
     for key in ("k_d", "Lambda", "beta"):
         values = np.array(getattr(section, key))
         changes[key] = (values * rng.uniform(0.6, 1.4, len(values))).tolist()
@@ -241,7 +244,8 @@ def gains(rng: np.random.Generator, sign: str) -> ControllerConfig:
 
 @pytest.mark.parametrize("sign", ["soft", "implicit", "literal"])
 def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
-    changes, rng = instants(3), np.random.default_rng(13)
+    changes = instants(3)
+    rng = np.random.default_rng(13)
     sets = [SERVO.vary(controller={"sign": sign}).controller, *(gains(rng, sign) for _ in changes)]
     records = fly(
         lambda k: Conditions(parameters=sets[int(np.searchsorted(changes, k, side="right"))])
@@ -249,7 +253,8 @@ def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
     assert engagements(records) == []
     without = []
     for k in changes:
-        tick, before = records[k], records[k - 1].after.law
+        tick = records[k]
+        before = records[k - 1].after.law
         assert before is not None
         u = control(before, before, tick.old)
         retuned = retune(before, tick.old, tick.new)
@@ -303,7 +308,8 @@ def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
     # 26; peak of elevator, aileron, rudder, thrust: 0.25, 0.15, 3.1 deg, 32 %, without 1.9, 2.4,
     # 6.5 deg, 50 % (its limit). The prototype, possibly with another initial state: 4 to 12 %,
     # without 16 to 51 %; 0.39, 0.70, 2.2 deg, 34 %.
-    overshoot, peak = {}, {}
+    overshoot = {}
+    peak = {}
     for latched in (True, False):
         e, u = upset(latched=latched)
         overshoot[latched] = -(e / e[0]).min(axis=0)
@@ -316,7 +322,8 @@ def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
 def test_error_goes_to_zero_with_and_without_latching() -> None:
     # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a
     # hundredth is left.
-    e, without = upset(latched=True)[0], upset(latched=False)[0]
+    e = upset(latched=True)[0]
+    without = upset(latched=False)[0]
     assert int(np.argmax(np.abs(e[:, 0]) < 0.05 * e[0, 0])) in range(15, 30)
     assert (np.abs(e[-1]) < 0.01 * np.abs(e[0])).all()
     assert (np.abs(without[-1]) < 0.01 * np.abs(without[0])).all()

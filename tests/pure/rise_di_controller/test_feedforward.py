@@ -93,7 +93,10 @@ def largest_error(params: ControllerConfig) -> float:
     """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of
     a tenth of a period.
     """
-    limits, law, state, x = params.guard(), params.tuned_law(), guard.initial_state(2), np.zeros(4)
+    limits = params.guard()
+    law = params.tuned_law()
+    state = guard.initial_state(2)
+    x = np.zeros(4)
     samples: list[StampedVector] = []
     errors = []
 
@@ -101,7 +104,8 @@ def largest_error(params: ControllerConfig) -> float:
         return np.asarray(np.array(A) @ x + np.array(GRAVITY) @ np.sin(x) + np.array(B) @ u)
 
     for k in range(round(6.0 * params.rate)):
-        now_ns, t = k * limits.period_ns, k / params.rate
+        now_ns = k * limits.period_ns
+        t = k / params.rate
         samples = [*samples[-2:], StampedVector(now_ns, reference(t))]
         state, _ = guard.tick(state, now_ns, StampedVector(now_ns, x[:2]), samples, limits, law)
         errors.append(np.abs(x[:2] - reference(t)).max())
@@ -158,7 +162,8 @@ def test_on_nominal_plant_feedforward_alone_leaves_sampling_error() -> None:
     # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3, the
     # error of the linear extrapolation, which is of second order in the period: 3.5 to 4.5 differs
     # from first order (2) and third order (8).
-    coarse, fine = largest_error(small_aircraft(100.0)), largest_error(small_aircraft(200.0))
+    coarse = largest_error(small_aircraft(100.0))
+    fine = largest_error(small_aircraft(200.0))
     assert coarse < 2e-3
     assert 3.5 < coarse / fine < 4.5
     assert largest_error(small_aircraft().model_copy(update={"feedforward": None})) > 0.5
@@ -199,15 +204,16 @@ def ticks(
     """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received
     in `missing`.
     """
-    state, states = guard.initial_state(2), []
-    y_now, y_m_samples = StampedVector(0, np.zeros(2)), [StampedVector(0, np.zeros(2))]
+    state = guard.initial_state(2)
+    states = []
+    y_now = StampedVector(0, np.zeros(2))
+    y_m_samples = [StampedVector(0, np.zeros(2))]
     for k in range(50, 150):
-        t, now_ns = k / 100, k * 10 * MS
+        t = k / 100
+        now_ns = k * 10 * MS
         if not missing[0] < t < missing[1]:
-            y_now, y_m_samples = (
-                StampedVector(now_ns, y(t)),
-                [*y_m_samples[-2:], StampedVector(now_ns, reference(t))],
-            )
+            y_now = StampedVector(now_ns, y(t))
+            y_m_samples = [*y_m_samples[-2:], StampedVector(now_ns, reference(t))]
         state, _ = guard.tick(state, now_ns, y_now, y_m_samples, params.guard(), params.tuned_law())
         states.append(state)
     return states

@@ -165,7 +165,8 @@ def test_measured_dt_clipped_between_fifth_and_ten_periods(gap_ms: int, dt_ms: i
 
 
 def test_a_repeated_sample_changes_nothing() -> None:
-    y, y_m = sample(10, 1.0), [sample(10)]
+    y = sample(10, 1.0)
+    y_m = [sample(10)]
     states = run((0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (20, y, y_m))
     assert states[2].u is states[1].u
     assert states[2].law is states[1].law
@@ -176,7 +177,8 @@ def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
     u.
     """
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
-    y, y_m = sample(10, 1.1), [sample(10)]
+    y = sample(10, 1.1)
+    y_m = [sample(10)]
     states = run(
         (0, sample(0, 1.0), [sample(0)]),
         (10, y, y_m),
@@ -258,7 +260,8 @@ STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
 def test_anti_windup_leaves_unsaturated_law(sign: Sign, state: LawState, y: FloatArray) -> None:
     """Without saturation the law is the same to the last bit."""
     law = TWO._replace(sign=sign)
-    zero, dt = np.zeros(2), np.array(0.01)
+    zero = np.zeros(2)
+    dt = np.array(0.01)
     after, u = step(state, y, zero, dt, law)
     limited_state, u_free, limited = step_with_anti_windup(
         state, y, zero, dt, zero, u, law, limits_of(np.inf)
@@ -282,7 +285,8 @@ def test_saturation_leaves_input_inside_limits(
 
 def test_saturation_moves_to_new_limits_at_rate() -> None:
     """Without a limit of the rate u is inside at once."""
-    u, before = np.array([5.0, -5.0]), np.array([3.0, -3.0])
+    u = np.array([5.0, -5.0])
+    before = np.array([3.0, -3.0])
     for rate, limited in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):
         assert saturate(u, before, np.array(0.01), limits_of(1.0, rate)).tolist() == limited
 
@@ -293,7 +297,8 @@ def test_integrals_stop_only_in_direction_that_worsens_saturation(
     limited_in: str, state: LawState, y: FloatArray, trim: FloatArray
 ) -> None:
     limits = limits_of(1.0) if limited_in == "magnitude" else limits_of(np.inf, 10.0)
-    zero, dt = np.zeros(2), np.array(0.01)
+    zero = np.zeros(2)
+    dt = np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
     limited_state, _, _ = step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
     beyond = trim + u - saturate(trim + u, zero, dt, limits)
@@ -324,7 +329,8 @@ def test_new_gains_transfer_without_a_bump(
         beta=TWO.beta * 2,
     )
     retuned = retune(state, TWO, new)
-    before, after = control(state, state, TWO), control(retuned, retuned, new)
+    before = control(state, state, TWO)
+    after = control(retuned, retuned, new)
     # u is a sum of terms of this size, each rounded once or twice
     size = np.abs(new.input_scale) * (
         new.K * (np.abs(state.e - state.e_0) + new.Lambda * np.abs(state.integral_e))

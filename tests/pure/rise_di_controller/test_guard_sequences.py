@@ -124,13 +124,12 @@ class Sequence(RuleBasedStateMachine):
 
     def _check_failsafe(self, before: guard.ControllerState) -> None:
         if before.mode is Mode.ENGAGED or (before.mode is Mode.INACTIVE) == self.active:
-            self.begin_ns, self.begin_u, self.hold = (
-                self.now_ns,
-                before.u,
-                CONFIG.hold if self.active else 0.0,
-            )
+            self.begin_ns = self.now_ns
+            self.begin_u = before.u
+            self.hold = CONFIG.hold if self.active else 0.0
         if not self.active and self.guard.deactivation_holds:
-            expected, mode = self.begin_u, Mode.INACTIVE
+            expected = self.begin_u
+            mode = Mode.INACTIVE
         else:
             expected, mode = self._expected(seconds(self.now_ns - self.begin_ns) - self.hold)
         assert self.state.mode is mode

@@ -122,17 +122,17 @@ def test_channels_do_not_mix(e: list[float]) -> None:
 
 def test_a_step_changes_none_of_its_arguments() -> None:
     state = LawState(*(np.array([value]) for value in (1.0, 2.0, 3.0, 4.0)))
-    y, y_m, params = np.array([1.5]), np.array([0.5]), one_channel(Sign.IMPLICIT)
+    y = np.array([1.5])
+    y_m = np.array([0.5])
+    params = one_channel(Sign.IMPLICIT)
     step(state, y, y_m, np.array(DT), params)
     arguments: tuple[FloatArray, ...] = (*state, y, y_m)
     assert [float(value[0]) for value in arguments] == [1.0, 2.0, 3.0, 4.0, 1.5, 0.5]
 
 
 def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() -> None:
-    old, new = (
-        one_channel(Sign.LITERAL, D=-1.0),
-        one_channel(Sign.LITERAL, D=1.0)._replace(K=np.array([5.0])),
-    )
+    old = one_channel(Sign.LITERAL, D=-1.0)
+    new = one_channel(Sign.LITERAL, D=1.0)._replace(K=np.array([5.0]))
     state, _ = step(
         engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old
     )

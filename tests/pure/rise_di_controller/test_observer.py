@@ -19,7 +19,8 @@ from rise_di_controller.observer import (
 )
 from rise_di_controller.saturation import Limits
 
-DT, TRIM = np.float64(0.1), 10.0
+DT = np.float64(0.1)
+TRIM = 10.0
 TRIM_LAW: Any = ControlLaw(
     state=tuple,
     engage=lambda measured, params: (),
@@ -81,16 +82,19 @@ def test_contribution_keeps_its_limits_of_size_and_rate() -> None:
 
 
 def test_missed_tick_predicts_with_the_u_that_was_held() -> None:
-    law, observer = with_observer(TRIM_LAW), params()
+    law = with_observer(TRIM_LAW)
+    observer = params()
     state = law.engage(measured(1.0), observer)
     # z+ = 0.5 1 + 2 (10.5 - 10) = 1.5
     assert law.missed(state, measured(0.0, u_before=10.5), observer).z == approx([1.5], abs=1e-15)
 
 
 def test_filter_over_the_record_is_that_of_each_tick() -> None:
-    law, slow = with_observer(TRIM_LAW), params()
+    law = with_observer(TRIM_LAW)
+    slow = params()
     fast = slow._replace(Phi=0.6 * slow.Phi, Gamma=2.0 * slow.Gamma)
-    filters, record = [slow] * 40 + [fast] * 3 + [slow, fast] * 2, []
+    filters = [slow] * 40 + [fast] * 3 + [slow, fast] * 2
+    record = []
     state = law.engage(measured(1.0), slow)
     for e, of_tick in zip(np.sin(np.arange(47.0)), filters, strict=True):
         state, u = law.step(state, measured(e), DT, of_tick)
@@ -115,7 +119,8 @@ def test_new_observer_without_record_starts_from_error_and_trim_keeps_contributi
     """As after the first tick: u stays 10.7, the estimate begins as at engagement, z = H'e =
     0.5.
     """
-    law, old = with_observer(TRIM_LAW), params()
+    law = with_observer(TRIM_LAW)
+    old = params()
     state = initial_state(1)._replace(
         law=ObserverState((), vector(0.4), vector(0.7), vector(1.0)),
         y=StampedVector(0, vector(7.5)),

@@ -195,7 +195,8 @@ class Loop:
         """
         p = self.p
         shown = np.linalg.pinv(p.C) @ p.C
-        x_dot, x_m_dot = self.x_dot(t), self.x_m_dot(t)
+        x_dot = self.x_dot(t)
+        x_m_dot = self.x_m_dot(t)
         x_mo_dot = shown @ x_m_dot
         steady = p.C @ p.A @ (x_mo_dot + x_dot - shown @ x_dot) + p.C @ self.f_dot(t)
         N_d = self.M @ (steady - p.C @ p.A_m @ x_mo_dot - p.C @ p.B_m @ p.u_m_dot(t))
@@ -216,7 +217,8 @@ class Loop:
 
     def V1(self, t: float) -> float:
         """Equation (31)."""
-        e, r = self.e(t), self.r(t)
+        e = self.e(t)
+        r = self.r(t)
         return float(e @ e + r @ self.M @ r) / 2.0
 
 
@@ -375,10 +377,12 @@ def test_27_bounds_Phi() -> None:
 @pytest.mark.equation(32)
 def test_V1_dot_of_32_has_gain_22(loop: Loop) -> None:
     """The gain (22) gives three squares in V1_dot of (32)."""
-    k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
+    k_g = 1.0
+    k_d = np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
-        e, r = loop.e(t), loop.r(t)
+        e = loop.e(t)
+        r = loop.r(t)
         uncertain = r @ (N_d + N_tilde + term - loop.switched(t) - loop.coupled(t))
         V1_dot = -e @ (loop.p.Lambda * e) - r @ r - k_g * r @ r - k_d @ r**2 + uncertain
         assert close(V1_dot, e @ loop.e_dot(t) + r @ loop.M @ loop.r_dot(t), EXACT)
@@ -526,7 +530,8 @@ def lemma_1_ratio(T: float) -> float:
     """
     ds = (T * T - 1.0) / round(8 * T * T)
     s = np.arange(1.0 + ds / 2.0, T * T, ds)
-    e, e_dot = np.sin(s) / np.sqrt(s), 2.0 * np.cos(s) - np.sin(s) / s
+    e = np.sin(s) / np.sqrt(s)
+    e_dot = 2.0 * np.cos(s) - np.sin(s) / s
     weight = 1.0 / np.sqrt(s)  # dt = ds / (2 t)
     return float(np.sum(np.abs(e_dot) * weight) / np.sum(np.abs(e) * weight))
 
@@ -566,7 +571,8 @@ def replayed(
     f is periodic, with f(t + half a period) = -f(t) up to a constant, which sets e_dot(0) = f(0):
     the law engages with u = 0.
     """
-    half, f = cycle.t[-1], cumulative_trapezoid(cycle.f_dot, cycle.t, initial=0)
+    half = cycle.t[-1]
+    f = cumulative_trapezoid(cycle.f_dot, cycle.t, initial=0)
     ticks = dt * (np.arange(round(4.0 / dt)) + 0.5)
     wave = np.interp(ticks % half, cycle.t, f - f[-1] / 2.0) * np.where(
         ticks % (2.0 * half) < half, 1.0, -1.0
@@ -574,7 +580,8 @@ def replayed(
     f_of_t = acts * (wave + f[-1] / 2.0 + e_dot_0)
     params = law_params(counterexample.K, counterexample.LAMBDA, cycle.beta)
     y = u = np.zeros(1)
-    state, e = engage(y, 0.0 * y), []
+    state = engage(y, 0.0 * y)
+    e = []
     for f_now in f_of_t:
         y = y + dt * (u + f_now)
         state, u = step(state, y, 0.0 * y, np.array(dt), params)
@@ -610,7 +617,8 @@ def test_same_f_allows_convergence() -> None:
     # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from
     # every start. At beta = 20 the cycle attracts so weakly that the sampling of 0.2 ms takes the
     # law off it.
-    cycle, weak = counterexample.limit_cycle(2.0), counterexample.limit_cycle(20.0)
+    cycle = counterexample.limit_cycle(2.0)
+    weak = counterexample.limit_cycle(20.0)
     assert replayed(cycle, 0.0) < 1e-3 * np.max(cycle.e)
     assert replayed(weak, weak.e_dot[0]) < 1e-3 * np.max(weak.e)
 
@@ -722,7 +730,8 @@ def gravity_slope(q: float) -> float:
     """The V part of f_dot in level flight at the pitch rate q: the difference of f over 1 us of
     theta_dot = q.
     """
-    aircraft, x = osprey(), np.zeros(8)
+    aircraft = osprey()
+    x = np.zeros(8)
     x[THETA] = 1e-6 * q
     return float(dynamics.f(0.0, x, aircraft)[V] / 1e-6)
 
@@ -751,7 +760,8 @@ def test_bound_7_fails_in_gust() -> None:
     # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u
     # <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)
-    C, B = aircraft.C, aircraft.B
+    C = aircraft.C
+    B = aircraft.B
     held = np.eye(8) - B @ np.linalg.solve(C @ B, C)
 
     def x_dot(t: float, x: FloatArray) -> FloatArray:
@@ -766,7 +776,8 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds, by second
     differences.
     """
-    one, zero = np.ones((1, 1)), np.zeros(1)
+    one = np.ones((1, 1))
+    zero = np.zeros(1)
     climb = Profile(0.0 * one, one, np.array(rise), zero, zero + 1.0, zero, zero, zero)
     dt = rise / 5.0
     y_m = reference_outputs(model, climb, dt, round(0.5 / dt))

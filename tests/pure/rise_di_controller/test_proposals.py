@@ -108,7 +108,8 @@ def test_part_that_is_learned_later_gets_its_feedforward() -> None:
     lateral = RiseDiConfig.validate_mapping(
         whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral"
     )
-    flight, acting = Flight(), []
+    flight = Flight()
+    acting = []
     for model in (lateral, whole):
         flight.receive(designed(START, model))
         flight.step()

@@ -44,7 +44,9 @@ def flown(
     """The u after each tick, (T, m), the modes, and why samples are lost. None: no sample of y
     comes; y_m is always 0.
     """
-    u, modes, lost = [], [], []
+    u = []
+    modes = []
+    lost = []
     for k, value in enumerate(y, first):
         now_ns = k * PERIOD_NS
         if value is not None:
@@ -73,7 +75,8 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(
     """To the bit. Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3
     rad/s and 30 m/s are above.
     """
-    config, unit = OBSERVER if observed else SERVO, np.array([1.0, 1.0, 1.0, 10.0])
+    config = OBSERVER if observed else SERVO
+    unit = np.array([1.0, 1.0, 1.0, 10.0])
     y = noisy(SPIKE + 60)
     y[SPIKE, channel] += size * unit[channel]
     u, modes, lost = flown(Controller(config), y)
@@ -88,7 +91,8 @@ def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> Non
     """2000 deg/s, the range of a gyro, and the speed of sound: of y and of y_m, so that the law
     never engages with more.
     """
-    controller, unit = Controller(SERVO), np.eye(4)[channel]
+    controller = Controller(SERVO)
+    unit = np.eye(4)[channel]
     for take in (controller.take_y, controller.take_y_m):
         sentence = take(StampedVector(0, 1.001 * bound * unit), 0)
         name = SERVO.outputs[channel]
@@ -223,7 +227,8 @@ def test_state_that_is_not_finite_begins_again() -> None:
 
 
 def test_loop_warns_of_a_lost_sample_and_of_a_new_engagement() -> None:
-    loop, zero = rise_di.Loop(SERVO), np.zeros(4)
+    loop = rise_di.Loop(SERVO)
+    zero = np.zeros(4)
     for k in range(SPIKE):
         loop.step(k / 100.0, y=zero, y_m=zero)
     with pytest.warns(
@@ -298,8 +303,11 @@ def test_u_is_a_number_within_its_limits_whatever_comes(
 ) -> None:
     """Each law behind the controller, and behind the guard alone, which has no bounds of y."""
     config = LAWS[name].model_copy(update=LIMITS | (MODELS if observed else {}))
-    controller, law, limits = Controller(config), config.tuned_law(), config.guard()
-    state, now_ns = guard.initial_state(4), 0
+    controller = Controller(config)
+    law = config.tuned_law()
+    limits = config.guard()
+    state = guard.initial_state(4)
+    now_ns = 0
     for k, (y, y_m, periods) in enumerate(rows):
         # zeros engage between what comes
         ready = np.zeros((2, 4)) if k % 3 == 0 else np.array([y, y_m])

@@ -102,7 +102,8 @@ def test_aileron_recovery_after_a_saturated_roll_command(
     # "recovered" is the time until e stays within 5 % of the pulse. Without anti-windup the error
     # is nine times as large and lasts three times as long.
     tape = aileron_flight(guarded=guarded)
-    e, t = error(tape)["p"], tape.time("truth")
+    e = error(tape)["p"]
+    t = tape.time("truth")
     assert wrong_way[0] <= e[t > P_END].max() <= wrong_way[1]
     assert recovered[0] <= last_beyond(t, e, 0.03) - P_END <= recovered[1]
     assert commanded[0] <= np.abs(tape["internals"]["u_free.aileron"]).max() / DEG <= commanded[1]

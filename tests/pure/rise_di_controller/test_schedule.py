@@ -88,7 +88,8 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
         state, u = control_law.step(
             state, Measurements(y, zero, zero, zero, zero), np.float64(0.01), params
         )
-    instant, at_once = np.float64(1e-9), params._replace(time=np.float64(1e-9))
+    instant = np.float64(1e-9)
+    at_once = params._replace(time=np.float64(1e-9))
     y[3] += FASTER
     # the reference moved too: the same error
     moved = Measurements(y, y_at(FASTER), zero, zero, zero)
@@ -131,10 +132,8 @@ def test_model_of_trim_beside_schedule_refused(name: str) -> None:
 
 def test_schedule_of_airspeed_alone_refused() -> None:
     """The factor of channel V is 1: nothing would follow the schedule."""
-    values, alone = (
-        flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump(),
-        C172P.controller.outputs.index("V"),
-    )
+    values = flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump()
+    alone = C172P.controller.outputs.index("V")
     for key in (
         "outputs",
         "inputs",

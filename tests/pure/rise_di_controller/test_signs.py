@@ -67,7 +67,8 @@ def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
     """A sign change in the airframe and in D gives the same flight to the last bit."""
     original = CALM_SERVO.vary(flight={"duration": 4.0})
     changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
-    nose_up, nose_down = simulate(original), simulate(changed)
+    nose_up = simulate(original)
+    nose_down = simulate(changed)
     assert nose_down["y"].values.tobytes() == nose_up["y"].values.tobytes()
     assert (nose_down["u"]["elevator"] == -nose_up["u"]["elevator"]).all()
     assert np.abs(nose_up["u"]["elevator"]).max() > 0.0
@@ -79,7 +80,8 @@ def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
     # the prototype: 2.38 s. It grows further, by a factor of e each 0.08 s: 34.9 rad/s, where the
     # aircraft is lost, 0.08 ln 34.9 = 0.28 s later.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
-    t, e = tape.time("truth"), error(tape)["q"]
+    t = tape.time("truth")
+    e = error(tape)["q"]
     assert np.abs(e[t < 2.0]).max() < 1e-3
     assert first(t, e, 1.0) == pytest.approx(2.38, abs=0.05)
     assert tape.outcome.startswith("diverged at t = ")

@@ -118,8 +118,10 @@ def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(
 
 
 def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) -> None:
-    zero, V = np.zeros(4), np.array([0.0, 0.0, 0.0, (FASTER - 1.0) * 25.0])
-    rng, outputs = np.random.default_rng(1), []
+    zero = np.zeros(4)
+    V = np.array([0.0, 0.0, 0.0, (FASTER - 1.0) * 25.0])
+    rng = np.random.default_rng(1)
+    outputs = []
     errors = rng.normal(size=(20, 4)) * np.array([0.01, 0.01, 0.01, 0.0])
     for controller in (scheduled, scheduled.at_speed(FASTER)):
         law, params = controller.tuned_law()
@@ -151,7 +153,9 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
 @pytest.mark.parametrize("key", ["B", "F"])
 def test_other_models_at_another_speed_leave_u_as_it_is(scheduled: RiseDiConfig, key: str) -> None:
     """At 1.2 of the trim speed; with B the feedforward starts again, with F the observer."""
-    values, loop, u = scheduled.model_dump(), rise_di.Loop(scheduled), []
+    values = scheduled.model_dump()
+    loop = rise_di.Loop(scheduled)
+    u = []
     values["schedule"]["fast"][key] = [0.8 * value for value in values["schedule"]["fast"][key]]
     for number in range(301):
         t = 0.01 * number
@@ -315,7 +319,9 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
     ):
         made.take(stamp_ns, y, u, 0)
     made.propose(0)
-    found, true, file = made.identification, scenario.aircraft.sampled_airframe(), OSPREY.matrix_b()
+    found = made.identification
+    true = scenario.aircraft.sampled_airframe()
+    file = OSPREY.matrix_b()
     assert found is not None
     # the seconds of the climb in speed are left out
     assert 12.0 < len(found.recorded.t) * 0.01 < 18.5

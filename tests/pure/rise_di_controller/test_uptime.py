@@ -21,8 +21,10 @@ def flown(scenario: str, start: int) -> tuple[list[FloatArray], list[FloatArray]
     on.
     """
     parameters = find_scenario(scenario).controller
-    controller, period = Controller(parameters), nanoseconds(1.0 / parameters.rate)
-    u, internals = [], []
+    controller = Controller(parameters)
+    period = nanoseconds(1.0 / parameters.rate)
+    u = []
+    internals = []
     for k in range(200):
         t_ns = nanoseconds(start) + k * period
         if not 80 <= k < 100:  # longer than the age limit

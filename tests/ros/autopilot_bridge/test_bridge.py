@@ -271,12 +271,15 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     (engagement,) = summary["engagements"]
     assert engagement["reason"] == "disengaged by request"
     tape = read_run(run).tape
-    mode, t = tape["internals"]["mode"], tape.time("internals")
-    delay, flies = host_delays.since(begin), t[mode == Mode.ENGAGED]
+    mode = tape["internals"]["mode"]
+    t = tape.time("internals")
+    delay = host_delays.since(begin)
+    flies = t[mode == Mode.ENGAGED]
     # the timeout of an activation, reported when it has answered
     assert abs(engagement["start"] - flies[0]) < 1.0 + delay
     assert engagement["stop"] - 0.1 - delay < flies[-1] < engagement["stop"] + LATE + delay
-    u, t_u = tape["u"].values, tape.time("u")
+    u = tape["u"].values
+    t_u = tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
     assert (t_u > engagement["stop"] + 2.0).any()
     assert not u[t_u > engagement["stop"] + 2.0].any()
@@ -313,7 +316,8 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     assert found["inputs"] == ["aileron"]
     channels = {name: np.squeeze(values) for name, values in found["channels"].items()}
     airframe = load_airframe("osprey")
-    p, aileron = list(airframe.states).index("p"), list(airframe.inputs).index("aileron")
+    p = list(airframe.states).index("p")
+    aileron = list(airframe.inputs).index("aileron")
     s = 0.5j / (channels["lag"] + channels["delay"])  # where a loop by the rules crosses 1
     # lag of slow_autopilot.yaml
     true = airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)

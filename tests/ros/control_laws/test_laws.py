@@ -38,10 +38,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder into which pip installs a copy of the example; pip leaves build artefacts beside
     the source.
     """
-    copy, target = (
-        tmp_path_factory.mktemp("source") / "pid_law",
-        tmp_path_factory.mktemp("installed"),
-    )
+    copy = tmp_path_factory.mktemp("source") / "pid_law"
+    target = tmp_path_factory.mktemp("installed")
     shutil.copytree(
         EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
     )
@@ -101,7 +99,8 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     for payload in map(payloads, runs[1:]):
         for topic in TOPICS:
             assert first[topic] == payload[topic], topic
-    tape, recorded = simulate(load_scenario(scenario)), read_run(runs[0]).tape
+    tape = simulate(load_scenario(scenario))
+    recorded = read_run(runs[0]).tape
     assert tape["u"].values.any(axis=0).all()
     require_equal_bits(recorded, tape)
     replay = invoke("replay", runs[0])

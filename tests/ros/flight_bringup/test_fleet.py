@@ -28,12 +28,14 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
     fleet = read_fleet(file)
     for flown in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
         assert flown.outcome == "completed"
-        recorded, alone = read_run(flown.run), simulate(flown.member.scenario)
+        recorded = read_run(flown.run)
+        alone = simulate(flown.member.scenario)
         assert {
             topic.split("/")[1] for topic in recorded.topics if topic.endswith(("/y", "/u"))
         } == {flown.member.name}
         for name in ("y", "y_m", "u_m", "u", "pose"):
-            of_log, of_simulation = recorded.tape[name], alone[name]
+            of_log = recorded.tape[name]
+            of_simulation = alone[name]
             assert len(of_log.stamp_ns) > 20
             assert of_log.stamp_ns.tobytes() == of_simulation.stamp_ns.tobytes()
             values = np.column_stack([of_log[channel] for channel in of_simulation.names])

@@ -131,7 +131,8 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
     start: Start, start_node: Start, osprey_gust: Scenario, tmp_path: Path, peer_node: Peer
 ) -> None:
     """In a flight in real time with a learner and a probe, and in one in lockstep without."""
-    policy, learning = allowed(), str(find_scenario("osprey_learn").path)
+    policy = allowed()
+    learning = str(find_scenario("osprey_learn").path)
     processes = [
         start_node(package, "-p", "start_time:=-1.0")
         for package in ("reference_model", "aircraft_sim")

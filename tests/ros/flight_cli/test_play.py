@@ -106,7 +106,8 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
     start: Start, tmp_path: Path, domain: int, peer_node: Peer
 ) -> None:
     """A type that is not installed, a name that no topic of ROS may have, and JSON, beside a y."""
-    y, log = serialize_message(to_message(1, ("q",), np.zeros(1), "peer")), tmp_path / "mixed.mcap"
+    y = serialize_message(to_message(1, ("q",), np.zeros(1), "peer"))
+    log = tmp_path / "mixed.mcap"
     with log.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
@@ -158,7 +159,8 @@ def test_controller_reproduces_flight_to_byte(
     )
     flight.succeed(120)
     recorded = tmp_path / "latest"
-    u, internals = of(recorded, "u"), of(recorded, "internals")
+    u = of(recorded, "u")
+    internals = of(recorded, "internals")
     receiving = Receiver(peer_node.node, U, INTERNALS)
     start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0").wait_for(
         "ready"

@@ -51,7 +51,9 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
             }
         },
     )
-    chosen, events, lines = written(guided, tmp_path / "learn.yaml"), list[Event](), list[str]()
+    chosen = written(guided, tmp_path / "learn.yaml")
+    events = list[Event]()
+    lines = list[str]()
     run = tmp_path / "run"
     flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
     assert flown == "completed"

@@ -37,7 +37,8 @@ from flight_view.control_client import ControlClient
 PEER_TOPICS = ("u_m", "guidance", "target")
 ORIGIN = [47.38, 8.54, 400.0]  # deg, m above WGS84
 PATIENT = ("-p", "max_age:=1000.0")  # a delay of the host makes no sample stale
-ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+ENU_OF_NED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+FLU_OF_FRD = np.diag([1, -1, -1])
 LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
@@ -141,7 +142,8 @@ class Flight:
 
     def send(self) -> None:
         """One y, one pose and one sample of internals, stamped now."""
-        now_ns, pose = time.time_ns(), np.array([LEVEL.get(name, 0.0) for name in POSE])
+        now_ns = time.time_ns()
+        pose = np.array([LEVEL.get(name, 0.0) for name in POSE])
         # a pose that stands still is refused
         pose[POSE.index("v_east")] = self.rng.normal(0.0, 0.01)
         self.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), "/aircraft#1"))

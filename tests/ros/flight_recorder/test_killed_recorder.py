@@ -64,7 +64,8 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(
     missing = []
     following = recorder("run0")
     for k in range(8):
-        process, folder = following, tmp_path / f"run{k}"
+        process = following
+        folder = tmp_path / f"run{k}"
         process.wait_for_log(folder, 50_000)
         # at first the recorder receives the history of 2 s that the publishers keep
         until(partial(is_up_to_date, folder, witness), "a log up to the newest samples")

@@ -205,7 +205,8 @@ def test_lost_messages_are_counted_and_reported(
 ) -> None:
     process = recorder("run")
     process.wait_for("ready")
-    names, sent = [f"x.{k}" for k in range(100)], 0
+    names = [f"x.{k}" for k in range(100)]
+    sent = 0
     publisher = peer_node.node.create_publisher(JointState, "truth", PUBLISH)
     peer_node.until(
         lambda: publisher.get_subscription_count() == 1, "the subscription of the recorder"

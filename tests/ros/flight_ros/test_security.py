@@ -69,7 +69,8 @@ class Hosts(NamedTuple):
 
 def is_separate(holder: subprocess.Popen[bytes]) -> bool:
     """Whether the process has left this network namespace, or has ended."""
-    own, other = Path("/proc/self/ns/net"), Path(f"/proc/{holder.pid}/ns/net")
+    own = Path("/proc/self/ns/net")
+    other = Path(f"/proc/{holder.pid}/ns/net")
     return holder.poll() is not None or other.readlink() != own.readlink()
 
 

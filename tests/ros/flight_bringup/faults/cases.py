@@ -459,7 +459,8 @@ BadSample = tuple[float, Names, FloatArray]
 
 
 def not_finite(values: tuple[float, ...], names: Names, random: Generator) -> BadSample:
-    value, bad = random.choice(values), random.uniform(-1.0, 1.0, len(names))
+    value = random.choice(values)
+    bad = random.uniform(-1.0, 1.0, len(names))
     bad[random.integers(len(names))] = value
     return 0.0, names, bad
 
@@ -505,7 +506,8 @@ def malformed(topic: str, kind: str) -> Injection:
     make, reason, sentence = BAD[kind]
 
     def inject(flight: Flight, random: Generator) -> None:
-        consumer, key = CONSUMERS[topic], f"refused {topic}: {reason}"
+        consumer = CONSUMERS[topic]
+        key = f"refused {topic}: {reason}"
         with relay(topic) as publish:
             until_refusal_logged_again(flight, topic, sentence)
             before = flight.count(consumer, key)

@@ -141,7 +141,8 @@ class Flights:
     """The flight under test, of one kind or another. One runs at a time."""
 
     def __init__(self, folder: Path, scenarios: Mapping[Kind, Scenario]) -> None:
-        self._folder, self._scenarios = folder, scenarios
+        self._folder = folder
+        self._scenarios = scenarios
         self._running: dict[Kind, Flight] = {}
         self.all: list[Flight] = []  # including those that have ended
 

@@ -90,7 +90,8 @@ ROLES = {
     Kind.LEARNING: (*FOUR, "learner"),
     Kind.BRIDGED: ("recorder", "controller", "reference_model", "autopilot", "bridge"),
 }
-OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
+OUTPUTS = ("q", "p", "r", "V")
+INPUTS = ("elevator", "aileron", "rudder", "thrust")
 ROSOUT = Topic("/rosout", Log)
 # of the aircraft in a guided flight: a gate relays it as `pose`
 TRUE_POSE = Topic("true_pose", POSE.type)
@@ -298,7 +299,8 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     sections = {
         key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()
     }
-    aircraft, reference = sections["aircraft"], sections["reference_model"]
+    aircraft = sections["aircraft"]
+    reference = sections["reference_model"]
     # Noise would hide a change of u, and a probe finds u in the positions of ideal actuators.
     for disturbance in ("gusts", "turbulence", "wind", "sensors", "actuators"):
         aircraft.pop(disturbance, None)
@@ -360,7 +362,8 @@ class Flight:
     """The processes of a kind of flight, and a probe. Instants are seconds of the system clock."""
 
     def __init__(self, folder: Path, source: Path, kind: Kind, clock: Path | None = None) -> None:
-        self.folder, self.kind = folder, kind
+        self.folder = folder
+        self.kind = kind
         self._clock = clock  # a library that gives the processes a system clock that can be set
         self._step = folder / "clock"
         self._step.write_bytes(bytes(8))
@@ -535,7 +538,8 @@ class Flight:
         """The engaged ticks with samples from `begin` on, from the log, which is complete; None
         before it reaches `until`.
         """
-        decoder, found = Decoder(self._tick_channels), []
+        decoder = Decoder(self._tick_channels)
+        found = []
         for topic, record in logged(self.runs[-1]):
             sample = self._decode(decoder, record.data) if topic == "/internals" else None
             if sample is not None and seconds(sample.stamp_ns) >= begin - MAX_AGE:
@@ -766,7 +770,8 @@ class Flight:
         try:
             self.until(self.is_steady, timeout, "engaged and tracking again")
         except AssertionError as error:
-            ticks, delay = self.ticks(time.time() - 2.0), self.host_delay(begin, time.time())
+            ticks = self.ticks(time.time() - 2.0)
+            delay = self.host_delay(begin, time.time())
             e = np.abs(ticks.e).max(axis=0, initial=0.0)
             ended = [
                 f"\n{role}: {process.output}"

@@ -87,7 +87,9 @@ def storm(topic: str, rate: float, duration: float, seed: int) -> None:
     values = np.random.default_rng(seed).uniform(-1.0, 1.0, (1000, 4))
     encoder = Encoder(NAMES[topic], "/foreign")
     with matched_publisher(topic) as publisher:
-        ticker, sent, begin = Ticker(BURST_NS, time.monotonic_ns()), 0, time.monotonic()
+        ticker = Ticker(BURST_NS, time.monotonic_ns())
+        sent = 0
+        begin = time.monotonic()
         while time.monotonic() - begin < duration:
             if (pause := ticker.remaining()) > 0:
                 time.sleep(pause)
@@ -118,8 +120,10 @@ def gate(source: str, target: str) -> None:
     node = Node("gate")
     subscription = PolledSubscription(node, Topic(source, Y.type), PUBLISH, raw=True)
     publisher = node.create_publisher(Y.type, target, PUBLISH)
-    waiter, decoder = WaitSet([subscription.entity], node.context), NamedDecoder()
-    fault, last = ["pass"], b""
+    waiter = WaitSet([subscription.entity], node.context)
+    decoder = NamedDecoder()
+    fault = ["pass"]
+    last = b""
 
     def read() -> None:
         for line in sys.stdin:
@@ -160,7 +164,9 @@ def clients(address: str, count: int, duration: float) -> None:
         f"GET /data/0 HTTP/1.1\r\nHost: {parts.netloc}\r\nX-Page-Token: {token}\r\n\r\n".encode()
     )
     print(f"begins at {time.time():.6f}", flush=True)
-    until, sent, opened = time.monotonic() + duration, 0, 0
+    until = time.monotonic() + duration
+    sent = 0
+    opened = 0
     connections: list[socket.socket] = []
     while opened < count or time.monotonic() < until:
         if opened < count:

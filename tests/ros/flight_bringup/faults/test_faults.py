@@ -128,7 +128,8 @@ def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> Non
 
 def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
     """All `internals` of some logs, and all log lines with their nodes."""
-    internals, lines = set(), set()
+    internals = set()
+    lines = set()
     for topic, record in (message for run in runs for message in logged(run)):
         if topic == "/internals":
             internals.add(record.data)
@@ -217,7 +218,8 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
         assert np.abs(applied).max() <= max(USUAL, np.abs(ticks.u).max())
     quiet = window.host_delay <= QUIET
     if quiet:  # else the failsafe of the aircraft may have moved u
-        low, high = before.u.min(axis=0), before.u.max(axis=0)
+        low = before.u.min(axis=0)
+        high = before.u.max(axis=0)
         assert (applied >= low - MOVES / 10).all()
         assert (applied <= high + MOVES / 10).all()
     # The probe subscribes with best effort: in a storm its socket drops samples that the flight's
@@ -265,8 +267,10 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
         Mode.RAMP,
         Mode.TRIM,
     ], ticks.modes
-    mode, u = ticks.mode, ticks.u
-    held, ramp = u[mode == Mode.HOLD], u[mode == Mode.RAMP]
+    mode = ticks.mode
+    u = ticks.u
+    held = u[mode == Mode.HOLD]
+    ramp = u[mode == Mode.RAMP]
     assert (held == held[0]).all()
     assert np.abs(held[0]).max() > 1e-4  # u = 0 would prove nothing
     stale = ticks.t[mode == Mode.HOLD][0]
@@ -291,7 +295,8 @@ def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
     if window.host_delay > QUIET:
         assert (applied == 0.0).all(axis=1).any()
         return
-    scale, after = applied @ before / (before @ before), t - flight.begin
+    scale = applied @ before / (before @ before)
+    after = t - flight.begin
     assert (
         np.abs(scale[(after > 0.05) & (after < U_MAX_AGE + HOLD - 0.02)] - 1.0).max(initial=0.0)
         <= EXACT
@@ -345,7 +350,8 @@ def check_released(case: Case, flight: Flight, window: Window) -> None:
 
 
 # of the ending of u_m, at any time and after LEVEL
-MAX_BANK, MAX_LEVEL_BANK = (np.radians(45.0), np.radians(5.0))
+MAX_BANK = np.radians(45.0)
+MAX_LEVEL_BANK = np.radians(5.0)
 
 
 def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:

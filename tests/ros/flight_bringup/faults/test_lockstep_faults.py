@@ -48,11 +48,9 @@ def test_random_faults_of_lockstep_flights(
     failed = []
     for seed in lockstep_seeds:
         random = np.random.default_rng(seed)
-        role, kills, busy = (
-            random.choice(list(MODULES)),
-            random.random() < 0.5,
-            random.random() < 0.5,
-        )
+        role = random.choice(list(MODULES))
+        kills = random.random() < 0.5
+        busy = random.random() < 0.5
         name = (
             f"{role} {'killed' if kills else 'stopped'} in "
             f"lockstep{' on a busy host' if busy else ''}"
