@@ -4,7 +4,7 @@
 many models side by side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -448,7 +448,12 @@ class Block(NamedTuple):
 
     def named(self, airframe: Airframe) -> Names:
         """The names of the indices."""
-        every = (airframe.states, airframe.inputs, airframe.outputs, airframe.gusts)
+        every: tuple[Iterable[str], ...] = (
+            airframe.states,
+            airframe.inputs,
+            airframe.outputs,
+            airframe.gusts,
+        )
         parts = (
             tuple(np.array(list(names), dtype=object)[places].tolist())
             for names, places in zip(every, self, strict=True)
