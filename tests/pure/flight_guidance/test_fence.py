@@ -643,9 +643,10 @@ def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -
         "guidance.home: found a turn from home onto the orbit that is 76 m outside of the fence, "
         "expected at least 12 m inside; with home 292 m inside every turn fits"
     )
-    GuidanceConfig.validate_mapping(square(295.0), "guidance")
-    with refusing("with home 417 m inside every turn fits"):
+    GuidanceConfig.validate_mapping(square(292.0), "guidance")
+    with refusing("with home 423 m inside every turn fits"):
         GuidanceConfig.validate_mapping(square(310.0, 10.0), "guidance")
+    GuidanceConfig.validate_mapping(square(423.0, 10.0), "guidance")
 
 
 def test_turn_onto_the_orbit_that_fits_to_one_side_is_enough() -> None:

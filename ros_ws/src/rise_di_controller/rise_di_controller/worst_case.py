@@ -253,6 +253,7 @@ def _figures(margins: Margins) -> FloatArray:
     )
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # an input without feedback has no crossing: L = 0
 def _slopes(
     plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, whole: UncertainLoop, d: FloatArray
 ) -> FloatArray:
@@ -284,9 +285,8 @@ def _slopes(
     x = S_at[np.arange(4 * m), rows, rows][:, None]
     a = -own / (x * (1.0 - x))
     b = np.concatenate([phase_rate, gain_rate, np.ones(2 * m)])[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):  # b of a loop without a crossing
-        phase = a.imag - b.imag * a.real / b.real
-        gain = a.real - b.real * a.imag / b.imag
+    phase = a.imag - b.imag * a.real / b.real
+    gain = a.real - b.real * a.imag / b.imag
     loop_at = 1.0 / x - 1.0
     peak = -(own * np.conj(x - np.repeat([0.0, 0.0, 0.0, 0.5], m)[:, None])).real
     kinds = np.repeat([0, 1, 2, 2], m)[:, None]
