@@ -4,9 +4,10 @@
 simulator.py 0` in lockstep.
 """
 
+import signal
 import sys
 import time
-from contextlib import suppress
+from threading import Event
 
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -44,23 +45,26 @@ clock_publisher = node.create_publisher(Clock, "/clock", KEPT)
 y_publisher = node.create_publisher(JointState, "y", KEPT)
 node.create_subscription(JointState, "u", lambda message: received.update(u=message), KEPT)
 t, due = 0, time.monotonic()
-with suppress(KeyboardInterrupt):
-    while True:
-        clock = Clock()
-        clock.clock.sec, clock.clock.nanosec = divmod(t, SECOND)
-        if t % SAMPLE == 0:
-            # the servos take the u of the last sample
-            u = dict(zip(received["u"].name, received["u"].position, strict=True))
-            sample = JointState(name=list(y), position=list(y.values()))
-            sample.header.stamp = clock.clock
-            y_publisher.publish(sample)  # before the clock: a node then finds y at its tick
-        clock_publisher.publish(clock)
-        # a pause is not caught up with
-        due = max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0
-        rclpy.spin_once(node, timeout_sec=0.0)
-        # lockstep: u answers this y
-        while time.monotonic() < due or (not speed and t % SAMPLE == 0 and answered() < t):
-            rclpy.spin_once(node, timeout_sec=0.0005)
-        for output, (name, effect) in EFFECTS.items():
-            y[output] += STEP / SECOND * (effect * u.get(name, 0.0) - DAMPING * y[output])
-        t += STEP
+# an exception of a signal may arise inside of rclpy, which then reports another one
+ended = Event()
+signal.signal(signal.SIGINT, lambda *_: ended.set())
+while not ended.is_set():
+    clock = Clock()
+    clock.clock.sec, clock.clock.nanosec = divmod(t, SECOND)
+    if t % SAMPLE == 0:
+        # the servos take the u of the last sample
+        u = dict(zip(received["u"].name, received["u"].position, strict=True))
+        sample = JointState(name=list(y), position=list(y.values()))
+        sample.header.stamp = clock.clock
+        y_publisher.publish(sample)  # before the clock: a node then finds y at its tick
+    clock_publisher.publish(clock)
+    # a pause is not caught up with
+    due = max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0
+    rclpy.spin_once(node, timeout_sec=0.0)
+    # lockstep: u answers this y
+    waits = not speed and t % SAMPLE == 0
+    while not ended.is_set() and (time.monotonic() < due or (waits and answered() < t)):
+        rclpy.spin_once(node, timeout_sec=0.0005)
+    for output, (name, effect) in EFFECTS.items():
+        y[output] += STEP / SECOND * (effect * u.get(name, 0.0) - DAMPING * y[output])
+    t += STEP
