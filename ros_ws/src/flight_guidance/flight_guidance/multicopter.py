@@ -70,7 +70,7 @@ class Wanted(NamedTuple):
     to_go: float = 0.0  # m
 
 
-def _own(params: GuidanceParams) -> MulticopterParams:
+def _gains(params: GuidanceParams) -> MulticopterParams:
     assert params.multicopter is not None  # noqa: S101 - `guidance.step` has looked
     return params.multicopter
 
@@ -81,9 +81,9 @@ def hold(
     """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead, with the heading and the
     altitude of now.
     """
-    stop = _stop(pose, _own(params))
-    there = {"north": stop.real, "east": stop.imag}
-    return there | {"heading": pose["psi"], "altitude": pose["altitude"]}
+    stop = _stop(pose, _gains(params))
+    place = {"north": stop.real, "east": stop.imag}
+    return place | {"heading": pose["psi"], "altitude": pose["altitude"]}
 
 
 def _velocity(pose: Mapping[str, float]) -> complex:
@@ -98,10 +98,10 @@ def _parts(vector: complex) -> tuple[float, float]:
     return vector.real, vector.imag
 
 
-def _stop(pose: Mapping[str, float], own: MulticopterParams) -> complex:
+def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
     """Where the aircraft stops, m."""
     v = _velocity(pose)
-    return _place(pose) + (own.lead + abs(v) / (2.0 * own.braking)) * v
+    return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v
 
 
 def step(
@@ -122,7 +122,7 @@ def step(
 
     a_ff and v_ff are those of the path `lead` ahead, for the tilt comes later by as much.
     """
-    own = _own(params)
+    gains = _gains(params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
     state = _begin(state, inputs, pose, params)
     dt = seconds(inputs.t_ns - state.t_ns)
@@ -132,13 +132,13 @@ def step(
     state, escape = _within_fence(state, pose, params)
     flies = state.mode is Mode.ENGAGED
     speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
-    state = state._replace(V_c=slewed(state.V_c, speed, own.braking, dt))
+    state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
     wanted = _wanted(state, pose, route, escape, params)
     if flies and state.lateral is not Lateral.PHI:
         state = state._replace(V_c=min(state.V_c, abs(wanted.velocity)))
     phi_c, theta_c, limited = _attitude_for(state, pose, wanted, params)
     state, climb_limited = _with_climb(state, pose, dt, params)
-    rates = _rates(state, phi_c, theta_c, own)
+    rates = _rates(state, phi_c, theta_c, gains)
     name = vertical(params.outputs)
     values = rates | {name: VERTICAL[name] * state.climb_c}
     u_m = tuple(
@@ -176,7 +176,7 @@ def _begin(
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
-    own = _own(params)
+    gains = _gains(params)
     held = GuidanceState(
         inputs.t_ns - params.period_ns,
         Mode.ENGAGED,
@@ -193,16 +193,16 @@ def _begin(
         V_c=abs(_velocity(pose)),
         u_m=(0.0,) * len(params.outputs),
         psi=pose["psi"],
-        wind=_parts(_velocity(pose) - _by_tilt(pose, pose, own) / own.drag),
+        wind=_parts(_velocity(pose) - _by_tilt(pose, pose, gains) / gains.drag),
         velocity=_parts(_velocity(pose)),
     )
     if state is None or inputs.begin is Begin.HOLD:
         return held
-    kept = {
+    unchanged = {
         name: getattr(state, name)
         for name in ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "wind")
     }
-    again = held._replace(**kept)
+    again = held._replace(**unchanged)
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
 
@@ -323,11 +323,11 @@ def _within_fence(
     fence = params.fence
     if fence is None or state.mode is not Mode.ENGAGED:
         return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
-    here = (np.float64(pose["north"]), np.float64(pose["east"]))
+    position = (np.float64(pose["north"]), np.float64(pose["east"]))
     margin = MARGIN * max(abs(_velocity(pose)), 1.0)
-    now = float(clearance(fence.zones, *here))
-    predicted = float(line_clearance(fence, *here, *_parts(_stop(pose, _own(params)))))
-    action = _action(fence, here, now)
+    now = float(clearance(fence.zones, *position))
+    predicted = float(line_clearance(fence, *position, *_parts(_stop(pose, _gains(params)))))
+    action = _action(fence, position, now)
     begins = state.fence == 0.0 and predicted < margin
     if begins:
         target = state.target._replace(**home(pose, params))
@@ -338,11 +338,11 @@ def _within_fence(
     return state._replace(fence=flown), Escape(flown, begins, now, predicted, 0.0)
 
 
-def _action(fence: Fence, here: tuple[Any, Any], now: float) -> float:
+def _action(fence: Fence, position: tuple[Any, Any], now: float) -> float:
     """The action of a fence that acts: home in a straight line or around, or back inside."""
     if now < 0.0:
         return BACK
-    return HOME if bool(ways(fence).aim(fence, *here)[2]) else AROUND
+    return HOME if bool(ways(fence).aim(fence, *position)[2]) else AROUND
 
 
 def _wanted(
@@ -353,14 +353,14 @@ def _wanted(
     params: GuidanceParams,
 ) -> Wanted:
     """What the lateral mode asks for; the way around a fence in its place."""
-    own = _own(params)
+    gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
     if state.mode is not Mode.ENGAGED or state.lateral is Lateral.PHI:
         return Wanted()
     if escape.action in {AROUND, BACK} and params.fence is not None:
-        here = (np.float64(pose["north"]), np.float64(pose["east"]))
-        north, east, _ = ways(params.fence).aim(params.fence, *here)
+        position = (np.float64(pose["north"]), np.float64(pose["east"]))
+        north, east, _ = ways(params.fence).aim(params.fence, *position)
         place = (float(north), float(east))
     elif state.lateral is Lateral.COURSE:
         velocity = cmath.rect(state.V_c, target.course)
@@ -368,27 +368,27 @@ def _wanted(
     elif state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         if not state.joining and not path.is_orbit(leg):
-            return _on_path(state, pose, route, own)
+            return _on_path(state, pose, route, gains)
         place = route.start(state.leg, target.along)[0]
-    return _to_place(complex(*place), state, pose, own)
+    return _to_place(complex(*place), state, pose, gains)
 
 
-def _approach(distance: float, speed: float, own: MulticopterParams) -> tuple[float, float]:
+def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
     """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s: `climb_for`
     with `k_p`, which falls by `braking`.
     """
-    params = VerticalParams(own.k_p, 2.0 * own.braking, speed, speed, 0.0)
+    params = VerticalParams(gains.k_p, 2.0 * gains.braking, speed, speed, 0.0)
     allowed = float(climb_for(distance, params))
-    slope = min(own.k_p, own.braking / max(allowed, 1e-6))
+    slope = min(gains.k_p, gains.braking / max(allowed, 1e-6))
     return allowed, 0.0 if allowed >= speed else slope
 
 
 def _to_place(
-    place: complex, state: GuidanceState, pose: Mapping[str, float], own: MulticopterParams
+    place: complex, state: GuidanceState, pose: Mapping[str, float], gains: MulticopterParams
 ) -> Wanted:
     """Towards a place, with the deceleration of the way."""
     distance, course = cmath.polar(place - _place(pose))
-    speed, slope = _approach(distance, state.V_c, own)
+    speed, slope = _approach(distance, state.V_c, gains)
     velocity = cmath.rect(speed, course)
     closing = (_velocity(pose) * cmath.rect(1.0, -course)).real
     brake = cmath.rect(-slope * closing, course)
@@ -396,7 +396,7 @@ def _to_place(
 
 
 def _on_path(
-    state: GuidanceState, pose: Mapping[str, float], route: Route, own: MulticopterParams
+    state: GuidanceState, pose: Mapping[str, float], route: Route, gains: MulticopterParams
 ) -> Wanted:
     """Along a line or a fillet of the route."""
     leg = route.legs[state.leg]
@@ -406,27 +406,27 @@ def _on_path(
     speed = state.V_c
     slope = 0.0
     if _stops(route, state.leg):
-        speed, slope = _approach(max(to_go, 0.0), speed, own)
-    across = -clip(own.k_p * error.e, ACROSS * speed)
+        speed, slope = _approach(max(to_go, 0.0), speed, gains)
+    across = -clip(gains.k_p * error.e, ACROSS * speed)
     velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
-    later = _parts(_place(pose) + own.lead * _velocity(pose))
+    later = _parts(_place(pose) + gains.lead * _velocity(pose))
     entered = leg
     if path.passed(leg, later) and not _stops(route, state.leg):
         entered = route.legs[state.leg + 1]
-    there = path.error(entered, later)
-    track = cmath.rect(1.0, there.track)
-    bend = complex(-slope * speed, speed**2 * there.curvature)
+    error_later = path.error(entered, later)
+    track = cmath.rect(1.0, error_later.track)
+    bend = complex(-slope * speed, speed**2 * error_later.curvature)
     now = velocity * cmath.rect(1.0, error.track)
     return Wanted(now, velocity * track, bend * track, error, to_go)
 
 
 def _by_tilt(
-    attitude: Mapping[str, float], pose: Mapping[str, float], own: MulticopterParams
+    attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
 ) -> complex:
     """Acceleration by an attitude, (g + d climb) tan(tilt), m/s^2."""
     angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
     north, east, up = thrust_axis(*angles)
-    return _lift(pose, own) / up * complex(north, east)
+    return _lift(pose, gains) / up * complex(north, east)
 
 
 def _with_wind(
@@ -439,15 +439,15 @@ def _with_wind(
     A low-pass of the wind that explains the acceleration of the pose. The tilt is that of the
     pose, so commands that are not flown move no wind. W is within what the largest tilt holds.
     """
-    own = _own(params)
+    gains = _gains(params)
     v = _velocity(pose)
     if state.mode is not Mode.ENGAGED:
         return state._replace(velocity=_parts(v))
     wind = complex(*state.wind)
     attitude = {"phi": state.phi, "theta": state.theta, "psi": state.psi}
-    unexplained = own.drag * (v - wind) - _by_tilt(attitude, pose, own)
-    wind += (v - complex(*state.velocity) + dt * unexplained) / (own.drag * WIND_TIME)
-    limit = GRAVITY * math.tan(params.limits.bank) / own.drag
+    unexplained = gains.drag * (v - wind) - _by_tilt(attitude, pose, gains)
+    wind += (v - complex(*state.velocity) + dt * unexplained) / (gains.drag * WIND_TIME)
+    limit = GRAVITY * math.tan(params.limits.bank) / gains.drag
     return state._replace(wind=_parts(_within(wind, limit)), velocity=_parts(v))
 
 
@@ -455,16 +455,16 @@ def _within(vector: complex, largest: float) -> complex:
     return vector * min(1.0, largest / max(abs(vector), 1e-6))
 
 
-def _lift(pose: Mapping[str, float], own: MulticopterParams) -> float:
+def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
     """Vertical part of the thrust in steady flight, g + d climb, m/s^2, at least half of g."""
-    return max(GRAVITY + own.drag * pose["climb"], GRAVITY / 2.0)
+    return max(GRAVITY + gains.drag * pose["climb"], GRAVITY / 2.0)
 
 
 def _attitude_for(
     state: GuidanceState, pose: Mapping[str, float], wanted: Wanted, params: GuidanceParams
 ) -> tuple[float, float, bool]:
     """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
-    own = _own(params)
+    gains = _gains(params)
     largest = params.limits.bank
     if state.mode is not Mode.ENGAGED:
         return 0.0, 0.0, False
@@ -474,10 +474,10 @@ def _attitude_for(
         return angles.real, angles.imag, angles != asked
     needed = (
         wanted.acceleration
-        + own.k_v * (wanted.velocity - _velocity(pose))
-        + own.drag * (wanted.ahead - complex(*state.wind))
+        + gains.k_v * (wanted.velocity - _velocity(pose))
+        + gains.drag * (wanted.ahead - complex(*state.wind))
     )
-    lift = _lift(pose, own)
+    lift = _lift(pose, gains)
     level = _within(needed, lift * math.tan(largest))
     ahead, right = _parts(level * cmath.rect(1.0, -state.psi))
     return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), level != needed
@@ -503,7 +503,7 @@ def _with_climb(
 
 
 def _rates(
-    state: GuidanceState, phi_c: float, theta_c: float, own: MulticopterParams
+    state: GuidanceState, phi_c: float, theta_c: float, gains: MulticopterParams
 ) -> dict[str, float]:
     """Body rates that turn the thrust into its direction by the shortest way, and the heading at
     its rate, the inverse of `kinematics.heading_rate`, rad/s.
@@ -523,11 +523,11 @@ def _rates(
     right = math.cos(state.phi) * math.sin(phi_c) + math.sin(state.phi) * down
     down = math.cos(state.phi) * down - math.sin(state.phi) * math.sin(phi_c)
     sine = math.hypot(ahead, right)
-    rate = min(own.k_tilt * math.atan2(sine, -down), own.tilt_rate) / max(sine, 1e-9)
+    rate = min(gains.k_tilt * math.atan2(sine, -down), gains.tilt_rate) / max(sine, 1e-9)
     q = -rate * ahead
     turn = 0.0
     if state.mode is Mode.ENGAGED:
-        turn = own.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
+        turn = gains.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
     phi = tilt(state.phi)
-    r = (clip(turn, own.yaw_rate) * math.cos(state.theta) - q * math.sin(phi)) / math.cos(phi)
+    r = (clip(turn, gains.yaw_rate) * math.cos(state.theta) - q * math.sin(phi)) / math.cos(phi)
     return {"p": rate * right, "q": q, "r": float(r)}

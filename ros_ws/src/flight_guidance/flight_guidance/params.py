@@ -444,10 +444,10 @@ class GuidanceConfig(NodeConfig):
 
     def _multicopter_params(self, drag: float) -> GuidanceParams:
         """The numbers of the equations of a multicopter."""
-        own = self._gains(drag)
+        gains = self._gains(drag)
         frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
         climbs = vertical(self.outputs)
-        rates = {"p": own.tilt_rate, "q": own.tilt_rate, "r": own.yaw_rate}
+        rates = {"p": gains.tilt_rate, "q": gains.tilt_rate, "r": gains.yaw_rate}
         rates[climbs] = self.acceleration / frequency[climbs]
         climb = self.climb or multicopter_rules.CLIMB * self.speed
         sink = self.sink or multicopter_rules.SINK * self.speed
@@ -457,7 +457,7 @@ class GuidanceConfig(NodeConfig):
             period_ns=period_ns(self.rate, "rate"),
             speed=self.speed,
             k_chi=0.0,
-            attitude=AttitudeParams(own.k_tilt, own.k_tilt, own.tilt_rate, 0.0, 0.0, 0.0),
+            attitude=AttitudeParams(gains.k_tilt, gains.k_tilt, gains.tilt_rate, 0.0, 0.0, 0.0),
             vertical=VerticalParams(gain, self.acceleration, climb, sink, 0.0),
             path=PathParams(0.0, self.damping, self.capture),
             limits=Limits(
@@ -477,7 +477,7 @@ class GuidanceConfig(NodeConfig):
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
             channels=MULTICOPTER,
-            multicopter=own,
+            multicopter=gains,
         )
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:

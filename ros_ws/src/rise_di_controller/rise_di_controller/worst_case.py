@@ -212,9 +212,9 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)
-    whole = uncertain_loop(plant, law, loop, box)
+    uncertain = uncertain_loop(plant, law, loop, box)
     drawn = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
-    slopes = _slopes(plant, law, loop, box, whole, np.zeros(k))
+    slopes = _slopes(plant, law, loop, box, uncertain, np.zeros(k))
     corners = np.unique(np.concatenate([_corners(slopes), drawn]), axis=0)
     margins = loop_margins(aircraft_at(plant, box, corners), law, loop)
     walked: set[tuple[int, int]] = set()
@@ -226,7 +226,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
         added = []
         for place in sorted({place for _, place in steps}):
             if margins.stable[place]:
-                slopes = _slopes(plant, law, loop, box, whole, corners[place])
+                slopes = _slopes(plant, law, loop, box, uncertain, corners[place])
                 added += [_corners(slopes[f]) for f, at in steps if at == place]
         fresh = [c for c in map(tuple, added) if not (corners == c).all(axis=1).any()]
         if not fresh:
@@ -246,16 +246,27 @@ def _corners(slopes: FloatArray) -> FloatArray:
 
 def _figures(margins: Margins) -> FloatArray:
     """The figures of N aircraft, (N, 4 m + 3): the less the worse, in the order of `_slopes`."""
-    whole = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
+    all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(
-        [margins.phase, margins.gain, 1.0 / margins.sensitivity, margins.disk, np.stack(whole, 1)],
+        [
+            margins.phase,
+            margins.gain,
+            1.0 / margins.sensitivity,
+            margins.disk,
+            np.stack(all_inputs, 1),
+        ],
         axis=1,
     )
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # an input without feedback has no crossing: L = 0
 def _slopes(
-    plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, whole: UncertainLoop, d: FloatArray
+    plant: LinearPlant,
+    law: LinearLaw,
+    loop: Loop,
+    box: Box,
+    uncertain: UncertainLoop,
+    d: FloatArray,
 ) -> FloatArray:
     """The slopes of `_figures` along the deviations at d, (4 m + 3, k), each up to a factor.
 
@@ -279,16 +290,16 @@ def _slopes(
     peaks = [np.argmax(np.abs(matrix), axis=0) for matrix in (diagonal, diagonal - 0.5)]
     peaks += [[int(np.argmax(norm_bound(matrix)))] for matrix in (S, half)]
     frequencies = np.concatenate([phase_at, gain_at, w[np.concatenate(peaks)]])
-    S_at, change = sensitivity_slopes(whole, d, frequencies)  # (4 m + 2, m, m), (.., k, m, m)
+    S_at, change = sensitivity_slopes(uncertain, d, frequencies)  # (4 m + 2, m, m), (.., k, m, m)
     rows = np.tile(np.arange(m), 4)
-    own = change[np.arange(4 * m), :, rows, rows]
+    derivative = change[np.arange(4 * m), :, rows, rows]
     x = S_at[np.arange(4 * m), rows, rows][:, None]
-    a = -own / (x * (1.0 - x))
+    a = -derivative / (x * (1.0 - x))
     b = np.concatenate([phase_rate, gain_rate, np.ones(2 * m)])[:, None]
     phase = a.imag - b.imag * a.real / b.real
     gain = a.real - b.real * a.imag / b.imag
     loop_at = 1.0 / x - 1.0
-    peak = -(own * np.conj(x - np.repeat([0.0, 0.0, 0.0, 0.5], m)[:, None])).real
+    peak = -(derivative * np.conj(x - np.repeat([0.0, 0.0, 0.0, 0.5], m)[:, None])).real
     kinds = np.repeat([0, 1, 2, 2], m)[:, None]
     falling = np.sign(np.log(np.abs(loop_at))) * gain
     each = np.where(
@@ -300,7 +311,7 @@ def _slopes(
         left, _, right = np.linalg.svd(t * (matrix - centre * np.eye(m)) / t.T)
         turned = t * part / t.T
         together.append(-np.einsum("i,kij,j->k", left[:, 0].conj(), turned, right[0].conj()).real)
-    slopes = np.concatenate([each, together, [_damping_slope(whole, d)]])
+    slopes = np.concatenate([each, together, [_damping_slope(uncertain, d)]])
     return np.asarray(np.nan_to_num(slopes))
 
 
@@ -322,11 +333,11 @@ def _crossed(
     return np.asarray(w[place] + share * step), np.asarray(rate)
 
 
-def _damping_slope(whole: UncertainLoop, d: FloatArray) -> FloatArray:
+def _damping_slope(uncertain: UncertainLoop, d: FloatArray) -> FloatArray:
     """The slope of the least damping of a slow mode along the deviations at d, (k,), up to a
     factor: zeta = -cos(angle(log z)).
     """
-    every = every_channel(whole)
+    every = every_channel(uncertain)
     A, left, right = every.closed(d[None])
     z, X = np.linalg.eig(A[0])
     turn = np.log(np.where(np.abs(z) > VANISHED, z, VANISHED).astype(complex))

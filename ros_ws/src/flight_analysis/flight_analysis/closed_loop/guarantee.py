@@ -122,15 +122,15 @@ def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = F
     """
     if exact and _boxes(parts, least, BOXES, disks=disks) is not None:
         return least
-    for at, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
-        most = FEWER_BOXES if disks or at > FIRST_GAP else BOXES
+    for place, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
+        most = FEWER_BOXES if disks or place > FIRST_GAP else BOXES
         used = _boxes(parts, least / (1.0 + gap), most, disks=disks)
         if used is not None:
             break
     else:
         return 0.0
     proved = gap
-    for finer in reversed(GAPS[:at] if at == FIRST_GAP else ()):
+    for finer in reversed(GAPS[:place] if place == FIRST_GAP else ()):
         if used is None or used > FEWER_BOXES:
             break
         used = _boxes(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
@@ -140,13 +140,13 @@ def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = F
 
 def _boxes(parts: list[Channels], size: float, most: int, *, disks: bool) -> int | None:
     """The number of boxes with which each part is proved; None if `most` are not enough."""
-    left = most
+    remaining = most
     for part in parts:
-        used = boxes_until_proved(part, *((1.0, size) if disks else (size, 0.0)), left)
+        used = boxes_until_proved(part, *((1.0, size) if disks else (size, 0.0)), remaining)
         if used is None:
             return None
-        left -= used
-    return most - left
+        remaining -= used
+    return most - remaining
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:

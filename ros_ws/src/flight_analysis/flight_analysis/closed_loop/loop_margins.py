@@ -145,10 +145,10 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
     )
     radii = np.abs(np.linalg.eigvals(samples)).max(axis=-1)
-    found = worst_in_box(linear.nominal, linear.law, linear.loop, box)
-    aircraft = aircraft_at(_some(linear.plant, slice(1)), box, found.corners)
+    search = worst_in_box(linear.nominal, linear.law, linear.loop, box)
+    aircraft = aircraft_at(_some(linear.plant, slice(1)), box, search.corners)
     return nominal._replace(
-        worst=found.worst,
+        worst=search.worst,
         worst_delay=_least_delay(linear._replace(plant=aircraft), nominal.delay),
         aircraft=len(radii),
         stable=int((radii <= 1.0 + SPECTRAL_RADIUS_TOLERANCE).sum()),

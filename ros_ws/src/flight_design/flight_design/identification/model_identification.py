@@ -171,11 +171,11 @@ class _Study(NamedTuple):
     ) -> tuple[Fit, Part]:
         """The most probable theta of a block, and the model."""
         also = None if flown is None else search.model_errors(flown)
-        alike = search.fit_alike(used, also) if quick else None
-        if alike is not None:
-            part = self.part(search, alike)
+        quick_fit = search.fit_alike(used, also) if quick else None
+        if quick_fit is not None:
+            part = self.part(search, quick_fit)
             if not part.refusal and part.after.whiteness.max() <= MAX_WHITENESS:
-                return alike, part
+                return quick_fit, part
         fit = search.fit(used, flown=also)
         return fit, self.part(search, fit)
 
