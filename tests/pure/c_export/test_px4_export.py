@@ -176,7 +176,8 @@ def test_spare_flies_until_all_is_ready(shell: Shell) -> None:
 
 def test_spare_flies_on_where_the_rates_come_too_slowly(library: Path) -> None:
     """The rate of the export is 250 Hz; samples may come faster."""
-    assert Shell(library, 200.0).fly(3) == [SLOW] * 3
+    for rate in (200.0, 0.0, float("nan")):
+        assert Shell(library, rate).fly(3) == [SLOW] * 3
     assert Shell(library, 400.0).run() == FLIES
 
 

@@ -167,7 +167,7 @@ void rise_di_rates_start(rise_di_rates *rates, float rate) {
     rates->parameters[1] = exported;
     rates->parameters[1].digest = exported.digest + 1U;
     rates->started = rise_di_start(&rates->controller, rates->parameters);
-    rates->slow = (rate * (float)exported.period_ns) < 0.99e9f;
+    rates->slow = !((rate * (float)exported.period_ns) >= 0.99e9f); /* of a rate that is no number, too */
     rise_di_reference_start(&rates->reference, &model);
     rates->refusal = RISE_DI_OFF;
     rates->latched = RISE_DI_FLIES;
