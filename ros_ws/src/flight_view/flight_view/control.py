@@ -37,7 +37,8 @@ AXES = ("north", "east", "altitude")  # of a waypoint
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
-GUST_LEAD = 0.2  # s from the request to the begin of a gust
+# s from the request to the begin of a gust; the second where a busy host sets the first late
+GUST_LEADS = (0.2, 1.0)
 # stamps above are of the system clock, stamps of a lockstep flight begin at 0
 SYSTEM_TIME_NS = 10**17
 
@@ -449,14 +450,15 @@ class Control:
         speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS
-        start = GUST_LEAD + (
-            (time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end
-        )
-        values = {
-            f"gusts.{axis}.{key}": value
-            for key, value in (("start", start), ("speed", speed), ("length", length))
-        }
-        return self._link.set_parameters("aircraft", values)
+        refusal = ""
+        for lead in GUST_LEADS:
+            now = (time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end
+            gust = {"start": now + lead, "speed": speed, "length": length}
+            values = {f"gusts.{axis}.{key}": value for key, value in gust.items()}
+            refusal = self._link.set_parameters("aircraft", values)
+            if not refusal:
+                break
+        return refusal
 
     def _send_target(self, request: Mapping[str, Any]) -> str:
         values = _mapping(request, "values")
