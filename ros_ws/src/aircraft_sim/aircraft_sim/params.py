@@ -46,14 +46,13 @@ from aircraft_sim.sections import (
     StartConfig,
     TurbulenceConfig,
     UncertaintyConfig,
-    VaneSensorsConfig,
     by_state,
     require_one_wind,
     wind_field_of,
 )
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import Turbulence, dryden, filters
-from aircraft_sim.vanes import ANGLES, Vanes
+from aircraft_sim.vanes import VaneSensorsConfig
 from aircraft_sim.wind_field import RelativeWind
 from flight_core import parameters
 from flight_core.channels import POSE, vertical
@@ -535,19 +534,6 @@ class AircraftConfig(NodeConfig):
             bias=_array(sensors.bias, zero_is_none=True),
             drift=None if drift is None else drift * np.sqrt(1.0 / self.rate),
             quantum=_array(sensors.quantisation, zero_is_none=True),
-        )
-
-    def vane_arrays(self) -> Vanes | None:
-        """The vanes as arrays; None without any."""
-        section = self.vanes
-        if not section.channels:
-            return None
-        frozen_at = np.array(section.frozen_at or (np.inf,) * len(section.channels))
-        return Vanes(
-            [ANGLES.index(name) for name in section.channels],
-            frozen_at,
-            section.dropout,
-            self.sensors.seed,
         )
 
     def pose_every(self) -> int:

@@ -10,10 +10,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from aircraft_sim import effector_faults, wind_field
-from aircraft_sim.airframe import Airframe
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
-from flight_core import parameters
 from flight_core.fields import Field, Problems
 from flight_core.parameters import (
     Config,
@@ -339,40 +337,6 @@ class SensorConfig(Config):
         default=0.0, ge=0, lt=1, description="the probability that a sample is lost"
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
-
-
-class VaneSensorsConfig(Config):
-    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors`
-    too.
-    """
-
-    channels: tuple[Literal["alpha", "beta"], ...] = Field(
-        default=(), description="the angles that have a vane; none if empty"
-    )
-    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, s")
-    dropout: float = Field(
-        default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before"
-    )
-
-    def _check(self) -> None:
-        require(
-            len(set(self.channels)) == len(self.channels),
-            "channels",
-            ", ".join(self.channels),
-            "different ones",
-        )
-        if self.frozen_at:
-            parameters.require_length("frozen_at", self.frozen_at, self.channels)
-
-    def require_fit(self, airframe: Airframe) -> None:
-        """Raise ParameterError for a vane that an airframe cannot have."""
-        key = "vanes.channels"
-        has_none = f"none: the airframe {airframe.name} has no"
-        for name in self.channels:
-            require(name in airframe.states, key, name, f"{has_none} state {name}")
-            is_output = f"none: {name} is an output of {airframe.name}"
-            require(name not in airframe.outputs, key, name, is_output)
-            require(airframe.speed > 0.0, key, name, f"{has_none} speed")
 
 
 PerPose = dict[str, Number]

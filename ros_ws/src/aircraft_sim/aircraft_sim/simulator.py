@@ -276,7 +276,7 @@ class Simulator:
         self._pose_sensors = parameters.pose_sensors()
         self._poses: DelayLine = ()
         self._sensors = parameters.sensor_arrays()
-        self._vanes = parameters.vane_arrays()
+        self._vanes = parameters.vanes.arrays(parameters.sensors.seed)
         self._vane_state = None if self._vanes is None else vanes.initial_state(self._vanes)
         self.truth_names = (
             "t",
@@ -328,7 +328,7 @@ class Simulator:
         self._drift_section = drift
         self._gusts = parameters.gusts
         self._sensors = parameters.sensor_arrays()
-        self._vanes = parameters.vane_arrays()
+        self._vanes = parameters.vanes.arrays(parameters.sensors.seed)
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:

@@ -5,11 +5,15 @@ readings behind it.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from aircraft_sim import random_streams
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.sections import Times
+from flight_core.fields import Field
+from flight_core.parameters import Config, require, require_length
 from flight_core.vectors import FloatArray
 
 ANGLES = ("alpha", "beta")
@@ -23,6 +27,48 @@ class Vanes(NamedTuple):
     frozen_at: FloatArray  # (k,) s, from when on a vane keeps its angle, infinite for never
     dropout: float  # probability that a reading of a vane is lost, each vane by itself
     seed: int
+
+
+class VaneSensorsConfig(Config):
+    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors`
+    too.
+    """
+
+    channels: tuple[Literal["alpha", "beta"], ...] = Field(
+        default=(), description="the angles that have a vane; none if empty"
+    )
+    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, s")
+    dropout: float = Field(
+        default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before"
+    )
+
+    def _check(self) -> None:
+        require(
+            len(set(self.channels)) == len(self.channels),
+            "channels",
+            ", ".join(self.channels),
+            "different ones",
+        )
+        if self.frozen_at:
+            require_length("frozen_at", self.frozen_at, self.channels)
+
+    def require_fit(self, airframe: Airframe) -> None:
+        """Raise ParameterError for a vane that an airframe cannot have."""
+        key = "vanes.channels"
+        has_none = f"none: the airframe {airframe.name} has no"
+        for name in self.channels:
+            require(name in airframe.states, key, name, f"{has_none} state {name}")
+            is_output = f"none: {name} is an output of {airframe.name}"
+            require(name not in airframe.outputs, key, name, is_output)
+            require(airframe.speed > 0.0, key, name, f"{has_none} speed")
+
+    def arrays(self, seed: int) -> Vanes | None:
+        """The vanes as arrays, with losses of this seed; None without any."""
+        if not self.channels:
+            return None
+        frozen_at = np.array(self.frozen_at or (np.inf,) * len(self.channels))
+        places = [ANGLES.index(name) for name in self.channels]
+        return Vanes(places, frozen_at, self.dropout, seed)
 
 
 class VaneState(NamedTuple):
