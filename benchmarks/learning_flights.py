@@ -138,9 +138,8 @@ class Row(NamedTuple):
     update: float = 0.0  # s of a core, mean: identification, test for a change and design
     longest: float = 0.0  # s of a core, the same
     replayed: int = 0
-    windows: str = (
-        ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
-    )
+    # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
+    windows: str = ""
     events: str = ""
     revision: str = ""  # of the code that flew
 

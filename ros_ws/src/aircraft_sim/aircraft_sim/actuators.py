@@ -23,31 +23,26 @@ class Actuators(NamedTuple):
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
     stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
-    lost_at: Array | None = (
-        None  # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
-    )
+    # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
+    lost_at: Array | None = None
     weak_at: Array | None = (
         # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
         None
     )
     weak_effect: Array | None = None  # (m,) factor
-    slow_at: Array | None = (
-        None  # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
-    )
+    # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
+    slow_at: Array | None = None
     slow_lag: Array | None = None  # (m,) s
-    loose_at: Array | None = (
-        None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
-    )
+    # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
+    loose_at: Array | None = None
     loose_play: Array | None = None  # (m,) half-width of the backlash
-    hard_over_at: Array | None = (
-        None  # (m,) when it runs away to `hard_over_to`, s of flight time, inf = never
-    )
+    # (m,) when it runs away to `hard_over_to`, s of flight time, inf = never
+    hard_over_at: Array | None = None
     hard_over_to: Array | None = None  # (m,) end stop, deviation from trim
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
     runs_to: Array | None = None  # (m,) end stop of a runaway in force; nan: follows the command
-    no_thrust: Array | None = (
-        None  # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
-    )
+    # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
+    no_thrust: Array | None = None
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:

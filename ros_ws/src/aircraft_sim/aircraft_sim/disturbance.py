@@ -38,9 +38,8 @@ class Gusts(NamedTuple):
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
     length: Array  # (G,) distance H from entry to peak, m, > 0
-    every: Array | None = (
-        None  # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
-    )
+    # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
+    every: Array | None = None
 
 
 class Bias(NamedTuple):

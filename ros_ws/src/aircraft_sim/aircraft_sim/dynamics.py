@@ -49,9 +49,8 @@ class Aircraft(NamedTuple):
     bias: Bias | None = None
     sines: Sines | None = None
     kinematics: EulerKinematics | None = None
-    trim: Array | None = (
-        None  # (n,) of x_dot, where the matrices are those of another airspeed than the trim's
-    )
+    # (n,) of x_dot, where the matrices are those of another airspeed than the trim's
+    trim: Array | None = None
 
 
 def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Array:

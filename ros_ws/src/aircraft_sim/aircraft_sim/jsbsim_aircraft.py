@@ -25,9 +25,8 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
-PREFIX = (
-    "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
-)
+# prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
+PREFIX = "jsbsim:"
 # environment: a folder with aircraft, engine and systems in place of the package's
 ROOT_VARIABLE = "JSBSIM_ROOT"
 # of the file of a model

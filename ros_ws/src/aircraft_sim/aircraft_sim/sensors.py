@@ -22,9 +22,8 @@ class Sensors(NamedTuple):
     dropout: float  # probability that a sample is dropped, all channels together
     seed: int
     bias: FloatArray | None = None  # (m,) SI
-    drift: FloatArray | None = (
-        None  # (m,) standard deviation of the random walk's step from sample to sample, SI
-    )
+    # (m,) standard deviation of the random walk's step from sample to sample, SI
+    drift: FloatArray | None = None
     quantum: FloatArray | None = None  # (m,) steps of the quantisation, SI, 0 = none
 
 

@@ -87,9 +87,8 @@ class Bridge:
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
-        self._keeps_mode = (
-            True  # whether a release leaves the mode: a pilot requested it, or nothing was flown
-        )
+        # whether a release leaves the mode: a pilot requested it, or nothing was flown
+        self._keeps_mode = True
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
         rows = channel_map.inputs.values()

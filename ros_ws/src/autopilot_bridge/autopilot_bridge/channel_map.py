@@ -25,9 +25,8 @@ from flight_core.vectors import ChannelError
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
 VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
-SEA_LEVEL_DENSITY = (
-    1.225  # kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
-)
+# kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
+SEA_LEVEL_DENSITY = 1.225
 
 
 class Line(NamedTuple):

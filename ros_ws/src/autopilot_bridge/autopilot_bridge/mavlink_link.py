@@ -174,18 +174,16 @@ class Link:
         self._further = tuple(further)
         self._systems: set[int] = set()  # of autopilots beside that of the map
         self._to_request = dict(config.rates)
-        self._requested: tuple[str, float] | None = (
-            None  # the message whose interval was requested, and when
-        )
+        # the message whose interval was requested, and when
+        self._requested: tuple[str, float] | None = None
         self._denied: dict[str, str] = {}
         self._beat = 0.0
         self._alive = 0.0
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
-        self._station_heard: float | None = (
-            None  # the ground station with a number of the RC overrides
-        )
+        # the ground station with a number of the RC overrides
+        self._station_heard: float | None = None
         self._sending = Lock()
         self._closed = Event()
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)

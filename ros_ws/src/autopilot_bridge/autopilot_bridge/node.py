@@ -63,9 +63,8 @@ RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
 # messages with release values at the end of the node; a single one may be lost
 RELEASES_AT_SHUTDOWN = 5
 
-ACTIVATION_TIMEOUT_NS = (
-    NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
-)
+# of the controller at engagement; it answers within some of its ticks
+ACTIVATION_TIMEOUT_NS = NANOSECONDS
 
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
 

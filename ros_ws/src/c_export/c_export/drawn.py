@@ -37,9 +37,8 @@ from rise_di_controller.guard import DT_RANGE, SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import saturate
 
-EPOCH_NS = (
-    1_795_000_000_000_000_000  # start of the drawn stamps: float64 does not resolve 1 ns there
-)
+# start of the drawn stamps: float64 does not resolve 1 ns there
+EPOCH_NS = 1_795_000_000_000_000_000
 
 
 def drawn_calls(

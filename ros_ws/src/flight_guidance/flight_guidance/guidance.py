@@ -215,9 +215,8 @@ class Guidance:
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
         self._waits_from_ns: int | None = None  # for a pose that is young enough
-        self._operated_ns: int | None = (
-            None  # the instant of the operator's last message, or of the first step
-        )
+        # the instant of the operator's last message, or of the first step
+        self._operated_ns: int | None = None
         self._link_lost = False
         self._authority = Authority()
 

@@ -66,9 +66,8 @@ class Target(NamedTuple):
     climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
-    along: float = (
-        0.0  # m along a line of the route from the start, where the aircraft joins the line
-    )
+    # m along a line of the route from the start, where the aircraft joins the line
+    along: float = 0.0
     r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
 
 
@@ -217,9 +216,8 @@ class GuidanceState(NamedTuple):
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
-    joining: float = (
-        0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
-    )
+    # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    joining: float = 0.0
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
     fence: float = 0.0  # action of the fence: of `fence.Escape`
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown

@@ -41,9 +41,8 @@ class Waypoint(NamedTuple):
     north: float  # m from the origin
     east: float  # m from the origin
     altitude: float  # m, as `pose` counts it
-    speed: float | None = (
-        None  # airspeed on the leg to the waypoint, m/s; None: as on the leg before
-    )
+    # airspeed on the leg to the waypoint, m/s; None: as on the leg before
+    speed: float | None = None
     turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
     wait: float = 0.0  # time on the circle round the waypoint, s
     leave: float | None = (

@@ -17,9 +17,8 @@ from flight_core.tape import Recording, Signal
 
 STEP_NS = NANOSECONDS // 10  # back: late samples are less late
 LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
-STRAY_NS = (
-    NANOSECONDS  # back: fewer messages than CONFIRMED that are so much older have a damaged stamp
-)
+# back: fewer messages than CONFIRMED that are so much older have a damaged stamp
+STRAY_NS = NANOSECONDS
 LATE_NS = 4 * NANOSECONDS  # a recorder that starts on a busy host stores its first sample so late
 # successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
 CONFIRMED = 10

@@ -58,9 +58,8 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
-RESERVED = (
-    8  # further connections: for requests of control, and for the first request of a connection
-)
+# further connections: for requests of control, and for the first request of a connection
+RESERVED = 8
 # s, for a request to arrive in full, for the next request to begin, and for the peer to take the
 # answer
 REQUEST_TIMEOUT = 10.0

@@ -29,15 +29,13 @@ class Measurements(NamedTuple):
     u_trim: Array  # the law adds to this input: u at engagement, and the feedforward
     u_before: Array  # the last command, after saturation
     position: Array | None = None  # of the actuators
-    x: Array | None = (
-        None  # (n, N) state: measured values of the outputs, true values of the remaining states
-    )
+    # (n, N) state: measured values of the outputs, true values of the remaining states
+    x: Array | None = None
     x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
     vane: Array | None = None  # (k,) readings of the vanes of an observer, rad
-    vane_m: Array | None = (
-        None  # (k,) those of the reference motion, from the model of the feedforward
-    )
+    # (k,) those of the reference motion, from the model of the feedforward
+    vane_m: Array | None = None
 
 
 def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:
@@ -63,12 +61,10 @@ class ControlLaw(NamedTuple):
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]]
     """(state, measured, dt, params, limits) -> (state, u before saturation, u)"""
     retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
-    missed: Callable[[Any, Measurements, Any], Any] = (
-        _no_prediction  # (state, measured, params) -> state
-    )
-    inner: "ControlLaw | None" = (
-        None  # the law extended by this law; the state field `law` is the state of `inner`
-    )
+    # (state, measured, params) -> state
+    missed: Callable[[Any, Measurements, Any], Any] = _no_prediction
+    # the law extended by this law; the state field `law` is the state of `inner`
+    inner: "ControlLaw | None" = None
 
 
 class TunedLaw(NamedTuple):

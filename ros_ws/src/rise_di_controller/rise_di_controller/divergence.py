@@ -17,9 +17,8 @@ from flight_core.vectors import FloatArray
 MEMORY = 1.0
 FACTOR = 3.0  # of the largest rms error before: gusts that come later are up to twice as strong
 LEAST = {"V": 1.0}  # m/s, rms error that does not count as a divergence
-LEAST_RATE = (
-    0.1  # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
-)
+# rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
+LEAST_RATE = 0.1
 
 # s, length of the record of e, and of the means in it: a loop with servos oscillates slower
 WINDOW = 10.0

@@ -38,9 +38,8 @@ class Nominal(NamedTuple):
     # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
     lead: Array
     sine_states: tuple[int, ...]  # indices of the states with a sine term
-    acts: Array | None = (
-        None  # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
-    )
+    # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
+    acts: Array | None = None
 
 
 def nominal_model(

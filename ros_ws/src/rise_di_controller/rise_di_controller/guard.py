@@ -62,9 +62,8 @@ class GuardParams(NamedTuple):
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
     # states of the nominal model read by vanes; the readings follow the outputs in y
     vanes: tuple[int, ...] = ()
-    over_speed: OverSpeed | None = (
-        None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
-    )
+    # the nominal model over the airspeed, beside a schedule; None: the one of the trim
+    over_speed: OverSpeed | None = None
     probe: Probe | None = None  # added to u_trim; None: no probe
 
 
@@ -101,9 +100,8 @@ class ControllerState(NamedTuple):
     hold_ns: int = 0
     ramp_ns: int = 0
     history: tuple[PastTick, ...] = ()
-    effectors: FloatArray | None = (
-        None  # (p,) commanded, with an allocation; u is the input of the law that they give
-    )
+    # (p,) commanded, with an allocation; u is the input of the law that they give
+    effectors: FloatArray | None = None
     effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
     vanes: Vanes | None = None  # None without vanes
 

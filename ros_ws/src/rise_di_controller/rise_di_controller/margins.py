@@ -47,9 +47,8 @@ VANISHED = 1e-9
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
 # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
 SERIAL_SIZE = 4000
-PHASE_AT_ZERO = (
-    0.01  # rad, phase of -L at the lowest frequency below which L is taken as real there
-)
+# rad, phase of -L at the lowest frequency below which L is taken as real there
+PHASE_AT_ZERO = 0.01
 # of `scaled_norm`, and of the search for the peak
 BALANCED_ROUNDS = 6
 DESCENT_STEPS = 40

@@ -56,9 +56,8 @@ class EventKind(StrEnum):
     REFUSED = "refused"  # a proposal fails a check of the controller
     NO_MODEL = "no model"  # the learner has refused what it identified
     FALLBACK = "fallback"  # to the law of the start, in all parts or in some
-    RESTART = (
-        "restart"  # the law was deactivated, and begins again with the parameters of the start
-    )
+    # the law was deactivated, and begins again with the parameters of the start
+    RESTART = "restart"
 
 
 class Proposal(NamedTuple):
@@ -156,12 +155,10 @@ class Learning:
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
-        self._last_ns: int | None = (
-            None  # end of the window of the last proposal that was not refused at once
-        )
-        self._since_ns: int | None = (
-            None  # when the law was last inactive: an earlier window is of another engagement
-        )
+        # end of the window of the last proposal that was not refused at once
+        self._last_ns: int | None = None
+        # when the law was last inactive: an earlier window is of another engagement
+        self._since_ns: int | None = None
         self._fallback: Fallback | None = None  # the last one
         self._fallbacks = Counter[str]()  # of this engagement, by output
         self._diverged = set[int]()  # digests of the parameters that diverged in this engagement

@@ -32,9 +32,8 @@ AUTHORITY = 2.0
 UNLIMITED = 1.0  # SI, full input where it has no limit: 57 deg, or the weight as thrust
 # m/s a sample, a change that counts as possible: above the knot in which an airspeed may come
 LEAST = {"V": 1.0}
-LEAST_RATE = (
-    0.1  # rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
-)
+# rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
+LEAST_RATE = 0.1
 AGREEING = 3  # samples in a row after a jump that agree
 
 

@@ -88,9 +88,8 @@ class ScheduleParams(NamedTuple):
     speed: Array  # () trim speed V0, m/s
     airspeed: Array  # (m,) 1 for the output V, else 0
     time: Array  # () time constant, s
-    observer: OverSpeed | None = (
-        None  # the law's parameters over the airspeed, of a law with an observer
-    )
+    # the law's parameters over the airspeed, of a law with an observer
+    observer: OverSpeed | None = None
 
 
 class ScheduleState(NamedTuple):

@@ -79,9 +79,8 @@ class Account(NamedTuple):
     unflown: tuple[int, ...] = ()
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
-    late: float | None = (
-        None  # s, flight time of the first u of a flight that flew less than half of its time
-    )
+    # s, flight time of the first u of a flight that flew less than half of its time
+    late: float | None = None
     outside: Outside | None = None  # of the fence; None without one
     off_orbit: float = 0.0  # m from the last orbit at the end; 0 of an orbit that is joined
     beside: float = 0.0  # m from the touch-down zone, of a landing; 0 inside

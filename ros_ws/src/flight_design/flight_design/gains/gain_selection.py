@@ -98,9 +98,8 @@ class LoopSetting(NamedTuple):
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
     # input of each output, in the airframe's order; empty: the airframe's pairing
     inputs: tuple[str, ...] = ()
-    feedforward: bool = (
-        False  # whether the result has the published airframe as model of a feedforward
-    )
+    # whether the result has the published airframe as model of a feedforward
+    feedforward: bool = False
     requirement: Requirement = Requirement()
 
 

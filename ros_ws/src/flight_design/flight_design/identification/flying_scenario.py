@@ -53,23 +53,20 @@ from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-REFERENCE_BANDWIDTH = (
-    0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
-)
+# of the loop: the reference model's natural frequency per bandwidth of a channel, at most
+REFERENCE_BANDWIDTH = 0.5
 # of the limit of thrust, which the command of V or climb needs in the end; the rest is for
 # disturbances
 HELD_FRACTION = 0.5
 # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
 HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}
-FULL_RANGE_TIME = (
-    1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
-)
+# s: u may cross from trim to its limit in that time, which bounds beta from below
+FULL_RANGE_TIME = 1.0
 # of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
 SAMPLES = 20
-MAX_SENSITIVITY = (
-    2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
-)
+# of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+MAX_SENSITIVITY = 2.0
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
 
 

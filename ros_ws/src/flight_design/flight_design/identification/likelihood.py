@@ -35,9 +35,8 @@ PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: tha
 SHEAR_PRIOR = 1.0  # 1, the same of the effects of the slope of the vertical wind
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
 MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
-MAX_DELAY_ERROR = (
-    4.0  # standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
-)
+# standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
+MAX_DELAY_ERROR = 4.0
 # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either
 # way
 MAX_FACTOR = 2.5
@@ -222,9 +221,8 @@ class Likelihood:
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
         count_A, count_B = map(np.count_nonzero, self._units)
-        self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = (
-            None  # theta, levels and innovations of `levels`
-        )
+        # theta, levels and innovations of `levels`
+        self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None
         self.count = int(count_A + count_B)  # of the entries that are identified
         self._factor = unknown.factor
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))

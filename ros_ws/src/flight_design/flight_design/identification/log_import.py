@@ -34,9 +34,8 @@ from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleL
 COMMANDS = "commands"  # the topic with trim + u, by input
 # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
 AIRBORNE = 0.5
-TYPICAL = (
-    90.0  # percentile of either in a log, which may have more time on the ground than in the air
-)
+# percentile of either in a log, which may have more time on the ground than in the air
+TYPICAL = 90.0
 LEAST = 2.0  # s of flight that are worth a bag
 
 FLOWN_AS = Source("vehicle_status", "vehicle_type")

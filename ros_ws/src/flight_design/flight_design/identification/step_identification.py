@@ -78,18 +78,16 @@ from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 CONTROL_RATE = 100.0
 STEP = 0.005
-SAMPLES = (
-    5  # uncertain aircraft around the identified one: only the largest response of them is used
-)
+# uncertain aircraft around the identified one: only the largest response of them is used
+SAMPLES = 5
 # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of
 # transport
 DELAY = 0.006
 
 THROTTLE = list(INPUTS).index("throttle")
 
-NOISE_SHARE = (
-    100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
-)
+# of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+NOISE_SHARE = 100.0
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
 """rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first

@@ -17,9 +17,8 @@ MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance 
 WINDOWS = {"V": 10.0}  # s, length of a response: engines and propellers need seconds to spin up
 WINDOW = 0.5  # s, the same for body rates
 SPAN = 0.025  # s, length of a chord
-TANGENT_CUTOFF = (
-    0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
-)
+# the search ends when the slope has fallen to this fraction of the largest one so far
+TANGENT_CUTOFF = 0.7
 Fly = Callable[[FloatArray, float], FloatArray]
 """(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m),
 deviations from trim."""

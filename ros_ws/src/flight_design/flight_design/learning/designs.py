@@ -10,9 +10,8 @@ from flight_design.identification.likelihood import PRIOR
 from flight_design.identification.model_identification import with_entries
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-DELAY_LEFT = (
-    0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
-)
+# s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
+DELAY_LEFT = 0.01
 FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
 
 

@@ -16,9 +16,8 @@ from flight_design.learning.change_test import Change
 # standard deviations of a normal distribution, passed with 5 %: the level of either test of a model
 # against the file
 LIKELIER = 1.645
-DELAY_DEVIATION = (
-    0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
-)
+# s: a host, a bridge or a servo that is 30 ms later than the file says is found
+DELAY_DEVIATION = 0.015
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
