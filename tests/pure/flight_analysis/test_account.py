@@ -334,6 +334,26 @@ def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays(late
     assert clock.recording().unset == 0
 
 
+@pytest.mark.parametrize("size", [400, 60])
+@pytest.mark.parametrize("live", [0, 100])
+def test_pause_in_history_of_publisher_is_no_step_of_clock(live: int, size: int) -> None:
+    """A recorder that joins late stores 3 s of history at once, with 0.6 s in which the publisher
+    paused; `live` samples come later. The same pause is a step where the log goes on in between.
+    """
+    (stamp_ns,) = stamps(range(1000, 1300))
+    stamp_ns[200:] += nanoseconds(0.6)
+    late_ns = np.maximum(stamp_ns, stamp_ns[-1 - live])
+    (live_ns,) = stamps(range(1000, 1300))
+    steps_ns = []
+    for log_ns in (late_ns, live_ns):
+        clock = StampClock()
+        for first in range(0, 300, size):
+            part = slice(first, first + size)
+            clock.usable(stamp_ns[part], log_ns[part], more=False, end=first + size >= 300)
+        steps_ns.append(clock.recording().step_ns)
+    assert steps_ns == [0, nanoseconds(0.61)]
+
+
 def test_clock_step_is_found_across_batches() -> None:
     stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
     log_ns = np.concatenate([*stamps(range(1000, 1200))])

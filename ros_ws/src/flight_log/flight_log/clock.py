@@ -40,6 +40,7 @@ class StampClock:
         self._last_ns: int | None = None  # of the usable part
         self._last_offset_ns = 0
         self._offset_ns = -(2**62)  # the largest lead of a stamp over the time of the recording
+        self._is_history = False  # whether the last samples were recorded in a burst
 
     def usable(
         self,
@@ -101,6 +102,8 @@ class StampClock:
             self._last_ns = int(stamps[after - 1])
             self._last_offset_ns = int(offsets[after - 1])
             self._offset_ns = max(self._offset_ns, int(offsets[first:after].max()))
+            if stamps[after - 1] - stamps[first] > STEP_NS:
+                self._is_history = _in_burst(stamps[first:after], offsets[first:after])
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
@@ -110,7 +113,8 @@ class StampClock:
         if not self._last_ns:  # none, or a stamp that was not set
             return 0, False
         jump_ns = stamp_ns - self._last_ns
-        return jump_ns, jump_ns > LEAP_NS and has_time and offset_ns > self._offset_ns + LEAP_NS
+        is_ahead = jump_ns > LEAP_NS and offset_ns > self._offset_ns + LEAP_NS
+        return jump_ns, is_ahead and has_time and not self._is_history
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mask of the samples that stay after the step: behind a step forth those later than the
@@ -142,6 +146,16 @@ class StampClock:
             self._step_at_ns,
             self._left_out,
         )
+
+
+def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
+    """Whether the last samples, over LEAP_NS of stamps, were recorded in less than half of that
+    time, as the history of a publisher for a late recorder is: a pause in it is no step of a clock.
+    """
+    recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
+    span_ns = stamp_ns[-1] - stamp_ns[recent][0]
+    rise_ns = offset_ns[-1] - offset_ns[recent][0]
+    return bool(rise_ns > max(STEP_NS, span_ns // 2))
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str:
