@@ -22,16 +22,10 @@ POLICY = (
     / "security"
     / "flight.policy.xml"
 )
-HEAD = ("| topic | from -> to | keeps | channels, or message and content |", "|---|---|---|---|")
+HEAD = ("| topic | from -> to | channels, or message and content |", "|---|---|---|")
 FURTHER_ROWS = (
-    (
-        "| `commands` | `rise-di import` -> log | | trim + u by input, SI, of a flight of another "
-        "program |"
-    ),
-    (
-        "| `alive/<role>` | all nodes, in lockstep | | `std_msgs/msg/String`; carries the "
-        "liveliness of the middleware |"
-    ),
+    "| `commands` | `rise-di import` -> log | trim + u by input, SI, of an imported flight |",
+    "| `alive/<role>` | all nodes, in lockstep | `std_msgs/msg/String`; liveliness |",
 )
 POLICY_COMMENT = """ SPDX-FileCopyrightText: RISE-DI contributors
      SPDX-License-Identifier: Apache-2.0
@@ -79,7 +73,7 @@ def table() -> str:
 def _row(topic: Topic) -> str:
     ends = topic.ends.replace("nodes", "all nodes").replace("_", " ")
     message = "" if topic.message == VECTOR else f"`{topic.message}`; "
-    return f"| `{topic.name}` | {ends} | {topic.keeps} | {message}{topic.meaning} |"
+    return f"| `{topic.name}` | {ends} | {message}{topic.meaning} |"
 
 
 def page() -> str:

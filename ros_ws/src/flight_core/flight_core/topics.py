@@ -76,12 +76,12 @@ U = Topic(
 )  # fmt: skip
 U_M = Topic(
     "u_m", VECTOR, "guidance, external -> reference_model, log",
-    "[live commands](#live-commands) by output; optional phi, theta (rad) for their ending",
+    "[live commands](#live-commands) by output; optional phi, theta (rad)",
 )  # fmt: skip
 POSE = Topic(
     "pose", VECTOR, "aircraft, bridge -> guidance, log",
-    "phi, theta, psi, beta (rad), north, east, altitude (m), v_north, v_east, climb (m/s), "
-    "those that are [known](#pose-and-wind)",
+    "[known](#pose-and-wind) of phi, theta, psi, beta (rad), north, east, altitude (m), v_north, "
+    "v_east, climb (m/s)",
 )  # fmt: skip
 GUIDANCE = Topic(
     "guidance", VECTOR, "guidance -> log",
@@ -131,7 +131,7 @@ INTERNALS = Topic("internals", VECTOR, "controller -> guidance, learner, monitor
 TRUTH = Topic("truth", VECTOR, "aircraft -> log", "below")
 PROPOSAL = Topic(
     "proposal", DIAGNOSTIC, "learner -> controller, log",
-    "what was learned, digests, parameters as JSON ([learning](learning.md#the-learners-node))",
+    "what was learned, digests, parameters as JSON",
     only_with="learner",
 )  # fmt: skip
 LEARNED = Topic(
@@ -146,14 +146,14 @@ LEARNING = Topic(
 )  # fmt: skip
 AUTHORITY = Topic(
     "authority", VECTOR, "controller -> guidance, log",
-    "`down.*` and `up.*` by output: least change by its input, units/s "
-    "([limits](guidance.md#limits-that-were-learned))",
+    "`down.*`, `up.*` by output: [least change](guidance.md#limits-that-were-learned) by its "
+    "input, units/s",
     only_with="learner",
 )  # fmt: skip
 EFFECTS = Topic(
     "effects", VECTOR, "controller -> bridge, log",
-    "by input: the largest part of its effect that fits the last seconds, 1e9 without a probe "
-    "([stuck surfaces](laws.md#stuck-surfaces))",
+    "by input: the largest [part of its effect](laws.md#stuck-surfaces) that fits the last "
+    "seconds, 1e9 without a probe",
     only_with="probe",
 )  # fmt: skip
 DIAGNOSTICS = Topic(
@@ -162,11 +162,11 @@ DIAGNOSTICS = Topic(
 )  # fmt: skip
 ROSOUT = Topic(
     "/rosout", "rcl_interfaces/msg/Log", "nodes, monitor, external -> log",
-    "of ROS 2: the log lines",
+    "log lines",
 )  # fmt: skip
 PARAMETER_EVENTS = Topic(
     "/parameter_events", "rcl_interfaces/msg/ParameterEvent", "nodes, monitor, external -> log",
-    "of ROS 2: changes of parameters",
+    "changes of parameters",
 )  # fmt: skip
 WOULD_SEND = Topic(
     "bridge/would_send", VECTOR, "bridge -> log",
@@ -175,7 +175,7 @@ WOULD_SEND = Topic(
 )  # fmt: skip
 ENGAGEMENT = Topic(
     "bridge/engagement", KEY_VALUE, "bridge -> monitor, log",
-    "DISENGAGED, ENGAGING, ENGAGED, NEUTRAL or RELEASE, and why it is not engaged",
+    "DISENGAGED, ENGAGING, ENGAGED, NEUTRAL or RELEASE, and why",
     only_with="bridge",
 )  # fmt: skip
 START = Topic(
@@ -190,8 +190,7 @@ NODE_STATE = Topic(
 )  # fmt: skip
 CLOCKS = Topic(
     "clocks", VECTOR, "nodes -> nodes",
-    "in real time, at 1 Hz: least time of reception less that of sending by node, s ([two "
-    "hosts](fleets.md#two-hosts))",
+    "in real time, at 1 Hz: least [reception less sending](fleets.md#two-hosts) by node, s",
     keeps=NOTHING,
 )  # fmt: skip
 CLOCK = Topic(
