@@ -23,18 +23,18 @@ from rise_di_controller.params import ControllerConfig
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
 
-For you who write or change a scenario file: every key, by section. [Get started](../get-started.md) has those that you meet first. A
-key that is not here is refused. Two sections of a file:
+For you who write or change a scenario file: every key, by section. [Get started](../get-started.md) has those that you meet first. Two sections of a
+file:
 
 ```yaml
 /**/flight: {ros__parameters: {duration: 60.0}}
 /**/aircraft: {ros__parameters: {airframe: osprey, rate: 500.0, step: 0.002, sensors: {noise: [0.0017, 0.03, 0.0017, 0.0017]}}}
 ```
 
-SI and radians, if nothing else is said. Without a type a value is a number. `= 0.2` is a default. A key without a default and
-without *optional* is required. A list has an entry a channel. No number is above 1e9 in size, no time limit above 1e6 s. The
-instant `.inf` is never. `examples/scenarios/` has files that set the rarer keys. The node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this
-page: `python -m tools.parameters`.
+Units are SI and radians. Without a type a value is a number. `= 0.2` is a default. A key without a default and without *optional* is required.
+A list has an entry a channel. No number is above 1e9, no time limit above 1e6 s. The instant `.inf` is never.
+Optional keys of `guidance` follow [rules](../guidance.md#numbers-by-rule). `examples/scenarios/` sets the rarer keys.
+The node `bridge` has no section: `-p` sets its keys. `python -m tools.parameters` writes this page.
 """  # noqa: E501 - a text as it is written
 SHARED = {
     "lockstep": "run in lockstep with the other nodes",
@@ -165,6 +165,8 @@ def _bounds(rules: Mapping[str, Any]) -> str:
         limits["gt"] = 0.0
     if "gt" in limits:
         limits.pop("ge", None)
+    if limits.keys() == {"ge", "le"}:
+        return f"{limits['ge']:g} to {limits['le']:g}"
     return ", ".join(f"{signs[rule]} {limit:g}" for rule, limit in sorted(limits.items()))
 
 

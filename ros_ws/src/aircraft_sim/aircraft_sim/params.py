@@ -83,9 +83,7 @@ class AircraftChannels(NamedTuple):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(
-        description="a name of the library, the path of a file, jsbsim:NAME or jsbsim:PATH"
-    )
+    airframe: str = Field(description="name, path of a file, jsbsim:NAME or jsbsim:PATH")
     speed: Positive | None = Field(
         default=None, description="of JSBSim: true airspeed of the trim, m/s"
     )
@@ -94,8 +92,7 @@ class AircraftConfig(NodeConfig):
     )
     commands: dict[str, str] = Field(
         default={},
-        description="of JSBSim: by input, the model's own properties, each with its value at "
-        "the command 1",
+        description="of JSBSim: by input, properties with their values at the command 1",
     )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
@@ -121,26 +118,23 @@ class AircraftConfig(NodeConfig):
     )
     kinematics: Literal["linear", "euler", "thrust"] = Field(
         default="linear",
-        description="the attitude by A, or by Euler's equations with the loss of lift in a "
-        "bank, for guidance; thrust: of a multicopter, which its tilt accelerates",
+        description="the attitude by A; by Euler's equations with the loss of lift in a bank; of a "
+        "multicopter",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
     )
-    shear: ShearConfig | None = Field(
-        default=None, description="how the steady wind changes with the height; none: not at all"
-    )
+    shear: ShearConfig | None = Field(default=None, description="steady wind over the height")
     microburst: MicroburstConfig | None = Field(default=None, description="a microburst; none")
     uncertainty: UncertaintyConfig = Field(
-        default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
+        default=UncertaintyConfig(), description="deviation from the airframe"
     )
     drift: DriftConfig | None = Field(
         default=None, description="how A and B change in flight, as by ice"
     )
     over_airspeed: str | None = Field(
         default=None,
-        description="the input that is a thrust: A, B and the trim follow the airspeed; none: "
-        "of the trim speed",
+        description="the the thrust, if A, B and the trim follow the airspeed",
     )
     actuators: ActuatorConfig = Field(
         default=ActuatorConfig(), description="the actuators; ideal where left out"

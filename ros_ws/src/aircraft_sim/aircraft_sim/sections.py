@@ -51,8 +51,7 @@ class TurbulenceConfig(Config):
     )
     rotary: bool = Field(
         default=False,
-        description="whether the air turns, too: p_g, q_g, r_g of the specification, by the span "
-        "of the airframe",
+        description="whether the air turns, too: p_g, q_g, r_g",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
@@ -203,16 +202,14 @@ class UncertaintyConfig(Config):
     )
     distribution: Distribution = Field(
         default="uniform",
-        description="of d: uniform, normal (limit at three standard deviations), its limits",
+        description="of d: normal: limit at three standard deviations; corners: its limits",
     )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
-        description="effect of wind on x_dot: by the aircraft's own A, or as published",
+        description="effect of wind: by the aircraft's own A, or as published",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(
-        default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on"
-    )
+    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft")
 
     def _check(self) -> None:
         require(
@@ -242,9 +239,7 @@ class DriftConfig(Config):
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(
-        default=0, ge=0, lt=2**32, description="the number of the seed's change, from 0 on"
-    )
+    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's change")
 
     def _check(self) -> None:
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
@@ -284,13 +279,13 @@ class ActuatorConfig(Config):
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
     faults: tuple[str, ...] = Field(
         default=(),
-        description="faults: INPUT KIND AT, at a time in s, perhaps how strong: aileron lost 60",
+        description="INPUT KIND AT, s, perhaps how strong: aileron lost 60",
     )
     delay: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description="delay of u before the actuators, s; whole periods of the aircraft",
+        description="delay of u, s; whole periods of the aircraft",
     )
 
     @classmethod
@@ -331,7 +326,7 @@ class SensorConfig(Config):
         default=0.0,
         ge=0,
         le=10,
-        description="delay from measurement to arrival, s; whole periods of `rate`",
+        description="delay, s; whole periods of `rate`",
     )
     dropout: float = Field(
         default=0.0, ge=0, lt=1, description="the probability that a sample is lost"
@@ -354,7 +349,7 @@ class PoseConfig(Config):
         default=0.0,
         ge=0,
         le=10,
-        description="from measurement to arrival, s; whole periods of the aircraft",
+        description="delay, s; whole periods of the aircraft",
     )
     bias: PerPose = Field(default={}, description="constant errors")
     drift: dict[str, NonNegative] = Field(

@@ -99,15 +99,11 @@ class GuidanceConfig(NodeConfig):
     roll_authority: Positive | None = Field(
         default=None, description="roll acceleration of full aileron, rad/s^2"
     )
-    stall_speed: Positive | None = Field(
-        default=None, description="V_s, true airspeed, m/s; none: 1.15 V_s is 0.8 V0"
-    )
-    speed_limit: Positive | None = Field(
-        default=None, description="largest true airspeed, m/s; none: 1.4 V0"
-    )
+    stall_speed: Positive | None = Field(default=None, description="V_s, true airspeed, m/s")
+    speed_limit: Positive | None = Field(default=None, description="largest true airspeed, m/s")
     ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose`")
     altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose`")
-    wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
+    wind: NonNegative = Field(default=0.0, description="the largest wind, m/s")
     drag: Positive | None = Field(
         default=None,
         description="of a multicopter: g tan(tilt) / V in steady flight, 1/s; none: an airplane",
@@ -118,34 +114,28 @@ class GuidanceConfig(NodeConfig):
     )
     roll_rate: Positive | None = Field(
         default=None,
-        description="largest rate of the bank p_max, rad/s; none: by the aileron's authority",
+        description="largest rate of the bank p_max, rad/s",
     )
     load: Positive = Field(default=0.3, description="largest change of the load factor by pitch, 1")
     pitch: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(math.radians(-15.0), math.radians(25.0)),
         description="least and largest pitch, rad",
     )
-    climb: Positive | None = Field(
-        default=None, description="largest climb rate, m/s; none: by the throttle's authority"
-    )
-    sink: Positive | None = Field(
-        default=None, description="largest sink rate, m/s; none: by the throttle's authority"
-    )
+    climb: Positive | None = Field(default=None, description="largest climb rate, m/s")
+    sink: Positive | None = Field(default=None, description="largest sink rate, m/s")
     acceleration: Positive = Field(
         default=1.0, description="permitted vertical acceleration, m/s^2"
     )
     altitude_gain: Positive | None = Field(
-        default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule"
+        default=None, description="k_h, climb rate per altitude error, 1/s"
     )
     alpha_time: Positive | None = Field(
-        default=None, description="time constant of the estimated angle of attack, s; none: by rule"
+        default=None, description="time constant of the estimated angle of attack, s"
     )
     sideslip_gain: NonNegative | None = Field(
-        default=None, description="k_beta, 1/s, with beta in `pose`; none: by rule"
+        default=None, description="k_beta, 1/s, with beta in `pose`"
     )
-    period: Positive | None = Field(
-        default=None, description="period of path following, s; none: by rule"
-    )
+    period: Positive | None = Field(default=None, description="period of path following, s")
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(
         default=0.8, description="damping of path following, 1"
     )
@@ -153,7 +143,7 @@ class GuidanceConfig(NodeConfig):
         default=math.radians(60.0), description="largest angle at which a path is approached, rad"
     )
     radius: Positive | None = Field(
-        default=None, description="radius of fillets and of the last orbit, m; none: by rule"
+        default=None, description="radius of fillets and of the last orbit, m"
     )
     profile: Literal["slope", "step"] = Field(
         default="slope", description="altitude changes along a leg, or at its begin"
@@ -166,8 +156,7 @@ class GuidanceConfig(NodeConfig):
     )
     origin: Annotated[Numbers, Field(min_length=3, max_length=3)] | None = Field(
         default=None,
-        description="latitude, longitude (deg) and height above WGS84 (m) of north = east = "
-        "altitude = 0",
+        description="latitude, longitude (deg) and height above WGS84 (m) of the origin",
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteConfig | None = Field(
@@ -184,7 +173,7 @@ class GuidanceConfig(NodeConfig):
     )
     home: HomeConfig = Field(
         default=HomeConfig(),
-        description="where the aircraft goes at a fence and by `guidance/home`",
+        description="where the aircraft goes at a fence",
     )
 
     def _check(self) -> None:

@@ -92,7 +92,7 @@ class ZoneConfig(Config):
     exclude: bool = Field(default=False, description="keep out of the zone, not in")
     group: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="of zones to stay in: inside every zone of one group at least; none: its own",
+        description="the aircraft stays in all zones of a group; none: its own",
     )
 
     def _check(self) -> None:
@@ -145,11 +145,10 @@ class LandingConfig(Config):
     """
 
     waypoint: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        description="number of the waypoint on the ground, from 0 on; its altitude is that of the "
-        "pose on the wheels"
+        description="number of the waypoint on the ground, from 0 on"
     )
     flare: Positive | None = Field(
-        default=None, description="height of the flare, m; none: 5 s of the sink of the glide path"
+        default=None, description="height of the flare, m; none: 5 s of sink"
     )
     sink: Positive = Field(default=0.5, description="sink at the touch, m/s")
     decrab: NonNegative = Field(

@@ -76,7 +76,7 @@ class FeedforwardConfig(Config):
         default=None, description="the inputs with a feedforward; all where absent"
     )
     deviation: NonNegatives | None = Field(
-        default=None, description="standard deviations of B, for the limits of guidance; none: 0"
+        default=None, description="standard deviations of B, for the limits of guidance"
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
@@ -226,7 +226,7 @@ class AllocationConfig(Config):
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
         default=None,
-        description="the inputs, the one that keeps its effect the longest first; none: in order",
+        description="the inputs by how long they keep their effect; none: in order",
     )
 
     def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":

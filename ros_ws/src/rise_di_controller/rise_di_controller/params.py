@@ -114,7 +114,7 @@ class ControllerConfig(NodeConfig):
     autostart: bool = Field(default=True, description="configure the node at start")
     start_active: bool = Field(
         default=True,
-        description="activate it too; else u is at trim until another node does",
+        description="activate it too; else u is at trim",
     )
     allocation: AllocationConfig | None = Field(
         default=None, description="extension: distributes the inputs of the law to effectors"

@@ -34,8 +34,8 @@ class ProbeConfig(Config):
 
     effect: NonNegatives | None = Field(
         default=None,
-        description="amplitude of each output by the sine on its input, units of y; 0: not "
-        "probed; none: 0.02 rad/s of p, q, r, else 0",
+        description="amplitude of each output by its sine; 0: not probed; none: 0.02 rad/s of "
+        "p, q, r, else 0",
     )
     lowest: Positive = Field(
         default=1.5, description="lowest frequency of a sine, Hz: above the commands of guidance"
@@ -45,8 +45,7 @@ class ProbeConfig(Config):
     )
     false_alarm: Annotated[float, Field(ge=1e-9, le=0.05)] = Field(
         default=1e-3,
-        description="largest probability of a window to call an input stuck that has the least "
-        "effect",
+        description="largest probability of a false alarm in a window",
     )
 
     def amplitudes(self, outputs: tuple[str, ...]) -> FloatArray:

@@ -83,8 +83,8 @@ class PriorConfig(Config):
     )
     off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
         default=None,
-        description="how rough it is: standard deviation of the entries of A and B over their "
-        "values; none: 0.29, that of +-50 %",
+        description="standard deviation of its entries over their values; none: 0.29, that of "
+        "+-50 %",
     )
 
 
@@ -101,14 +101,12 @@ class LearnConfig(Config):
         description="when identifications begin, from the first tick, s; then one a window",
     )
     check: Annotated[float, Field(ge=1, le=600)] = Field(
-        default=10.0, description="after these times: period of the test for a changed aircraft, s"
+        default=10.0, description="then: period of the test for a changed aircraft, s"
     )
-    prior: PriorConfig | None = Field(
-        default=None, description="the rough model; none: the airframe"
-    )
+    prior: PriorConfig | None = Field(default=None, description="the rough model")
     without: tuple[str, ...] | None = Field(
         default=None,
-        description="outputs without a learned model; the controller adds parts that oscillate",
+        description="outputs without a learned model",
     )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
@@ -147,8 +145,7 @@ class RiseDiConfig(ControllerConfig):
         description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)"
     )
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
-        description="how the sign of (21) is sampled; auto: implicit with lag and delay below "
-        "half a period, else soft"
+        description="how the sign of (21) is sampled; auto: implicit or soft"
     )
     softening: Positive | Positives = Field(
         description="width of the softened sign in total lags; stable above 1, 3 is usual"
