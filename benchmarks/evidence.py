@@ -49,12 +49,12 @@ BASELINE = " x baseline"  # end of a goal on a ratio
 HEAD = """\
 # Evidence
 
-For you if you want to check a figure. A program writes this page from `docs/evidence/`. Each link leads to the figures of a
-measurement, with goals, command, revision, host and date; `docs/evidence/tables/` has tables of other pages.
-`make evidence ARGS="--again NAME"` measures again: NAME is that of the file. The programs of learning, guidance and real
-autopilots write their files themselves. Limits of all measurements: one host, the loopback interface, simulated aircraft. In
-turbulence a figure is the worst of the seeds. A baseline is the least program that does the same on this host. Flights of real
-autopilots before 2026-11-23 take the times of their commands some seconds early: their rms is to be measured again.
+For you if you want to check a figure. Each link leads to the figures of a measurement, with goals, command, revision, host and date;
+`docs/evidence/tables/` has tables of other pages. `make evidence ARGS="--again NAME"` measures again and writes this page: NAME is that
+of the file. The programs of learning, guidance and real autopilots write their files themselves. Limits of all measurements: one host,
+the loopback interface, simulated aircraft. In turbulence a figure is the worst of the seeds. A baseline is the least program that does
+the same on this host. Flights of real autopilots before 2026-11-23 take the times of their commands some seconds early: measure their
+rms again.
 """  # noqa: E501 - a text as it is written
 
 
@@ -174,8 +174,8 @@ def write_page() -> None:
         lines += [
             f"## {section}",
             "",
-            "| measurement | goals met, and missed | date |",
-            "|---|---|---|",
+            "| measurement | goals met, and missed |",
+            "|---|---|",
         ]
         for name, measurement in measurements.items():
             lines.append(_line(FOLDER / f"{name}.csv", measurement["title"]))
@@ -185,7 +185,7 @@ def write_page() -> None:
 
 def _line(path: Path, title: str) -> str:
     if not path.exists():
-        return f"| {title} | not measured | - |"
+        return f"| {title} | not measured |"
     with path.open(newline="") as stream:
         lines = list(csv.reader(stream))[1:]
     figures = {line[0]: Row(*line[:5]) for line in lines}
@@ -208,9 +208,9 @@ def _line(path: Path, title: str) -> str:
             f"{figure.name} **{text}** ({figure.goal})",
         )
     passed = f"{met} of {len(judged)}" if judged else "-"
-    goals = "; ".join([passed, *missed.values()])
-    busy = ", busy host" if BUSY in origin.host else ""
-    return f"| [{title}](evidence/{path.name}) | {goals} | {origin.date[:10]}{busy} |"
+    busy = ["busy host"] if BUSY in origin.host else []
+    goals = "; ".join([passed, *missed.values(), *busy])
+    return f"| [{title}](evidence/{path.name}) | {goals} |"
 
 
 def origin(command: str) -> Origin:
