@@ -15,7 +15,7 @@ import pytest
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
-from tests.conftest import refusing
+from tests.conftest import REPOSITORY, refusing
 from tests.nodes.world import OUTPUTS, World, diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
@@ -28,14 +28,16 @@ from flight_guidance.reach import AUTHORITY
 
 TICK_NS = 20_000_000
 MAX_AGE = 0.2  # s, of y and pose: the default
+SQUARE = REPOSITORY / "examples/px4_quadrotor/square.yaml"
 LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
 class Flight:
     """A guidance node; the test is aircraft, controller and operator."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, outputs: tuple[str, ...] = OUTPUTS) -> None:
         self.world = world
+        self.outputs = outputs
         self.node: Any = world.start(GuidanceNode)
         self.mode: float = ControllerMode.ENGAGED
         self.has_pose = True
@@ -43,7 +45,7 @@ class Flight:
 
     def send(self) -> None:
         """One y, one pose and one sample of internals, stamped now."""
-        self.world.send("/y", dict.fromkeys(OUTPUTS, 0.0), "/aircraft#1")
+        self.world.send("/y", dict.fromkeys(self.outputs, 0.0), "/aircraft#1")
         self.world.send("/internals", {"mode": self.mode}, "/controller#1")
         if self.has_pose:
             pose = dict.fromkeys(POSE, 0.0) | LEVEL
@@ -118,6 +120,15 @@ def test_there_is_no_command_before_controller_engaged(tmp_path: Path) -> None:
         flight.mode = ControllerMode.ENGAGED
         flight.run()
         assert world.sent["/u_m"]
+
+
+def test_multicopter_has_commands_and_a_place_on_a_map(tmp_path: Path) -> None:
+    path = tmp_path / "square.yaml"
+    path.write_text(scenario_yaml(find_scenario(str(SQUARE))))
+    with world_of("--params-file", str(path)) as world:
+        Flight(world, ("q", "vertical_speed", "p", "r")).run(0.2)
+        assert world.sent["/u_m"]
+        assert world.sent["/odometry"]
 
 
 def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:

@@ -361,7 +361,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(placed.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
-        r = yaw_rate(y, pose["phi"], pose["theta"], self.parameters.speed + y["V"])
+        speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, and measures r
+        r = yaw_rate(y, pose["phi"], pose["theta"], speed)
         for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message
