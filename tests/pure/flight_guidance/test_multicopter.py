@@ -107,6 +107,21 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
     assert guidance_notices(tape, scenario.guidance) == []
 
 
+def test_wait_hovers_at_its_waypoint_for_its_time_and_the_flight_goes_on() -> None:
+    route = {"north": [0, 8, 8], "east": [0, 0, 8], "altitude": [2.0] * 3, "wait": [0, 4, 0]}
+    scenario, tape = flight(26.0, route=route)
+    log = tape["guidance"]
+    t = tape.time("guidance")
+    beside = np.hypot(log["pose.north"] - 8.0, log["pose.east"])
+    hovers = (log["leg"] == 1) & (log["loitered"] > 0.0)
+    assert np.ptp(t[hovers]) == approx(4.0, abs=0.05)
+    assert np.max(beside[hovers]) < 1.5  # within 0.5 s of flight at 3 m/s, where the time begins
+    assert beside[hovers][-1] < 0.8
+    assert [leg.result for leg in flown_legs(tape)] == ["flown"] * 3 + ["not ended"]
+    assert math.hypot(log["pose.north"][-1] - 8.0, log["pose.east"][-1] - 8.0) < 1.0
+    assert replay_guidance(tape, scenario.guidance).equal()
+
+
 def test_attitude_heading_and_climb_are_held_apart() -> None:
     program = commanded(phi=0.15, theta=-0.1, heading=1.2, climb=0.5)
     _, tape = flight(9.0, program=program)
@@ -178,8 +193,8 @@ def test_reference_model_levels_a_multicopter_whose_guidance_is_lost() -> None:
 def test_what_no_multicopter_flies_is_refused() -> None:
     with refusing("drag: found None, expected g tan"):
         SQUARE.vary(guidance={"drag": None})
-    with refusing(r"route\[1\]: found turns, a wait or a leave"):
-        SQUARE.vary(guidance={"route": ROUTE | {"wait": [0, 5, 0, 0, 0]}})
+    with refusing(r"route\[1\]: found turns or a leave, .*`wait` hovers"):
+        SQUARE.vary(guidance={"route": ROUTE | {"turns": [0, 1, 0, 0, 0]}})
     with refusing(r"radius: found 2 m, expected at least 5\.3 m at 3 m/s"):
         SQUARE.vary(guidance={"radius": 2.0})
     with refusing("kinematics: found 'linear' beside guidance, expected thrust"):

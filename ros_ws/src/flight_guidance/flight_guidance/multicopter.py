@@ -41,8 +41,8 @@ from flight_guidance.guidance_state import (
     Vertical,
 )
 from flight_guidance.lateral import PathError
-from flight_guidance.legs import on_leg, on_profile
-from flight_guidance.path import Point, Route
+from flight_guidance.legs import has_loitered, on_leg, on_profile
+from flight_guidance.path import Arc, Point, Route
 from flight_guidance.targets import home
 from flight_guidance.vertical import VerticalParams, climb_for, slewed
 from flight_guidance.ways import line_clearance, ways
@@ -127,7 +127,7 @@ def step(
     state = _begin(state, inputs, pose, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, pose, dt, params)
-    state, missed = _with_commands(state, inputs.commands, pose, route, params)
+    state, missed = _with_commands(state, inputs.commands, pose, dt, route, params)
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
     flies = state.mode is Mode.ENGAGED
@@ -244,6 +244,7 @@ def _with_commands(
     state: GuidanceState,
     commands: Mapping[str, float],
     pose: Mapping[str, float],
+    dt: float,
     route: Route | None,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, float]:
@@ -254,7 +255,7 @@ def _with_commands(
     missed = 0.0
     moved = lateral.keys() & commands.keys()
     if state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and route and not moved:
-        state, missed = _along_route(state, pose, route)
+        state, missed = _along_route(state, pose, dt, route)
     state = state._replace(target=state.target._replace(**commands))
     if state.fence >= HOME and moved:
         state = state._replace(fence=0.0)
@@ -280,19 +281,19 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
 
 
 def _stops(route: Route, number: int) -> bool:
-    """Whether an aircraft stops at the end of a leg: before the last place, and where a corner has
-    no fillet.
+    """Whether an aircraft stops at the end of a leg: before a hover, and where a corner has no
+    fillet.
     """
     following = next(iter(route.legs[number + 1 :]), None)
-    leg = route.legs[number]
-    return bool(path.turns_back(leg, following)) or number + 2 == len(route.legs)
+    hovers = following is not None and path.is_orbit(following)
+    return hovers or bool(path.turns_back(route.legs[number], following))
 
 
 def _along_route(
-    state: GuidanceState, pose: Mapping[str, float], route: Route
+    state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """The state on the leg once its start is reached, or on the next leg once the leg is passed;
-    and the distance missed by, m.
+    """The state on the leg once its start is reached, or on the next leg once the leg is passed or
+    its wait is over; and the distance missed by, m.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -303,6 +304,12 @@ def _along_route(
         return (on_leg(state, state.leg, route) if joins else state), 0.0
     if leg.end is None:
         return state, 0.0
+    if isinstance(leg, Arc) and leg.loiter is not None:
+        if state.loitered or _is_near(state, pose, leg.centre):
+            share = dt / leg.loiter.wait
+            state = state._replace(loitered=min(state.loitered + share, 1.0))
+        ends = has_loitered(state, pose, route)
+        return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     ends = path.passed(leg, position)
     if _stops(route, state.leg):
         ends = ends or _is_near(state, pose, leg.end)

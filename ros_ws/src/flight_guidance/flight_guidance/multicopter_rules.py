@@ -10,7 +10,7 @@ from flight_core.units import GRAVITY
 from flight_guidance import path, reach
 from flight_guidance.feasibility import Performance, as_route, require_bounds, speeds
 from flight_guidance.guidance_state import MulticopterParams
-from flight_guidance.path import Arc, Route
+from flight_guidance.path import Arc, Leg, Loiter, Route
 from flight_guidance.route_file import Waypoint
 
 BRAKING = 0.3
@@ -54,22 +54,36 @@ def gains(
 def route_through(
     waypoints: Sequence[Waypoint], radius: float | None, braking: float, can: Performance
 ) -> Route:
-    """Lines with fillets through waypoints, and a hover at the last one: its leg is a circle of the
-    radius of the fillets within which the place counts as reached.
+    """Lines with fillets through waypoints, and a hover at the last one and at each `wait`, which
+    the aircraft reaches by a line without a fillet: its leg is a circle of the radius of the
+    fillets within which the place counts as reached.
 
     Altitudes change along the lines. `braking`, m/s^2, bounds the curvature. Raises ParameterError
-    for a waypoint beyond the bounds, and for circles and waits, which a multicopter does not fly.
+    for a waypoint beyond the bounds, and for circles, which a multicopter does not fly.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require_bounds(waypoints, can)
-    expected = "none: a multicopter hovers at the last waypoint alone"
     for k, waypoint in enumerate(waypoints):
-        require(not waypoint.loiters, f"route[{k}]", "turns, a wait or a leave", expected)
+        circles = waypoint.turns > 0.0 or waypoint.departure != waypoint.altitude
+        expected = "neither: a multicopter flies no circle; `wait` hovers"
+        require(not circles, f"route[{k}]", "turns or a leave", expected)
     fastest = max(speeds(waypoints, can.speed))
     least = fastest**2 / braking
     radius = radius or math.ceil(10.0 * least) / 10.0
     expected = f"at least {least:.1f} m at {fastest:g} m/s"
     require(radius >= 0.99 * least, "radius", f"{radius:g} m", expected)
+    return as_route(tuple(_legs(waypoints, radius)), waypoints, can.speed, slopes=True)
+
+
+def _legs(waypoints: Sequence[Waypoint], radius: float) -> list[Leg]:
+    """Lines with fillets between the hovers; the last hover has no end."""
     points = [waypoint.point for waypoint in waypoints]
-    legs = (*path.filleted(points, radius), Arc(points[-1], radius))
-    return as_route(legs, waypoints, can.speed, slopes=True)
+    legs: list[Leg] = []
+    first = 0
+    for k, waypoint in enumerate(waypoints[:-1]):
+        if waypoint.wait:
+            legs += path.filleted(points[first : k + 1], radius, first)
+            legs.append(Arc(points[k], radius, points[k], Loiter(wait=waypoint.wait)))
+            first = k
+    legs += path.filleted(points[first:], radius, first)
+    return [*legs, Arc(points[-1], radius)]

@@ -44,7 +44,7 @@ class Waypoint(NamedTuple):
     # airspeed on the leg to the waypoint, m/s; None: as on the leg before
     speed: float | None = None
     turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
-    wait: float = 0.0  # time on the circle round the waypoint, s
+    wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
     leave: float | None = (
         # altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`
         None
