@@ -5,10 +5,10 @@
 import numpy as np
 import pytest
 
+import rise_di
 from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.account import Account, account
+from flight_analysis.report.account import Account
 from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.loop_lost import lost_parts
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
@@ -88,9 +88,7 @@ def test_outcome_of_an_unstable_flight_has_a_status() -> None:
     servo = find_scenario("osprey_servo")
     late = servo.vary(aircraft={"actuators": {"delay": 0.08}}, flight={"duration": 12.0})
     assert margins(late).delay < 0.08
-    tape = simulate(late)
-    assert tape.outcome == COMPLETED
-    outcome = final_outcome(tape.outcome, account(tape, late))
+    outcome = rise_di.simulate(late).outcome
     assert outcome.startswith("completed, loop lost: the true error of q oscillated by 0.1")
     assert exit_status(outcome) == STATUS_INCOMPLETE
     assert final_outcome(outcome, Account(10.0, {}, ())) == COMPLETED  # a report made again

@@ -8,7 +8,6 @@ from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
 from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
-from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import best_error_over as best_error
 from flight_analysis.report.data_frame import data_frame
@@ -30,6 +29,7 @@ from flight_log.tape_reader import RecordedRun
 from rise_di.c_code import Exported, export
 from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
 from rise_di.flight_env import FlightEnv, FlightVectorEnv
+from rise_di.in_memory import simulate
 from rise_di.own_airframe import NewAirframe, new_airframe
 from rise_di.own_loop import Loop, as_control, fly_plant
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits

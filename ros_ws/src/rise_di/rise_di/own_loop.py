@@ -6,11 +6,14 @@ in python-control.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flight_analysis.report.account import account
+from flight_analysis.report.flight_outcome import final_outcome
 from flight_core.arguments import as_number
 from flight_core.installation import require_package
 from flight_core.modes import Mode
@@ -173,7 +176,7 @@ def fly_plant(
 
     `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
     Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
-    flight early, with the reason in `outcome` of the tape.
+    flight early, with the reason in `outcome` of the tape, which also tells of a lost loop.
 
     Args:
         plant: plant(t, u, dt) -> y: t, dt in s, u (p,), y (m,), SI, deviations from trim.
@@ -225,7 +228,8 @@ def fly_plant(
         for topic, value in sample.items():
             rows[topic].append((t_ns, value))
     signals = {topic: _signal(names, rows[topic]) for topic, names in channels.items()}
-    return Tape(signals, outcome=outcome)
+    tape = Tape(signals, outcome=outcome)
+    return replace(tape, outcome=final_outcome(outcome, account(tape, None, outcome)))
 
 
 def _reference_model(

@@ -62,26 +62,11 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Fly a scenario in memory. A flight that diverges or is interrupted (Ctrl-C) ends early.
+    """The tape of a flight in memory, SI and radians, with the reason of an early end. Raises
+    ParameterError for no Scenario, and for one that learns without `learn`.
 
-    Args:
-        scenario: The flight.
-        progress: Called with the flight time, s, once per simulated second.
-        guide: Makes the guidance of a scenario with guidance.
-        control: Makes the controller from the parameters.
-        learn: Makes the learner of a scenario with a learner, as `learner` returns.
-        announce: Takes the events of the learning.
-
-    Returns:
-        The tape: signals of shape (N, k), SI and radians. `outcome` has the reason of an early end.
-
-    Raises:
-        ParameterError: `scenario` is no Scenario, or learns and `learn` is None.
-
-    Examples:
-        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> tape.outcome, tape["y"]["q"].shape
-        ('completed', (51,))
+    `progress` is called with the flight time, s, once per simulated second. `announce` takes the
+    events of the learning.
     """
     as_scenario(scenario)
     change = (

@@ -5,7 +5,8 @@ oscillates, or one that grows. Limits keep all three bounded, and such a flight 
 
 - Of the ticks of WINDOW, SATURATED or more have u of an input at a limit, SIDE or more on either
   side of u_free. A climb at full throttle stays on one side. A limit of the rate does not count:
-  noise reaches the rate of a slow engine to either side.
+  noise reaches the rate of a slow engine to either side. A swing between rate limits shows in e:
+  the loop is lost once e repeats itself or grows, and holds otherwise.
 - e repeats itself over WINDOW, `divergence.period`, with a mean square above `divergence.least`: a
   limit cycle, also of actuators whose limits the controller does not have.
 - The mean square of e over the last WINDOW is above FACTOR^2 times the largest before, and above

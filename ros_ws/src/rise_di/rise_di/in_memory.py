@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight in memory with the outcome that `rise-di fly` reports."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from flight_analysis.closed_loop.learning_loop import Learn
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate as fly_in_memory
+from flight_analysis.report.account import account
+from flight_analysis.report.flight_outcome import final_outcome
+from flight_core.tape import Tape
+from flight_guidance.guidance import Guidance
+from flight_guidance.params import GuidanceConfig
+from rise_di_controller.controller import Controller
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.proposals import Event
+
+
+def simulate(
+    scenario: Scenario,
+    progress: Callable[[float], None] | None = None,
+    guide: Callable[[GuidanceConfig], Guidance] = Guidance,
+    control: Callable[[ControllerConfig], Controller] = Controller,
+    learn: Learn | None = None,
+    announce: Callable[[Event], None] = lambda event: None,
+) -> Tape:
+    """Fly a scenario in memory. A flight that diverges or is interrupted (Ctrl-C) ends early.
+
+    Args:
+        scenario: The flight.
+        progress: Called with the flight time, s, once per simulated second.
+        guide: Makes the guidance of a scenario with guidance.
+        control: Makes the controller from the parameters.
+        learn: Makes the learner of a scenario with a learner, as `learner` returns.
+        announce: Takes the events of the learning.
+
+    Returns:
+        The tape: signals of shape (N, k), SI and radians. `outcome` is that of `rise-di fly`: the
+        reason of an early end, or "completed", with a lost loop, a missed leg and the time outside
+        of the fence.
+
+    Raises:
+        ParameterError: `scenario` is no Scenario, or learns and `learn` is None.
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> tape.outcome, tape["y"]["q"].shape
+        ('completed', (51,))
+    """
+    tape = fly_in_memory(scenario, progress, guide, control, learn, announce)
+    judged = account(tape, scenario, tape.outcome)
+    return replace(tape, outcome=final_outcome(tape.outcome, judged))
