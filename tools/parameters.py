@@ -32,7 +32,7 @@ file:
 ```
 
 Units are SI and radians. Without a type a value is a number. `= 0.2` is a default. A key without a default and without *optional* is required.
-A list has an entry a channel. No number is above 1e9, no time limit above 1e6 s. The instant `.inf` is never.
+A list has an entry a channel. NAME is a name of yours. No number is above 1e9, no time limit above 1e6 s. The instant `.inf` is never.
 Optional keys of `guidance` follow [rules](../guidance.md#numbers-by-rule). `examples/scenarios/` sets the rarer keys.
 The node `bridge` has no section: `-p` sets its keys. `python -m tools.parameters` writes this page.
 """  # noqa: E501 - a text as it is written
@@ -105,7 +105,7 @@ def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, st
             like = shown.setdefault(group, key)
             yield (
                 key,
-                "groups by name" if named else "group",
+                "groups" if named else "group",
                 meaning if like == key else f"{meaning}; keys as in `{like}`",
             )
             if like == key:
