@@ -22,7 +22,15 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.benchmark_course import build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Enter, Task, find_entry, task_of
-from flight_campaign.benchmark_scores import CHUNKS, SCORES, Benchmark, Definition, Flights, define
+from flight_campaign.benchmark_scores import (
+    CHUNKS,
+    SCORES,
+    Benchmark,
+    Definition,
+    Flights,
+    define,
+    drawn_release,
+)
 from flight_campaign.benchmark_sets import SCENARIOS, SETS, UNCERTAINTY, VERSION, Sets, seed_of
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
@@ -40,7 +48,7 @@ OSPREY = (
 
 
 def entry(enter: Enter) -> BenchmarkEntry:
-    return BenchmarkEntry("own", "y", "nothing", "", enter)
+    return BenchmarkEntry("own", "y", "nothing", {}, enter)
 
 
 @pytest.fixture
@@ -124,6 +132,39 @@ def test_entry_of_the_page_flies(
     assert pl.read_parquet(flights.fly(LATE, 3))["score"].to_numpy().max() < 10.0  # none is lost
 
 
+def test_digest_covers_each_module_that_the_entry_imports(
+    brief: Sets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also inside of a function, and relative to a package."""
+    (tmp_path / "entry_of_parts").mkdir()
+    files = {
+        "entered_law.py": "def enter(task):\n    import numpy, entry_of_parts.gains\n",
+        "entry_of_parts/__init__.py": "",
+        "entry_of_parts/gains.py": "from . import rows\n",
+        "entry_of_parts/rows.py": "K = 1.0\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = find_entry(["entered_law:enter"], brief, find_scenario)
+    names = {"entered_law", "entry_of_parts", "entry_of_parts.gains", "entry_of_parts.rows"}
+    assert set(before.sources) == {f"{name}.py" for name in names}
+    (tmp_path / "entry_of_parts" / "rows.py").write_text("K = 2.0\n")
+    assert find_entry(["entered_law:enter"], brief, find_scenario).source != before.source
+
+
+def test_seeds_are_drawn_once_a_run(brief: Sets, tmp_path: Path) -> None:
+    release = drawn_release(tmp_path)
+    assert re.fullmatch("[0-9a-f]{40}", release)
+    assert drawn_release(tmp_path) != release
+    flights = Flights(
+        entry(lambda task: PI), Sets({"osprey_servo": brief.scenario("gusts")}, release)
+    )
+    Benchmark(tmp_path, define(flights, 3, "0.0"), {"own.py": b"PI"})
+    assert drawn_release(tmp_path) == release
+    assert (tmp_path / "entry" / "own.py").read_bytes() == b"PI"
+
+
 def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path) -> None:
     flights = Flights(entry(lambda task: PI), brief)
     definition = define(flights, 3, "0.0")
@@ -179,7 +220,7 @@ def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Set
     [
         (["no_such_module:enter"], "found 'no_such_module:enter'"),
         (["osprey_servo", "osprey_gust"], "expected one scenario for each airframe"),
-        (["pi", "--release", "abc"], "found abc, expected the hash of a commit, 40 hex digits"),
+        (["pi", "--release", "abc"], "found abc, expected draw, or the hash of a commit, 40 hex"),
     ],
 )
 def test_command_refuses_with_a_sentence(words: list[str], sentence: str) -> None:

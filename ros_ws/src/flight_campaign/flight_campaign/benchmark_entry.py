@@ -4,11 +4,15 @@
 Python.
 """
 
+import ast
 import hashlib
-import inspect
+import importlib.util
 import json
+import site
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import sysconfig
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
@@ -16,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+import flight_core
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign.benchmark_sets import Sets, frame
@@ -33,6 +38,7 @@ TUNED_FOR = "osprey"
 TUNED_ON = "gust_turbulence"
 FIXED = ("rate", "outputs", "inputs", "lower", "upper")  # keys of the frame that no law changes
 NOT_STATED = "not stated"
+GAINS = "controllers.json"  # among the sources of an entry
 
 
 class Task(NamedTuple):
@@ -63,8 +69,18 @@ class BenchmarkEntry(NamedTuple):
     name: str
     sees: str  # measurements beside y_m
     knows: str  # of the aircraft, beside D
-    source: str  # SHA-256 of its gains or of its module
+    sources: Mapping[str, bytes]  # its gains and its modules by file name
     enter: Enter
+
+    @property
+    def source(self) -> str:
+        """SHA-256 of the names, sizes and bytes of the sources in the order of the names, "" for
+        none.
+        """
+        digest = hashlib.sha256()
+        for name, content in sorted(self.sources.items()):
+            digest.update(f"{name} {len(content)}\n".encode() + content)
+        return digest.hexdigest() if self.sources else ""
 
 
 def task_of(name: str, sets: Sets) -> Task:
@@ -155,9 +171,10 @@ def find_entry(
     first = words[0]
     if ":" in first and not first.endswith(".yaml"):
         require(len(words) == 1, "ENTRY", " ".join(words), "one MODULE:FUNCTION")
-        enter, source = _function(first)
+        enter = _function(first)
+        sources = sources_of([first.partition(":")[0]])
         return BenchmarkEntry(
-            name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter
+            name or first.replace(":", "."), sees or "y", knows or NOT_STATED, sources, enter
         )
     if first in REGISTERED:
         require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
@@ -181,15 +198,17 @@ def find_entry(
     )
 
 
-def _of_airframes(controllers: Mapping[str, ControllerConfig]) -> tuple[str, Enter]:
-    """Digest and entry of controllers by airframe."""
+def _of_airframes(
+    controllers: Mapping[str, ControllerConfig],
+) -> tuple[dict[str, bytes], Enter]:
+    """Sources and entry of controllers by airframe."""
     sections = {
         airframe: controller.model_dump(mode="json") for airframe, controller in controllers.items()
     }
-    modules = {type(controller) for controller in controllers.values()}
-    text = json.dumps(sections, sort_keys=True).encode() + b"".join(sorted(map(_source, modules)))
+    modules = {type(controller).__module__ for controller in controllers.values()}
+    gains = {GAINS: json.dumps(sections, sort_keys=True, indent=1).encode()}
     fixed = {airframe: _without_delay(section) for airframe, section in sections.items()}
-    return hashlib.sha256(text).hexdigest(), lambda task: fixed.get(task.airframe)
+    return gains | sources_of(modules), lambda task: fixed.get(task.airframe)
 
 
 def _without_delay(section: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,10 +225,8 @@ def _tuned(name: str, scenario: Scenario) -> ControllerConfig:
     return tuned_controller(name, tuned, build_benchmark(scenario))
 
 
-def _function(text: str) -> tuple[Enter, str]:
-    """A function by MODULE:FUNCTION, of an installed package or of a file of this folder, and the
-    digest of its module.
-    """
+def _function(text: str) -> Enter:
+    """A function by MODULE:FUNCTION, of an installed package or of a file of this folder."""
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:
@@ -220,12 +237,64 @@ def _function(text: str) -> tuple[Enter, str]:
             "here"
         ) from None
     require(callable(function), "ENTRY", text, "a function of a task")
-    return function, hashlib.sha256(_source(function)).hexdigest()
+    enter: Enter = function
+    return enter
 
 
-def _source(entry: Any) -> bytes:
-    """The source of the module of a function or a class."""
+def sources_of(modules: Iterable[str]) -> dict[str, bytes]:
+    """The source of some modules, and of each module imported by their statements at any depth,
+    by file name.
+
+    Modules of Python, of installed libraries and of the stack are left out: each version has one
+    source. The package of a module named first counts wherever the package lies.
+    """
+    waiting = list(modules)
+    packages = {name.partition(".")[0] for name in waiting}
+    libraries = [Path(folder).resolve() for folder in _libraries()]
+    sources: dict[str, bytes] = {}
+    seen: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        spec = _spec(name)
+        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+            continue
+        path = Path(spec.origin).resolve()
+        installed = any(path.is_relative_to(folder) for folder in libraries)
+        if name.partition(".")[0] in packages or not installed:
+            content = path.read_bytes()
+            sources[f"{name}.py"] = content
+            waiting += _imported(ast.parse(content), spec)
+    return sources
+
+
+def _libraries() -> set[str]:
+    """Folders of Python, of installed libraries, and of the packages of the stack."""
+    stack = Path(flight_core.__file__).parents[2]
+    python = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
+    return {*python, *site.getsitepackages(), site.getusersitepackages(), str(stack)}
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    """Where a module lies; None for a name that is no module."""
     try:
-        return Path(str(inspect.getsourcefile(entry))).read_bytes()
-    except (OSError, TypeError):
-        return b""
+        return importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None
+
+
+def _imported(tree: ast.Module, spec: ModuleSpec) -> list[str]:
+    """Names of modules in the import statements of a module, with names that may be a module."""
+    package = spec.name if spec.submodule_search_locations else spec.name.rpartition(".")[0]
+    names = []
+    for statement in ast.walk(tree):
+        if isinstance(statement, ast.Import):
+            names += [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom):
+            relative = "." * statement.level + (statement.module or "")
+            module = importlib.util.resolve_name(relative, package)
+            names += [module, *(f"{module}.{alias.name}" for alias in statement.names)]
+    parents = [name.rpartition(".")[0] for name in names]
+    return [*filter(None, parents), *names]

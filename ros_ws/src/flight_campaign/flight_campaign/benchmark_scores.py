@@ -5,9 +5,11 @@ file has the scores.
 """
 
 import json
-from collections.abc import Iterator
+import secrets
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,7 +23,16 @@ from flight_campaign.batch import Stepper
 from flight_campaign.batch_loop import FleetResult
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Step, Task, entered, stepped, task_of
-from flight_campaign.benchmark_sets import AFTER, BEFORE, SETS, UNCERTAINTY, VERSION, Sets, seed_of
+from flight_campaign.benchmark_sets import (
+    AFTER,
+    BEFORE,
+    RELEASE_LENGTH,
+    SETS,
+    UNCERTAINTY,
+    VERSION,
+    Sets,
+    seed_of,
+)
 from flight_campaign.engines import Engine, Job
 from flight_campaign.missions import Mission
 from flight_campaign.rows import Chunk, encode
@@ -42,6 +53,7 @@ if TYPE_CHECKING:
 DEFINITION = "benchmark.json"
 CHUNKS = "chunks"
 SCORES = "scores.json"
+ENTRY = "entry"  # folder of the sources
 CHUNK = 50  # aircraft of a set that fly at once
 
 
@@ -55,7 +67,7 @@ class Definition(Config):
     entry: str
     sees: str
     knows: str
-    source: str  # SHA-256 of gains or module of the entry
+    source: str  # SHA-256 of gains and modules of the entry
     stack: str  # its version
     not_flown: dict[str, str]  # a sentence for each set that the entry takes no part in
 
@@ -102,12 +114,27 @@ def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
     return Definition.validate_mapping(values, "benchmark")
 
 
+def drawn_release(folder: Path) -> str:
+    """The hash of a run in a folder, else one drawn at random, from which the seeds come: nobody
+    knows them before the run has flown.
+    """
+    if not is_file(folder / DEFINITION):
+        return secrets.token_hex(RELEASE_LENGTH // 2)
+    text = (folder / DEFINITION).read_text(encoding="utf-8")
+    return Definition.validate_mapping(json.loads(text), DEFINITION).release
+
+
 class Benchmark:
-    """A run of the benchmark and its folder. A folder with chunks of the same definition is
-    continued.
+    """A run of the benchmark and its folder, which keeps the sources of the entry. A folder with
+    chunks of the same definition is continued.
     """
 
-    def __init__(self, folder: Path, definition: Definition) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        definition: Definition,
+        sources: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
         self.folder = folder
         self.definition = definition
         path = folder / DEFINITION
@@ -120,7 +147,10 @@ class Benchmark:
                 "another folder, or remove this one",
             )
         with writing("--output", folder, "a folder that can"):
-            (folder / CHUNKS).mkdir(parents=True, exist_ok=True)
+            for name in (CHUNKS, ENTRY):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+            for name, content in sources.items():
+                write_file(folder / ENTRY / name, content)
             write_file(path, definition.model_dump_json(indent=1))
 
     def missing(self) -> list[Job]:

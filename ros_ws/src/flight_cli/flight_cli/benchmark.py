@@ -15,7 +15,7 @@ from rich.console import Console
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.benchmark_entry import find_entry
-from flight_campaign.benchmark_scores import SCORES, Flights, define
+from flight_campaign.benchmark_scores import SCORES, Flights, define, drawn_release
 from flight_campaign.benchmark_scores import Benchmark as BenchmarkRun
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar, say
@@ -24,6 +24,7 @@ from flight_core.files import display_path
 from flight_core.parameters import require
 
 FOLDER = "benchmark-"
+DRAW = "draw"  # a release in place of a hash
 LEGEND = (
     "score: sum of rms of the true error over the unit of a channel (10 mrad/s, p 20, V 0.1 "
     "m/s), of a mission the largest"
@@ -51,7 +52,9 @@ class Benchmark:
     sees: str | None = option("What the law measures beside y_m, as in: y.")
     knows: str | None = option("What the law knows of the aircraft beside D, as in: Omega_ii.")
     release: str = option(
-        "Hash of the commit of a release: fresh seeds; by default the fixed seeds.", default=""
+        "Hash of the commit of a release: fresh seeds; draw: hidden seeds, drawn now; by default "
+        "the fixed seeds.",
+        default="",
     )
     output: Path | None = option(
         "Folder of the run, which an interrupted run continues; by default in runs."
@@ -63,21 +66,22 @@ class Benchmark:
         """Fly what is missing, and show the scores."""
         engines.require_jax()
         fits = (
-            not self.release
+            self.release in ("", DRAW)
             or re.fullmatch(rf"[0-9a-f]{{{RELEASE_LENGTH}}}", self.release) is not None
         )
-        require(
-            fits, "--release", self.release, f"the hash of a commit, {RELEASE_LENGTH} hex digits"
-        )
+        expected = f"{DRAW}, or the hash of a commit, {RELEASE_LENGTH} hex digits"
+        require(fits, "--release", self.release, expected)
         with Console(stderr=True, quiet=self.as_json).status("preparing"):
-            sets = Sets({word: find_scenario(word) for word in SCENARIOS}, self.release)
-            entered = find_entry(self.entry, sets, find_scenario, self.name, self.sees, self.knows)
-            flights = Flights(entered, sets)
+            known = {word: find_scenario(word) for word in SCENARIOS}
+            entered = find_entry(
+                self.entry, Sets(known), find_scenario, self.name, self.sees, self.knows
+            )
+            name = FOLDER + re.sub(r"[^\w.-]", "_", entered.name)
+            folder = self.output or Path("runs") / name
+            release = drawn_release(folder) if self.release == DRAW else self.release
+            flights = Flights(entered, Sets(known, release))
             definition = define(flights, self.aircraft, version("rise-di"))
-        run = BenchmarkRun(
-            self.output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)),
-            definition,
-        )
+        run = BenchmarkRun(folder, definition, entered.sources)
         _fly(run, flights, engines.threads(self.workers), quiet=self.as_json)
         scores = run.scores()
         if self.as_json:
