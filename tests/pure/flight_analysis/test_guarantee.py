@@ -196,6 +196,16 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
     assert promise.stable > promise.unstable.deviation / 1.1
 
 
+def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
+    """At 0 rad/s a constant delay changes nothing, so the scaling of 0 says nothing of its
+    channels: the limit of c172p, u up to 10 ms late, was 33 % beside 76 % found.
+    """
+    c172p = find_scenario("jsbsim_c172p")
+    promise = guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
+    assert promise.unstable is not None
+    assert promise.unstable.deviation / 1.1 < promise.stable < promise.unstable.deviation
+
+
 def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     linear = boxed("osprey_servo")
     assert linear.box is not None

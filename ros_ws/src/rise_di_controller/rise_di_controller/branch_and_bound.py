@@ -24,6 +24,8 @@ from rise_di_controller.structured_value import (
 )
 from rise_di_controller.uncertain_loop import Channels, ComplexArray
 
+SLOW = 1e-3  # part of pi / T of a slow motion
+
 
 class Region(NamedTuple):
     """abs(d - centre) <= half of each parameter, (r,), at the frequencies from low to high."""
@@ -71,6 +73,8 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
         M = scale[:, None] * around.response(w, RADIUS)
         bound, scaling = tightened_at(around, w, M, _start(M, region.scaling))
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
+        if interval is None and bound < 1.0 and w == 0.0:
+            interval = _from_zero(around, scaling, scale)
         if interval is None:
             regions += region.halves(int(np.argmax(_effects(part, M, scaling))), scaling)
         else:
@@ -78,6 +82,17 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
         if not regions:
             return tried
     return None
+
+
+def _from_zero(part: Channels, near: Scaling, scale: FloatArray) -> tuple[float, float] | None:
+    """The frequencies from 0 on at which a D and a G hold that fit a slow motion: a delay has no
+    effect at 0 rad/s, so that the D of 0 may hold nowhere above.
+    """
+    slow = SLOW * np.pi / part.period
+    M = scale[:, None] * part.response(slow, RADIUS)
+    _, scaling = tightened_at(part, slow, M, _start(M, near))
+    still = scale[:, None] * part.response(0.0, RADIUS)
+    return interval_at(part, 0.0, scaling, scale) if bound_at(still, scaling) < 1.0 else None
 
 
 def _frequency(region: Region, highest: float) -> float:
