@@ -10,7 +10,7 @@ writes a gain set as the section of a scenario file.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Generic, NamedTuple, TypeVar
@@ -198,6 +198,25 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     for parameters that the controller does not accept.
     """
     paired = _paired(study, setting)
+    engineering = gain_candidates(study, setting)
+    first = engineering(np.ones(len(paired.rows)), np.ones(len(paired.rows))).controller
+    chosen = first
+    if first.sampled_sign()[0] is Sign.SOFT:  # behind servos
+        rates = study.u_dot[:, 0][:, paired.columns]
+        chosen = within_requirement(engineering, setting.requirement, rates).controller
+    chosen = with_feedforward(chosen, study.airframe) if setting.feedforward else chosen
+    return Selection(study, setting, _literal(study, setting, paired), chosen)
+
+
+def gain_candidates(
+    study: Study, setting: LoopSetting
+) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
+    """A function of `slower` and `lower`, (m,) each, that gives the engineering gains with the
+    bandwidth lower by the second and the integral slower by both, and their loop.
+
+    Raises ParameterError as `select_gains`.
+    """
+    paired = _paired(study, setting)
     limits = (
         study.slew[paired.columns] / paired.unit,
         setting.factor,
@@ -211,13 +230,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
         chosen = controller(*selected, slower * lower)
         return Candidate(chosen, linear_loop(chosen, study.airframe, study.A, study.B))
 
-    first = engineering(np.ones(len(paired.rows)), np.ones(len(paired.rows))).controller
-    chosen = first
-    if first.sampled_sign()[0] is Sign.SOFT:  # behind servos
-        rates = study.u_dot[:, 0][:, paired.columns]
-        chosen = within_requirement(engineering, setting.requirement, rates).controller
-    chosen = with_feedforward(chosen, study.airframe) if setting.feedforward else chosen
-    return Selection(study, setting, _literal(study, setting, paired), chosen)
+    return engineering
 
 
 class _Paired(NamedTuple):

@@ -35,8 +35,10 @@ ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this has to be accepted
 # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
 PHASE_MARGINS = (5.0, 80.0)
 
-MAX_SLOWER = 64.0  # largest factors of the search
-MAX_LOWER = 18.0  # by which the integral and the bandwidth fall
+# largest factors of the search by which the integral and the bandwidth fall. A throttle that is
+# weak near its stop has a bandwidth 200 times below the integral of the rule: 1000 leave V 85 deg
+MAX_SLOWER = 1000.0
+MAX_LOWER = 18.0
 FURTHER_STARTS = (
     (exponent(8.0), 0),
     (exponent(2.0), exponent(2.0)),
@@ -251,7 +253,9 @@ class _Loops(Generic[Controller]):
         for place in places:
             candidate, margins = self._measured[place]
             phase, gain, damping = fractions(margins, needed)
-            reached = np.where(margins.stable, np.minimum(phase, gain), 0.0)
+            # each channel integrates: a phase without a crossover lies below the frequencies seen
+            seen = margins.stable & np.isfinite(margins.phase)
+            reached = np.where(seen, np.minimum(phase, gain), 0.0)
             goals = np.append(reached, damping if margins.stable else 0.0)
             measured.append(_Measured(candidate, reached))
             shortages.append(float(np.maximum(1.0 - goals, 0.0).sum()))
