@@ -15,7 +15,13 @@ from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
-from flight_analysis.closed_loop.loop_margins import law_order, loop_of, margins
+from flight_analysis.closed_loop.loop_margins import (
+    LinearLoop,
+    law_order,
+    loop_assessment,
+    loop_of,
+    margins,
+)
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray
@@ -117,6 +123,14 @@ def test_no_feedback_has_infinite_margins() -> None:
     found = loop_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
     assert [*found.phase, *found.crossover, *found.gain] == [math.inf, 0.0, math.inf]
     assert [*found.sensitivity, *found.disk, found.disk_all] == approx([1.0, 2.0, 2.0])
+
+
+def test_least_delay_margin_beside_a_nominal_loop_that_tolerates_every_delay() -> None:
+    gains = np.array([[[2.0]], [[4.0]]])  # an integrator of gain k has the delay margin pi / 2 k
+    plant = LinearPlant(np.zeros((2, 1, 1)), gains, np.eye(1))
+    found = loop_assessment(LinearLoop("two", ("u",), plant, proportional(np.eye(1)), NO_LAG))
+    assert found.delay == math.inf  # beyond MAX_DELAY_MARGIN
+    assert found.worst_delay == approx(math.pi / 8.0, rel=0.02)
 
 
 def test_second_order_loop_has_its_damping() -> None:

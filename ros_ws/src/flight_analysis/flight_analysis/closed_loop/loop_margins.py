@@ -173,7 +173,7 @@ def _least_delay(linear: LinearLoop, nominal: float) -> float:
         radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
         unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
         if len(unstable):
-            least = nominal
+            least = longest
             for k in unstable[np.argsort(-radii[unstable])]:
                 plant = LinearPlant(uncertain.A[k], uncertain.B[k], uncertain.C)
                 if not is_stable(
