@@ -44,6 +44,8 @@ gain margin and S."""
 NO_MODE = 1e-6
 # magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
 VANISHED = 1e-9
+# of the vectors of the modes, Frobenius: S is exact to 1e-9 below it
+MOST_CONDITION = 1e6
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
 # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
 SERIAL_SIZE = 4000
@@ -154,7 +156,8 @@ def loop_margins(
     """
     shape = _batch_shape(plant, law)
     parts = [
-        _margins(form, loop.period, together=together) for form in _schur_forms(plant, law, loop)
+        _margins(schur_form(*batch, loop), loop.period, together=together)
+        for batch in _batches(plant, law)
     ]
     return Margins(
         *(
@@ -166,14 +169,27 @@ def loop_margins(
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
     """The `phase` of `loop_margins` alone, (..., m), without the search for gain margins and
-    peaks.
+    peaks, to 1e-8: a loop with independent modes is a sum over them.
     """
     parts = []
-    for form in _schur_forms(plant, law, loop):
-        w, S = on_grid(form, loop.period)
-        phase, _ = _phase_margins(form, w, _loop_of_sensitivity(S), loop.period)
-        parts.append(np.where(_stable(form)[:, None], phase, 0.0))
+    for aircraft, its_law in _batches(plant, law):
+        form, independent = _modal_form(aircraft, its_law, loop)
+        phase = _phases(form, loop.period)
+        if not independent.all():
+            rest = np.flatnonzero(~independent)
+            few = aircraft._replace(A=aircraft.A[rest], B=aircraft.B[rest])
+            few_laws = LinearLaw(*(matrix[rest] for matrix in its_law))
+            phase[rest] = _phases(schur_form(few, few_laws, loop), loop.period)
+        parts.append(phase)
     return np.concatenate(parts).reshape(*_batch_shape(plant, law), -1)
+
+
+def _phases(form: "SchurForm", period: float) -> FloatArray:
+    """The phase margins of the aircraft of a batch, (N, m), rad."""
+    w = _frequencies(form.eigenvalues, period)
+    L = _loop_of_sensitivity(_sensitivity(form, np.exp(1j * w * period)))
+    phase, _ = _phase_margins(form, w, L, period)
+    return np.where(_stable(form)[:, None], phase, 0.0)
 
 
 def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
@@ -185,18 +201,18 @@ class SchurForm(NamedTuple):
     to v = d + u.
     """
 
-    T: ComplexArray  # (N, k, k) upper triangular
+    T: ComplexArray  # (N, k, k) upper triangular, or (N, k) a diagonal
     R: ComplexArray  # (N, k, m)
     L: ComplexArray  # (N, m, k)
 
     @property
     def eigenvalues(self) -> ComplexArray:
         """Eigenvalues of the closed loops, (N, k)."""
-        return np.asarray(np.einsum("...ii->...i", self.T))
+        return self.T if self.T.ndim == self.R.ndim - 1 else np.einsum("...ii->...i", self.T)
 
 
-def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[SchurForm]:
-    """The closed loops of an aircraft, or of N, in batches."""
+def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, LinearLaw]]:
+    """An aircraft, or N, with a law each, in batches."""
     shape = _batch_shape(plant, law)
     count = int(np.prod(shape))
 
@@ -210,29 +226,63 @@ def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[Sch
     laws = [each(matrix) for matrix in law]
     for k in range(0, count, BATCH):
         batch = slice(k, k + BATCH)
-        aircraft = LinearPlant(A[batch], B[batch], plant.C)
         its_law = LinearLaw(*(matrix[batch] for matrix in laws))
-        yield schur_form(aircraft, its_law, loop)
+        yield LinearPlant(A[batch], B[batch], plant.C), its_law
 
 
 def schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SchurForm:
     """The closed loops of N aircraft: A (N, n, n), B (N, n, m) under one law or N laws."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
-    no_delay, (N, _, m) = np.zeros(len(loop.lag)), plant.B.shape
-    _, B, C = sampled_plant(plant, loop, no_delay)
-    pairs = [schur(matrix, output="complex") for matrix in closed_loop(plant, law, loop, no_delay)]
+    A, B, K = _from_inputs_to_inputs(plant, law, loop)
+    pairs = [schur(matrix, output="complex") for matrix in A]
     T, Q = (np.array(matrices, dtype=np.complex128) for matrices in zip(*pairs, strict=True))
+    return SchurForm(T, Q.conj().swapaxes(1, 2) @ B, K @ Q)
+
+
+def _modal_form(
+    plant: LinearPlant, law: LinearLaw, loop: Loop
+) -> tuple[SchurForm, NDArray[np.bool_]]:
+    """As `schur_form` with a diagonal T, and whether the modes of each loop are independent: the
+    condition of their vectors is at most MOST_CONDITION.
+    """
+    A, B, K = _from_inputs_to_inputs(plant, law, loop)
+    eigenvalues, modes = np.linalg.eig(A)
+    size = np.linalg.norm(modes, axis=(1, 2))
+    try:
+        inverse = np.linalg.inv(modes)
+    except np.linalg.LinAlgError:  # equal vectors to the bit
+        inverse = np.full_like(modes, np.inf)
+    with np.errstate(over="ignore"):
+        independent = size * np.linalg.norm(inverse, axis=(1, 2)) <= MOST_CONDITION
+    inverse[~independent] = 0.0
+    form = SchurForm(eigenvalues.astype(np.complex128), inverse @ B, K @ modes)
+    return form, np.asarray(independent)
+
+
+def _from_inputs_to_inputs(
+    plant: LinearPlant, law: LinearLaw, loop: Loop
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The closed loops of N aircraft from a disturbance d of the inputs to u: z+ = A z + B d, u = K
+    z.
+    """
+    no_delay = np.zeros(len(loop.lag))
+    N, _, m = plant.B.shape
+    _, B, C = sampled_plant(plant, loop, no_delay)
     B = np.concatenate([B, np.zeros((N, law.A.shape[-1], m))], axis=1)
     K = np.concatenate([law.D @ C, np.broadcast_to(law.C, (N, *law.C.shape[-2:]))], axis=2)
-    return SchurForm(T, Q.conj().swapaxes(1, 2) @ B, K @ Q)
+    return closed_loop(plant, law, loop, no_delay), B, K
 
 
 def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
     """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part
-    at once.
+    at once; with a diagonal T a sum over the modes.
     """
     (N, k, m), F = form.R.shape, z.shape[1]
+    if form.T.ndim == z.ndim:
+        residues = form.L.swapaxes(1, 2)[..., None] * form.R[:, :, None]
+        summed = 1.0 / (z[..., None] - form.T[:, None]) @ residues.reshape(N, k, m * m)
+        return np.asarray(np.eye(m) + summed.reshape(N, F, m, m))
     size = min(max(SERIAL_SIZE // (k * m), 1), F)
     z = np.pad(z, ((0, 0), (0, -F % size)), mode="edge").reshape(N, -1, size)
     X = np.zeros((N, z.shape[1], k, size, m), dtype=np.complex128)
