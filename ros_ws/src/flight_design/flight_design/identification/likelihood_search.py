@@ -216,13 +216,17 @@ class Search(Likelihood):
         )
         expected = -float(slope @ (tried[0] - theta)) / 2.0
         for several in (tried[:1], tried[1:]):
-            lower, _, _ = self._costs(
-                self.innovations(self.models(several, levels), levels), used, several
-            )
+            innovations = self.innovations(self.models(several, levels), levels)
+            lower, _, _ = self._costs(innovations, used, several)
             progressed = float(costs[0] - lower.min())
             if progressed >= GOOD * expected:
                 break
-        return (several[int(lower.argmin())] if progressed > 0.0 else theta), hessian, progressed
+        if progressed <= 0.0:
+            return theta, hessian, progressed
+        best = several[int(lower.argmin())]
+        if len(several) == 1:
+            self._passed = best.tobytes(), levels, innovations
+        return best, hessian, progressed
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """The innovations of a model that flies, theta (p,), with winds, angles and delays of
