@@ -115,8 +115,8 @@ def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
 
 
 def drawn_release(folder: Path) -> str:
-    """The hash of a run in a folder, else one drawn at random, from which the seeds come: nobody
-    knows them before the run has flown.
+    """The hash of a run in a folder, else one drawn at random, from which the seeds come:
+    unknown before the run has flown.
     """
     if not is_file(folder / DEFINITION):
         return secrets.token_hex(RELEASE_LENGTH // 2)
