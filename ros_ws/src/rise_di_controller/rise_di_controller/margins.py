@@ -247,10 +247,11 @@ def _modal_form(
     condition of their vectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
-    eigenvalues, modes = np.linalg.eig(A)
+    eigenvalues, real_or_complex = np.linalg.eig(A)
+    modes: ComplexArray = real_or_complex.astype(np.complex128)
     size = np.linalg.norm(modes, axis=(1, 2))
     try:
-        inverse = np.linalg.inv(modes)
+        inverse: ComplexArray = np.linalg.inv(modes).astype(np.complex128)
     except np.linalg.LinAlgError:  # equal vectors to the bit
         inverse = np.full_like(modes, np.inf)
     with np.errstate(over="ignore"):
