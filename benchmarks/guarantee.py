@@ -4,6 +4,7 @@
 F-4C of the tutorial (f4c), with the flight of an unstable aircraft: CSV on standard output.
 
 python -m benchmarks.guarantee osprey_servo osprey_observer f4c
+python -m benchmarks.guarantee osprey_servo --corners 20000  with corners and samples at the limit
 """
 
 import argparse
@@ -13,25 +14,37 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import as_yaml, with_entries
+from aircraft_sim.uncertainty import Spread, as_yaml, drawn_places, with_entries
 from flight_analysis.closed_loop.guarantee import Unstable, guarantee
-from flight_analysis.closed_loop.loop_margins import LinearLoop, scenario_loop
+from flight_analysis.closed_loop.loop_margins import (
+    LinearLoop,
+    box_of,
+    linear_loop,
+    scenario_loop,
+)
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
 from flight_analysis.report.flight_outcome import final_outcome
 from flight_design.gains.gain_design import select_gains
+from flight_design.identification.likelihood import PRIOR
+from flight_design.learning.scenario_learner import learner
+from rise_di_controller.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
+from rise_di_controller.uncertain_loop import aircraft_at
 from rise_di_controller.worst_case import worst_in_box
 
 UNCERTAINTY = 0.3
 LATE = 0.01  # s
 FARTHER = 1.2  # factor on the deviations of the first unstable aircraft, for one that diverges
 LARGEST = 0.99
+BATCH = 500  # aircraft at once: their matrices stay in the cache
 F4C = "f4c"
+LEARNED = "learned"  # the last model of osprey_learn
 PAGE = Path(__file__).parents[1] / "docs" / "tutorials" / "theorem.md"
 HEADINGS = (
     "scenario",
@@ -46,17 +59,45 @@ HEADINGS = (
     "least found",
     "processor time, s",
     "outcome of an aircraft 1.2 times as far off",
+    "unstable corners and samples at the guarantee",
 )
 
 
 def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
-    """The loop with its box, and the scenario that flies; None for the F-4C."""
+    """The loop with its box, and the scenario that flies; None for LEARNED and for the F-4C."""
     if name == F4C:
         text = PAGE.read_text().split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0]
         frame = Airframe.validate_mapping(yaml.safe_load(text), F4C)
         return select_gains(frame, samples=20).engineering.loop_with_box(), None
+    if name == LEARNED:
+        return learned_loop(find_scenario("osprey_learn")), None
     scenario = find_scenario(name)
     return scenario_loop(scenario, scenario.controller, 1, UNCERTAINTY), scenario
+
+
+def learned_loop(scenario: Scenario) -> LinearLoop:
+    """The loop of the last model of a flight that learns: around that model, with two of its
+    standard deviations a side for the box; those before a flight where the flight shows none.
+    """
+    tape = simulate(scenario, learn=learner(scenario))
+    controller = scenario.controller
+    for change in tape.changes:
+        controller = type(controller).validate_mapping(controller.changed(change), "controller")
+    frame = load_airframe(scenario.aircraft.airframe)
+    matrices = {"A": frame.matrix_a(), "B": frame.matrix_b()}
+    last = tape["learned"].values[-1]
+    stated = dict(zip(tape["learned"].names, last.tolist(), strict=True))
+    errors = {}
+    deviations = {}
+    for name, (matrix, i, j) in drawn_places(frame).items():
+        spaced = name.replace(",", ", ")
+        if f"value.{spaced}" in stated:
+            value = stated[f"value.{spaced}"]
+            errors[name] = value / matrices[matrix][i, j] - 1.0
+            deviations[name] = 2.0 * abs(stated[f"deviation.{spaced}"] / value)
+    model = with_entries(frame, errors)
+    loop = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
+    return loop._replace(box=box_of(model, controller, 2.0 * PRIOR, Spread(deviations)))
 
 
 def flight(scenario: Scenario, first: Unstable) -> str:
@@ -72,7 +113,26 @@ def flight(scenario: Scenario, first: Unstable) -> str:
         return final_outcome(tape.outcome, account(tape, flown))
 
 
-def row(name: str) -> list[str]:
+def beyond(linear: LinearLoop, stable: float, count: int) -> str:
+    """How many of `count` aircraft are unstable at a guaranteed limit: a half are corners, a half
+    uniform samples.
+    """
+    box = linear.box
+    assert box is not None  # noqa: S101 - for mypy
+    generator = np.random.default_rng(3)
+    still = np.zeros(len(linear.inputs))
+    unstable = 0
+    for k in range(0, count, BATCH):
+        d = generator.uniform(-1.0, 1.0, (min(BATCH, count - k), len(box.names)))
+        d = d if k % (2 * BATCH) else np.sign(d)
+        aircraft = aircraft_at(linear.nominal, box, d * stable / box.part.max())
+        z = np.linalg.eigvals(closed_loop(aircraft, linear.law, linear.loop, still))
+        radii = np.abs(z).max(axis=-1)
+        unstable += int(np.count_nonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE))
+    return f"{unstable} of {count}"
+
+
+def row(name: str, corners: int) -> list[str]:
     """The figures of a scenario."""
     linear, scenario = loop_of(name)
     box = linear.box
@@ -97,6 +157,7 @@ def row(name: str) -> list[str]:
         f"{float(worst.disk_all):.3f}",
         f"{seconds:.0f}",
         flight(scenario, first) if flies and scenario is not None and first is not None else "",
+        beyond(linear, promise.stable, corners) if corners else "",
     ]
 
 
@@ -108,10 +169,12 @@ def main() -> None:
     """Print a row a scenario."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenarios", nargs="+")
+    parser.add_argument("--corners", type=int, default=0)
+    options = parser.parse_args()
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(HEADINGS)
-    for name in parser.parse_args().scenarios:
-        writer.writerow(row(name))
+    for name in options.scenarios:
+        writer.writerow(row(name, options.corners))
         sys.stdout.flush()
 
 

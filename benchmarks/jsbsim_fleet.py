@@ -3,13 +3,14 @@
 """Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables
 of docs/experiments.md.
 
-.venv/bin/python -m benchmarks.jsbsim_fleet  the aircraft of FLEET, some ten seconds each
+.venv/bin/python -m benchmarks.jsbsim_fleet  the aircraft of jsbsim_gains.yaml, half a minute each
 .venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft
 """
 
 import sys
 
 import numpy as np
+from benchmarks.jsbsim_gains import CONDITIONS
 
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS
 from flight_core.outcome import COMPLETED, FlightEnded
@@ -21,39 +22,18 @@ from flight_design.identification.step_identification import (
     without_beta,
 )
 
-KNOT = 1852.0 / 3600.0
-FOOT = 0.3048  # m/s, m; exact
-
-
-# fmt: off
-FLEET = {
-    "c172p": (90, 4000), "c172x": (90, 4000), "J3Cub": (60, 2000), "DHC6": (130, 6000),
-    "T37": (200, 8000),
-    "F80C": (260, 12000), "A4": (300, 15000), "T38": (300, 12000), "f16": (300, 10000),
-    "global5000": (330, 25000), "737": (300, 20000), "B747": (350, 25000),
-}
-"""Light and utility aircraft, trainers, fighters, business jet, airliners: a usual true airspeed,
-kt, and altitude, ft."""
-
-# fmt: on
-DEFAULT = (100, 3000)
-
-# s: the model of the window that ends at 30 s flies; the next one flies at 64 s
-LEARNED, LEARN_DURATION = (34.0, 94.0)
-
 
 def main() -> None:
     """Print the tables of the selected aircraft."""
-    arguments = sys.argv[1:]
-    names = arguments or list(FLEET)
+    names = sys.argv[1:] or list(CONDITIONS)
     rows = []
     reasons = []
     for number, name in enumerate(names, 1):
         print(f"{number} of {len(names)}: {name}", file=sys.stderr)
-        speed, altitude = FLEET.get(name, DEFAULT)
-        condition = f"{speed} kt, {altitude} ft"
+        speed, altitude = CONDITIONS[name][0]
+        condition = f"{speed:g} m/s, {altitude:g} m"
         try:
-            aircraft = identify(name, speed * KNOT, altitude * FOOT)
+            aircraft = identify(name, speed, altitude)
         except (FlightEnded, ParameterError) as error:
             reasons.append(f"| {name} | {condition} | {error} |")
             continue

@@ -8,9 +8,7 @@ import ast
 import hashlib
 import importlib.util
 import json
-import site
 import sys
-import sysconfig
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -39,6 +37,7 @@ TUNED_ON = "gust_turbulence"
 FIXED = ("rate", "outputs", "inputs", "lower", "upper")  # keys of the frame that no law changes
 NOT_STATED = "not stated"
 GAINS = "controllers.json"  # among the sources of an entry
+INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
 
 
 class Task(NamedTuple):
@@ -250,43 +249,38 @@ def sources_of(modules: Iterable[str]) -> dict[str, bytes]:
     """
     waiting = list(modules)
     packages = {name.partition(".")[0] for name in waiting}
-    libraries = [Path(folder).resolve() for folder in _libraries()]
     sources: dict[str, bytes] = {}
     seen: set[str] = set()
     while waiting:
         name = waiting.pop()
-        if name in seen:
-            continue
+        spec = None if name in seen else _spec(name)
         seen.add(name)
-        spec = _spec(name)
-        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
-            continue
-        path = Path(spec.origin).resolve()
-        installed = any(path.is_relative_to(folder) for folder in libraries)
-        if name.partition(".")[0] in packages or not installed:
-            content = path.read_bytes()
+        if spec is not None and (name.partition(".")[0] in packages or not _is_library(spec)):
+            content = Path(str(spec.origin)).read_bytes()
             sources[f"{name}.py"] = content
             waiting += _imported(ast.parse(content), spec)
     return sources
 
 
-def _libraries() -> set[str]:
-    """Folders of Python, of installed libraries, and of the packages of the stack."""
-    stack = Path(flight_core.__file__).parents[2]
-    python = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
-    return {*python, *site.getsitepackages(), site.getusersitepackages(), str(stack)}
-
-
 def _spec(name: str) -> ModuleSpec | None:
-    """Where a module lies; None for a name that is no module."""
+    """Where a module with a source lies; None for any other name."""
     try:
-        return importlib.util.find_spec(name)
+        spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         return None
+    return spec if spec is not None and str(spec.origin).endswith(".py") else None
+
+
+def _is_library(spec: ModuleSpec) -> bool:
+    """Whether a module is of Python, installed, or of the stack."""
+    path = Path(str(spec.origin)).resolve()
+    stack = Path(flight_core.__file__).resolve().parents[2]
+    of_python = spec.name.partition(".")[0] in sys.stdlib_module_names
+    return of_python or bool(INSTALLED & {*path.parts}) or path.is_relative_to(stack)
 
 
 def _imported(tree: ast.Module, spec: ModuleSpec) -> list[str]:
-    """Names of modules in the import statements of a module, with names that may be a module."""
+    """Names in the import statements of a module, of modules and of what may be a module."""
     package = spec.name if spec.submodule_search_locations else spec.name.rpartition(".")[0]
     names = []
     for statement in ast.walk(tree):
@@ -296,5 +290,4 @@ def _imported(tree: ast.Module, spec: ModuleSpec) -> list[str]:
             relative = "." * statement.level + (statement.module or "")
             module = importlib.util.resolve_name(relative, package)
             names += [module, *(f"{module}.{alias.name}" for alias in statement.names)]
-    parents = [name.rpartition(".")[0] for name in names]
-    return [*filter(None, parents), *names]
+    return names + [name.rpartition(".")[0] for name in names if "." in name]

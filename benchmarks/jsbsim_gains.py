@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether `rise-di identify` finds gains for the aircraft of JSBSim that trim, at two speeds each,
+and whether a random search refutes refusals: CSV on standard output.
+
+python -m benchmarks.jsbsim_gains c172p t6texan2
+
+A refusal is a phase margin that the search for gains does not reach, of 45 deg or of
+--phase-margin. FIVE of them, drawn at random, are searched by random factors on the integrals and
+the bandwidths, within wider bounds than those of the search.
+"""
+
+import argparse
+import csv
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from flight_core.outcome import FlightEnded
+from flight_core.parameters import ParameterError
+from flight_design.gains.gain_selection import SOFTENING, Selection, gain_candidates, select_gains
+from flight_design.gains.relaxation import binding
+from flight_design.gains.requirement import least_fraction
+from flight_design.identification.step_identification import identify
+from rise_di_controller.margins import loop_margins
+
+CONDITIONS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+FIVE = 5
+SECONDS = 10.0  # of processor time a refusal
+WIDEST = np.log([[4000.0], [200.0]])  # factors on integral and bandwidth
+FRESH = 0.3  # of the tries: anywhere; the others begin at the best one
+SPREAD = 0.4  # of a try beside the best one, in the logarithm of a factor
+HEADINGS = (
+    "aircraft",
+    "speed, m/s",
+    "altitude, m",
+    "gains for 45 deg",
+    "slower integral of V",
+    "rms of V in calm air, m/s",
+    "flights",
+    "gains for {:g} deg",
+    "random search",
+)
+
+
+def verdict(selection: Selection) -> str:
+    """Whether a selection has the margins, or the bound that binds."""
+    if not selection.engineering.unmet:
+        return "found"
+    return f"refused: {binding(selection).sentence(selection.chosen.outputs)}"
+
+
+def searched(selection: Selection) -> str:
+    """What random factors find for a refused selection in SECONDS."""
+    build = gain_candidates(selection.study, selection.setting)
+    generator = np.random.default_rng(1)
+    m = len(selection.chosen.outputs)
+    best = -1.0
+    place = np.zeros((2, m))
+    begin = time.process_time()
+    tries = 0
+    while best < 1.0 and time.process_time() - begin < SECONDS:
+        tries += 1
+        step = SPREAD * generator.standard_normal((2, m))
+        fresh = best < 0.0 or generator.random() < FRESH
+        tried = generator.random((2, m)) * WIDEST if fresh else np.clip(place + step, 0.0, WIDEST)
+        loop = build(*np.exp(tried)).loop
+        margins = loop_margins(loop.nominal, loop.law, loop.loop, together=False)
+        if np.isfinite(margins.phase).all():
+            fraction = least_fraction(margins, selection.setting.requirement)
+            if fraction > best:
+                best = fraction
+                place = tried
+    if best < 1.0:
+        return f"none in {tries} tries, at most {best:.0%} of the goals"
+    return f"REFUTED in {tries} tries by {np.exp(place).round(2).tolist()}"
+
+
+def main() -> None:
+    """Print a row a condition."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("aircraft", nargs="*", default=list(CONDITIONS))
+    parser.add_argument("--phase-margin", type=float, default=60.0)
+    options = parser.parse_args()
+    rows = []
+    refused = []
+    for name in options.aircraft:
+        for speed, altitude in CONDITIONS[name]:
+            print(f"{name} at {speed} m/s", file=sys.stderr)
+            row = [name, f"{speed:g}", f"{altitude:g}"]
+            rows.append(row)
+            try:
+                identified = identify(name, speed, altitude)
+            except (FlightEnded, ParameterError) as error:
+                row.append(f"{error}")
+                continue
+            selection = identified.selection
+            needed = selection.setting.requirement._replace(
+                phase=math.radians(options.phase_margin)
+            )
+            more = select_gains(selection.study, selection.setting._replace(requirement=needed))
+            slower = selection.chosen.softening[selection.chosen.outputs.index("V")] / SOFTENING
+            row += [
+                verdict(selection),
+                f"{slower:.3g}",
+                f"{identified.flights['calm'].rms['V']:.3g}",
+                identified.failure or "completed",
+                verdict(more),
+            ]
+            refused += [(row, each) for each in (selection, more) if each.engineering.unmet]
+    for k in np.random.default_rng(1).permutation(len(refused))[:FIVE]:
+        row, selection = refused[k]
+        phase = math.degrees(selection.setting.requirement.phase)
+        row.append(f"{phase:g} deg: {searched(selection)}")
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow([heading.format(options.phase_margin) for heading in HEADINGS])
+    writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
