@@ -247,3 +247,24 @@ class Commands(NamedTuple):
 def bits(names: Collection[str]) -> int:
     """The names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
     return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
+
+
+CARRIED = ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "loitered")
+"""What filters that begin again leave: the mode, since after a lost pose the wings are levelled."""
+
+
+def begun_again(
+    held: GuidanceState,
+    state: GuidanceState | None,
+    inputs: Inputs,
+    params: GuidanceParams,
+    *further: str,
+) -> GuidanceState:
+    """The state `held` with what a state before leaves, and further values by name.
+
+    Up to the age limit of u_m the reference model still flies the last u_m.
+    """
+    if state is None or inputs.begin is Begin.HOLD:
+        return held
+    again = held._replace(**{name: getattr(state, name) for name in (*CARRIED, *further)})
+    return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again

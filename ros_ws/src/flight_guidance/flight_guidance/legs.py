@@ -3,11 +3,13 @@
 """A route in flight: how the legs are joined, followed and ended."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance import path
+from flight_guidance.fence import HOME
 from flight_guidance.guidance_state import (
+    Channels,
     GuidanceState,
     Lateral,
     Mode,
@@ -81,6 +83,47 @@ def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -
     return leg.end is not None and bool(
         path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
     )
+
+
+def with_commands(
+    state: GuidanceState,
+    commands: Mapping[str, float],
+    pose: Mapping[str, float],
+    route: Route | None,
+    channels: Channels,
+    follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
+    join: Callable[[GuidanceState, int, float, Route], GuidanceState],
+) -> tuple[GuidanceState, float]:
+    """The modes and commands in force: of the next leg by `follow` once a leg is passed, then the
+    commands given. `join`: the state on the way to a leg, from a distance along the leg on.
+
+    A lateral command ends the leg: the command may come with a new route, and so with new legs.
+    Returns further the distance from the end of a leg that ends here and is missed, m.
+    """
+    moved = channels.lateral.keys() & commands.keys()
+    missed = 0.0
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not moved
+    if on_route and route is not None:
+        state, missed = follow(state, route)
+    if not commands:
+        return on_profile(state, pose, route), missed
+    state = state._replace(target=state.target._replace(**commands))
+    if state.fence >= HOME and moved:
+        state = state._replace(fence=0.0)
+    for name in commands:
+        state = state._replace(
+            lateral=channels.lateral.get(name, state.lateral),
+            vertical=channels.vertical.get(name, state.vertical),
+        )
+    if "leg" in commands and route is not None:
+        held = state.vertical
+        state = join(state, int(commands["leg"]), commands.get("along", 0.0), route)
+        state = state._replace(target=state.target._replace(**commands))
+        if channels.vertical.keys() & commands.keys():
+            state = state._replace(vertical=held)
+    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
+        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
+    return on_profile(state, pose, route), missed
 
 
 def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:

@@ -24,8 +24,6 @@ from flight_guidance.attitude import BodyRates, body_rates, yaw_for_bank
 from flight_guidance.fence import AROUND, BACK, HOME, Escape, Motion, last_safe_turn
 from flight_guidance.guidance_state import (
     LARGEST,
-    LATERAL,
-    VERTICAL,
     Begin,
     Commands,
     GuidanceParams,
@@ -36,17 +34,11 @@ from flight_guidance.guidance_state import (
     Mode,
     Target,
     Vertical,
+    begun_again,
 )
-from flight_guidance.lateral import (
-    heading_estimate,
-    slip_estimate,
-)
+from flight_guidance.lateral import heading_estimate, slip_estimate
 from flight_guidance.lateral_modes import escaping_bank, lateral_bank
-from flight_guidance.legs import (
-    along_route,
-    joining,
-    on_profile,
-)
+from flight_guidance.legs import along_route, joining, with_commands
 from flight_guidance.path import Route
 from flight_guidance.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.vertical import (
@@ -98,20 +90,7 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     held = holding(
         inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params
     )
-    if state is None or inputs.begin is Begin.HOLD:
-        return held
-    again = held._replace(
-        mode=state.mode,
-        lateral=state.lateral,
-        vertical=state.vertical,
-        target=state.target,
-        leg=state.leg,
-        joining=state.joining,
-        fence=state.fence,
-        loitered=state.loitered,
-    )  # the mode, since after a lost pose the wings are levelled
-    # Up to the age limit of u_m the reference model still flies the last u_m.
-    return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
+    return begun_again(held, state, inputs, params)
 
 
 def hold_now(
@@ -159,7 +138,17 @@ def step(
     state = _with_attitude(state, inputs, dt, params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
     y = dict(zip(params.outputs, inputs.y, strict=True))
-    state, missed = _with_commands(state, inputs.commands, pose, dt, route)
+    if params.channels.lateral.keys() & inputs.commands.keys():
+        state = state._replace(target=state.target._replace(r=0.0))
+    state, missed = with_commands(
+        state,
+        inputs.commands,
+        pose,
+        route,
+        params.channels,
+        lambda state, route: along_route(state, pose, dt, route),
+        lambda state, leg, along, route: joining(state, leg, along, pose, route),
+    )
     state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
     wanted, error, to_go = lateral_bank(state, pose, airspeed(inputs.y, params), route, params)
     if state.mode is Mode.ENGAGED:
@@ -378,48 +367,6 @@ def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
     return wind_of(
         pose["v_north"], pose["v_east"], pose["climb"], pose["psi"] + pose["beta"], speed
     )
-
-
-def _with_commands(
-    state: GuidanceState,
-    commands: Mapping[str, float],
-    pose: Mapping[str, float],
-    dt: float,
-    route: Route | None,
-) -> tuple[GuidanceState, float]:
-    """The modes and commands in force: of the next leg once a leg is passed, then the commands
-    given.
-
-    A lateral command ends the leg: the command may come with a new route, and so with new legs.
-    Returns further the distance from the end of a leg that ends here and is missed, m.
-    """
-    missed = 0.0
-    on_route = (
-        state.mode is Mode.ENGAGED
-        and state.lateral is Lateral.ROUTE
-        and not LATERAL.keys() & commands.keys()
-    )
-    if on_route and route is not None:
-        state, missed = along_route(state, pose, dt, route)
-    if not commands:
-        return on_profile(state, pose, route), missed
-    if LATERAL.keys() & commands.keys():
-        state = state._replace(target=state.target._replace(r=0.0))
-    state = state._replace(target=state.target._replace(**commands))
-    if state.fence >= HOME and LATERAL.keys() & commands.keys():
-        state = state._replace(fence=0.0)
-    for name in commands:
-        state = state._replace(
-            lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical)
-        )
-    if "leg" in commands and route is not None:
-        state = joining(state, int(commands["leg"]), commands.get("along", 0.0), pose, route)
-        state = state._replace(target=state.target._replace(**commands))
-        named = [VERTICAL[name] for name in commands if name in VERTICAL]
-        state = state._replace(vertical=named[0] if named else Vertical.PROFILE)
-    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
-        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
-    return on_profile(state, pose, route), missed
 
 
 def _climb(

@@ -39,9 +39,10 @@ from flight_guidance.guidance_state import (
     MulticopterParams,
     Target,
     Vertical,
+    begun_again,
 )
 from flight_guidance.lateral import PathError
-from flight_guidance.legs import has_loitered, on_leg, on_profile
+from flight_guidance.legs import has_loitered, on_leg, with_commands
 from flight_guidance.path import Arc, Point, Route
 from flight_guidance.targets import home
 from flight_guidance.vertical import VerticalParams, climb_for, slewed
@@ -127,7 +128,15 @@ def step(
     state = _begin(state, inputs, pose, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, pose, dt, params)
-    state, missed = _with_commands(state, inputs.commands, pose, dt, route, params)
+    state, missed = with_commands(
+        state,
+        inputs.commands,
+        pose,
+        route,
+        params.channels,
+        lambda state, route: _along_route(state, pose, dt, route),
+        lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=1.0),
+    )
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
     flies = state.mode is Mode.ENGAGED
@@ -196,14 +205,7 @@ def _begin(
         wind=_parts(_velocity(pose) - _by_tilt(pose, pose, gains) / gains.drag),
         velocity=_parts(_velocity(pose)),
     )
-    if state is None or inputs.begin is Begin.HOLD:
-        return held
-    unchanged = {
-        name: getattr(state, name)
-        for name in ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "wind")
-    }
-    again = held._replace(**unchanged)
-    return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
+    return begun_again(held, state, inputs, params, "wind")
 
 
 def _with_attitude(
@@ -240,42 +242,6 @@ def _with_attitude(
     )
 
 
-def _with_commands(
-    state: GuidanceState,
-    commands: Mapping[str, float],
-    pose: Mapping[str, float],
-    dt: float,
-    route: Route | None,
-    params: GuidanceParams,
-) -> tuple[GuidanceState, float]:
-    """The modes and commands in force, and the distance from the end of a leg that ends here and is
-    missed, m.
-    """
-    lateral = params.channels.lateral
-    missed = 0.0
-    moved = lateral.keys() & commands.keys()
-    if state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and route and not moved:
-        state, missed = _along_route(state, pose, dt, route)
-    state = state._replace(target=state.target._replace(**commands))
-    if state.fence >= HOME and moved:
-        state = state._replace(fence=0.0)
-    for name in commands:
-        state = state._replace(
-            lateral=lateral.get(name, state.lateral),
-            vertical=params.channels.vertical.get(name, state.vertical),
-        )
-    if "leg" in commands and route is not None:
-        held = state.vertical
-        state = on_leg(state, int(commands["leg"]), route)._replace(joining=1.0)
-        joined = {"along": 0.0} | dict(commands)
-        state = state._replace(target=state.target._replace(**joined))
-        if params.channels.vertical.keys() & commands.keys():
-            state = state._replace(vertical=held)
-    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
-        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
-    return on_profile(state, pose, route), missed
-
-
 def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> bool:
     return abs(complex(*place) - _place(pose)) <= NEAR * max(float(state.target.V), 1.0)
 
@@ -299,8 +265,7 @@ def _along_route(
     leg = route.legs[state.leg]
     if state.joining:
         start, _ = route.start(state.leg, state.target.along)
-        is_last = path.is_orbit(leg)
-        joins = is_last or _is_near(state, pose, start)
+        joins = path.is_orbit(leg) or _is_near(state, pose, start)
         return (on_leg(state, state.leg, route) if joins else state), 0.0
     if leg.end is None:
         return state, 0.0
@@ -310,10 +275,8 @@ def _along_route(
             state = state._replace(loitered=min(state.loitered + share, 1.0))
         ends = has_loitered(state, pose, route)
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
-    ends = path.passed(leg, position)
-    if _stops(route, state.leg):
-        ends = ends or _is_near(state, pose, leg.end)
-    if not ends:
+    stopped = _stops(route, state.leg) and _is_near(state, pose, leg.end)
+    if not stopped and not path.passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)
     missed = distance if distance > route.near(state.leg) else 0.0
