@@ -7,13 +7,13 @@ flies through.
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import NamedTuple
 
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import OVERRIDE_TIME, ArduPlane, guided_scenario
+from tests.sitl.kit import OVERRIDE_TIME, ArduPlane
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_log.tape_reader import read_run
@@ -136,60 +136,44 @@ def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
         assert engagement.stop_ns is None, took
 
 
-def test_stuck_aileron_is_found_by_a_turn_that_guidance_commands(plane: ArduPlane) -> None:
-    """In calm air an aileron that sticks in trim moves nothing, and nothing tells it: u grows where
-    a bank is commanded.
-    """
+@contextmanager
+def waiting(
+    plane: ArduPlane, sentence: str = "DISENGAGED", channel_map: str = ""
+) -> Iterator[Process]:
+    """A flight of the stack that says a sentence and waits for an engagement."""
     plane.level()
-    scenario = plane.folder / "turn.yaml"
-    program = plane.turns([10.0], plane.state()["alt"] - plane.home, 24.0)
-    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0))
-    with ExitStack() as afterwards, plane.engaged(scenario, plane.mavlink_map(), 100.0) as flight:
-        for parameter, value in stuck("aileron", 1500):
-            plane.say("param", parameter, f"{value:g}")
-            afterwards.callback(plane.say, "param", parameter, f"{HEALTHY[parameter]:g}")
-        flight.wait_for("RELEASE", 60.0)
-        afterwards.close()
-        flight.interrupt()
-        flight.end()
-    (engagement,) = plane.summary()["engagements"]
-    assert re.search("^(aileron|phi)", engagement["reason"])
-
-
-def test_engagement_in_a_climb_is_refused(plane: ArduPlane) -> None:
-    plane.level()
-    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
+    flight = plane.fly(SCENARIO.path, channel_map or plane.mavlink_map(), 100.0, "--send")
     try:
-        flight.wait_for("DISENGAGED")
-        plane.say("goto", f"{plane.state()['alt'] - plane.home + 200.0:.0f}")
-        plane.until(lambda state: state["climb"] > 3.0)
-        plane.hand_over()
-        refused = plane.requested()
-        assert refused.end() != 0
-        assert "climb" in refused.output
+        flight.wait_for(sentence)
+        yield flight
     finally:
         flight.interrupt()
         flight.end()
         plane.level()
+
+
+def require_refusal(plane: ArduPlane, reason: str) -> None:
+    refused = plane.requested()
+    assert refused.end() != 0
+    assert reason in refused.output
+
+
+def test_engagement_in_a_climb_is_refused(plane: ArduPlane) -> None:
+    with waiting(plane):
+        plane.say("goto", f"{plane.state()['alt'] - plane.home + 200.0:.0f}")
+        plane.until(lambda state: state["climb"] > 3.0)
+        plane.hand_over()
+        require_refusal(plane, "climb")
     assert plane.summary()["engagements"] == []
 
 
 def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: ArduPlane) -> None:
     """ArduPilot's own failsafe leaves MANUAL, and says so in HEARTBEAT."""
-    plane.level()
-    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
-    try:
-        flight.wait_for("DISENGAGED")
+    with waiting(plane):
         plane.hand_over()
         with plane.without_transmitter():
             plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
-            refused = plane.requested()
-            assert refused.end() != 0
-        assert "the mode is not MANUAL" in refused.output
-    finally:
-        flight.interrupt()
-        flight.end()
-        plane.level()
+            require_refusal(plane, "the mode is not MANUAL")
 
 
 def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPlane) -> None:
@@ -235,24 +219,15 @@ def failsafe(plane: ArduPlane) -> Iterator[None]:
 def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(
     plane: ArduPlane,
 ) -> None:
-    plane.level()
-    with plane.shared_link() as link:
-        flight = plane.fly(SCENARIO.path, plane.shared_map(), 100.0, "--send")
-        try:
-            flight.wait_for("would refuse: the mode is not MANUAL")
-            plane.hand_over()
-            time.sleep(3.0)  # the rates are known 2 s after the first message
-            link("take")
-            time.sleep(1.0)  # the count of 2 s has fallen by a third
-            refused = plane.requested()
-            assert refused.end() != 0
-            assert re.search("ATTITUDE (comes|came) at .* Hz, requested are 40 Hz", refused.output)
-            assert "set streamrate -1" in flight.output
-            flight.wait_for("less than 20 s ago")  # the rate has come back
-        finally:
-            flight.interrupt()
-            flight.end()
-            plane.level()
+    sentence = "would refuse: the mode is not MANUAL"
+    with plane.shared_link() as link, waiting(plane, sentence, plane.shared_map()) as flight:
+        plane.hand_over()
+        time.sleep(3.0)  # the rates are known 2 s after the first message
+        link("take")
+        time.sleep(1.0)  # the count of 2 s has fallen by a third
+        require_refusal(plane, " Hz, requested are 40 Hz")
+        assert "set streamrate -1" in flight.output
+        flight.wait_for("less than 20 s ago")  # the rate has come back
     assert plane.summary()["engagements"] == []
 
 
@@ -340,17 +315,10 @@ def test_mode_after_a_release_is_the_pilots_or_one_that_flies(
 
 
 def test_long_timeout_of_overrides_refuses_an_engagement(plane: ArduPlane) -> None:
-    plane.level()
     plane.say("param", "RC_OVERRIDE_TIME", "3")
-    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
     try:
-        flight.wait_for("would refuse: the mode is not MANUAL")
-        plane.hand_over()
-        refused = plane.requested()
-        assert refused.end() != 0
-        assert "RC_OVERRIDE_TIME is 3, expected 0.2 to 1" in refused.output
+        with waiting(plane, "would refuse: the mode is not MANUAL"):
+            plane.hand_over()
+            require_refusal(plane, "RC_OVERRIDE_TIME is 3, expected 0.2 to 1")
     finally:
-        flight.interrupt()
-        flight.end()
         plane.say("param", "RC_OVERRIDE_TIME", f"{OVERRIDE_TIME:g}")
-        plane.level()

@@ -573,15 +573,12 @@ def test_bridge_without_topics_of_autopilot_ends_with_the_cause_of_each(tmp_path
         setup.autopilot_runs = False
         for publisher in (setup.autopilot._twist, setup.autopilot._airspeed):
             publisher.leave()
-        setup.world.publisher(TwistStamped, "/ap/airspeed", 10)
         setup.start()
         with pytest.raises(FlightEnded) as ended:
             setup.run(4.0)
         sentence = str(ended.value)
         assert sentence.startswith("no y after 3 s: ")
-        assert "/ap/twist/filtered: no publisher" in sentence
-        expected = "geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
-        assert f"/ap/airspeed: /peer publishes {expected}" in sentence
+        assert "/ap/twist/filtered, /ap/airspeed: no publisher" in sentence
 
 
 def test_domain_or_profile_named_where_a_topic_has_no_publisher() -> None:

@@ -468,8 +468,6 @@ def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_m
     come(3.0, 40.0)
     assert made.lost() == ""
     assert made.refusal().startswith("ATTITUDE came at 4 Hz")
-    come(20.0, 40.0)
-    assert made.refusal() == ""
 
 
 def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Clock) -> None:

@@ -40,7 +40,6 @@ BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELEASE_AFTER = 2.0  # s, in place of the 3 s of RC_OVERRIDE_TIME, longer than MAX_AGE
 NEUTRAL = 0.4  # s, in tests with neutral values
 FULL = math.radians(30.0)  # full deflection of a surface in the map
-EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
 PATIENT = 5.0  # s, of y and u, where a release by their age would hide another one
 MAX_AGE, RELEASE = 1.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s: a host pauses for up to a second
 # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20
