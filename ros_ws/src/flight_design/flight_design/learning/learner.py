@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import chain
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, 
 from flight_design.learning.designs import (
     margin_behind,
     margin_of,
+    reserve_of,
     with_deviations,
     with_margin,
     without_effect,
@@ -49,7 +51,9 @@ from flight_design.learning.part_checks import (
     explains,
     forgotten,
     is_within,
+    kept_by_file,
     not_white,
+    relative_deviations,
     sentence,
     too_late,
     unchanged,
@@ -57,6 +61,7 @@ from flight_design.learning.part_checks import (
     unproven,
     weaker,
 )
+from flight_design.learning.predicted_error import predicted_error, tolerates
 from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
 from rise_di_controller.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -125,6 +130,7 @@ class Learner:
         # None too once the rough model has not flown, or the law fell back
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
+        self._by_rough: RiseDiConfig | None = None  # the proposal of the rough model
         self._believed = rough
         self._quick = quick
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
@@ -237,6 +243,8 @@ class Learner:
         ]
         sentences += [changed(change) for change in damaged if change.outputs not in dead]
         verdict = self._verdict(identified, without_model, lost=lost)
+        if kept := self._better_by_file(verdict, without_model):
+            verdict = self._verdict(identified, without_model, kept, lost=lost)
         if self._changed and any(
             another_airframe(part.entries, self._rough.name, AT_BOUND, self._believed.factor)
             for part in identified.parts
@@ -256,10 +264,13 @@ class Learner:
         self,
         identified: Identification,
         without_model: Mapping[tuple[str, ...], str],
+        kept: Mapping[tuple[str, ...], str] = MappingProxyType({}),
         *,
         lost: bool,
     ) -> Verdict:
-        """Which parts of an identification shall fly."""
+        """Which parts of an identification shall fly, those that are `kept` by the airframe file,
+        for its reason.
+        """
         end_ns = self._record.end_ns
         known = {part: value for part, value in self._known.items() if part not in without_model}
         model = self._model
@@ -287,23 +298,24 @@ class Learner:
             if not (rough or reason or part.outputs in learned) and flies_file:
                 reason = unproven(part, self._rough.name)
                 tried += part.entries
+            if part.outputs in kept:
+                reason = kept[part.outputs]
+                tried += part.entries
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
-                if part.outputs in learned and is_about_file and back_to_file(part):
+                is_back = part.outputs in kept or (is_about_file and back_to_file(part))
+                if part.outputs in learned and is_back:
                     model = with_entries(model, as_in_file(part))
                     del known[part.outputs]
                     name = "" if self._design_of_rough is None else self._rough.name
-                    sentences.append(back(part, name))
+                    sentences.append(kept.get(part.outputs) or back(part, name))
                 continue
             entries = as_in_file(part) if rough else part.entries
             model = with_entries(model, entries)
-            deviation = {
-                entry.name: abs(entry.deviation * entry.unit / entry.value)
-                for entry in entries
-                if entry.value
-            }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(end_ns, deviation, part.latest, rough, part.delays)
+            known[part.outputs] = Known(
+                end_ns, relative_deviations(entries), part.latest, rough, part.delays
+            )
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
                 if rough
@@ -311,6 +323,32 @@ class Learner:
             )
         tested = with_entries(model, tried) if tried else model
         return Verdict(model, known, sentences, refusals, tested)
+
+    def _better_by_file(
+        self, verdict: Verdict, without_model: Mapping[tuple[str, ...], str]
+    ) -> dict[tuple[str, ...], str]:
+        """The learned parts that fly better by the design for the airframe file, each with its
+        sentence: around the learned model, with u late as in the flight. None where this design
+        does not tolerate the latest delay. Raises ParameterError without a design of the verdict.
+        """
+        learned = [part for part, value in verdict.known.items() if not value.is_rough]
+        by_rough = self._by_rough
+        if by_rough is None or self._design_of_rough is None or self._changed or without_model:
+            return {}
+        latest = max((verdict.known[part].latest for part in learned), default=0.0)
+        late = latest + reserve_of(self._controller)
+        if not learned or not tolerates(by_rough, verdict.model, late):
+            return {}
+        proposed = self._designed(verdict.model, verdict.known, without_model)
+        by_model = predicted_error(proposed, verdict.model, latest)
+        by_file = predicted_error(by_rough, verdict.model, latest)
+        kept = {}
+        for part in learned:
+            rows = [self._controller.outputs.index(name) for name in part]
+            share = float(by_file[rows].sum() / by_model[rows].sum())
+            if share < 1.0:
+                kept[part] = kept_by_file(part, self._rough.name, share)
+        return kept
 
     def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> None:
         """Design for a verdict, and take it as proposed. Raises ParameterError without a design."""
@@ -354,6 +392,7 @@ class Learner:
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
+        self._by_rough = proposed
         self._propose(proposed)
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
