@@ -213,7 +213,7 @@ def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude
-    there = {"north": place.north, "east": place.east, "altitude": altitude}
+    over_home = {"north": place.north, "east": place.east, "altitude": altitude}
     if params.multicopter is not None:
-        return there
-    return there | {"radius": float(math.ceil(params.limits.radius))}
+        return over_home
+    return over_home | {"radius": float(math.ceil(params.limits.radius))}
