@@ -3,19 +3,23 @@
 """Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave
 the fence, and how far.
 
-    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--shapes square ell]
-    [--aircraft 2000] .venv/bin/python -m benchmarks.fence --from-outside [--aircraft 1]
+    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--aircraft 2000]
+    .venv/bin/python -m benchmarks.fence --from-outside [--aircraft 1]
+    .venv/bin/python -m benchmarks.fence --generated 60 [--seed 7]
 
-The figures go to docs/evidence/guidance-fence-*.csv, where all fences and winds are flown. A row a
-shape and a wind. Of the osprey a fleet flies: every entry of A and B is off by up to 30 %
-(`aircraft_sim.uncertainty`). An aircraft of JSBSim flies as it is, once. The turbulence is light
-(MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The aircraft starts at the origin to the
-north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status 1: an
-aircraft left the fence, or was lost.
+The figures go to docs/evidence/guidance-fence-*.csv, a row a shape and a wind. Of the osprey a
+fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`). An aircraft
+of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a
+share of V0. The aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No
+number belongs to an aircraft. Exit status 1: an aircraft left the fence, or was lost.
 
 `--from-outside` starts ospreys outside of five fences, in a wind of 0.4 V from four sides; the
 figures are printed. A flight is home that is within HOME_RADII of home at the end. Exit status 1:
 an aircraft did not come home.
+
+`--generated N` makes fences round home: triangles, slots, holes near home and polygons smaller than
+a turn, until N are accepted. An osprey begins over home and flies a course of the seed; the figures
+and the refusals are printed.
 """
 
 import csv
@@ -23,7 +27,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, product
+from itertools import chain, cycle, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,7 +45,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, batch_matrices, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.outcome import COMPLETED
-from flight_guidance.params import GuidanceConfig
+from flight_core.parameters import ParameterError
 from flight_guidance.zones import Fence, Zone
 
 OSPREY = "osprey"
@@ -89,9 +93,9 @@ WINDS: Mapping[str, tuple[float, float]] = {
 }
 """Where the air moves to: north and east, of V0."""
 
-DURATION, HOMEWARD_DURATION = 8.0, 25.0
+DURATION, HOMEWARD_DURATION, GENERATED_DURATION = 8.0, 25.0, 12.0
 """Radii at V0: 3 to the fence against the wind, a turn, and the way home; 14 round the U against
-0.4 V."""
+0.4 V; 12 lead to the corners of most generated fences."""
 
 
 class Row(NamedTuple):
@@ -103,7 +107,6 @@ class Row(NamedTuple):
     flights: int
     outside: int  # flights
     farthest: float  # m beyond the fence
-    turned: int  # flights with a bank of nine tenths of the largest
     lost: int  # flights
     home: int  # flights within HOME_RADII at the end
 
@@ -133,9 +136,9 @@ def windy(
     wind: tuple[float, float],
     home: tuple[float, float],
     radii: float = DURATION,
-) -> tuple[Scenario, GuidanceConfig, float]:
-    """A scenario in a wind, share of V0, without a route, that flies to the north; its section, and
-    the least radius, m.
+) -> tuple[Scenario, float]:
+    """A scenario in a wind, share of V0, without a route, that flies to the north; and the least
+    radius, m.
 
     `home` in radii; `radii`: the duration, at V0.
     """
@@ -154,7 +157,7 @@ def windy(
             "home": dict(zip(("north", "east"), at(home, radius), strict=True)),
         },
     )
-    return varied, section, radius
+    return varied, radius
 
 
 def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
@@ -172,7 +175,7 @@ def fly_fleet(
     share, radii = (
         (OUTSIDE_WINDS[wind], HOMEWARD_DURATION) if from_outside else (WINDS[wind], DURATION)
     )
-    scenario, _, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
+    scenario, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
     route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario = scenario.vary(guidance={"route": route})
     airframe = load_airframe("osprey")
@@ -183,7 +186,6 @@ def fly_fleet(
     mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
     control_law, params = scenario.controller.tuned_law()
     beyond = []
-    banks = []
     lost = 0
     home = 0
     for first in range(0, aircraft, CHUNK):
@@ -197,36 +199,105 @@ def fly_fleet(
         result = batch.fly(assembled, vehicle, course, control_law, batch.shared(params), mission)
         figures = result.mission or {}
         beyond += np.asarray(figures["max.breach"]).tolist()
-        banks += np.asarray(figures["max.phi"]).tolist()
         lost += int(np.sum(np.asarray(result.diverged)))
         home += int(np.sum(np.asarray(figures["home"]) <= HOME_RADII * radius))
-    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)._replace(
-        home=home
-    )
+    return row_of(OSPREY, shape, wind, beyond, lost, home)
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
     """The row of an aircraft of JSBSim, which flies to the north."""
-    scenario, section, radius = windy(aircraft_of(name), WINDS[wind], HOME)
-    zones = of_radius(SHAPES[shape], radius)
-    fence = {
-        f"zone{k}": {
-            "north": zone.north,
-            "east": zone.east,
-            "radius": zone.radius or None,
-            "exclude": zone.exclude,
-        }
-        for k, zone in enumerate(zones)
-    }
-    program = {"course": {"start": [0.1], "value": [0.0]}}
-    tape = simulate(scenario.vary(guidance={"fence": fence, "program": program}))
+    prepared = windy(aircraft_of(name), WINDS[wind], HOME)
+    return row_of_flight(name, (shape, wind), prepared, SHAPES[shape], 0.0)
+
+
+def row_of_flight(
+    name: str,
+    about: tuple[str, str],
+    prepared: tuple[Scenario, float],
+    shape: tuple[Zone, ...],
+    course: float,
+) -> Row:
+    """The row of a flight on a course, rad, inside of zones in radii. `prepared`: of `windy`;
+    `about`: the fence and the wind.
+
+    Raises ParameterError for a fence that is refused.
+    """
+    scenario, radius = prepared
+    fence = {}
+    for k, zone in enumerate(of_radius(shape, radius)):
+        fence[f"zone{k}"] = zone._asdict() | {"radius": zone.radius or None}
+    program = {"course": {"start": [0.1], "value": [course]}}
+    tape = simulate(
+        scenario.vary(
+            guidance={"fence": fence, "program": program},
+            aircraft={"start": {"heading": course}},
+        )
+    )
     beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
-    bank = float(np.abs(tape["pose"]["phi"]).max())
     pose = tape["pose"]
-    home = at(HOME, radius)
-    to_home = math.hypot(pose["north"][-1] - home[0], pose["east"][-1] - home[1])
-    row = row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
-    return row._replace(home=int(to_home <= HOME_RADII * radius))
+    assert scenario.guidance is not None  # noqa: S101 - `windy` has made the section
+    home = scenario.guidance.home
+    to_home = math.hypot(pose["north"][-1] - home.north, pose["east"][-1] - home.east)
+    lost = int(tape.outcome != COMPLETED)
+    return row_of(name, *about, [beyond], lost, int(to_home <= HOME_RADII * radius))
+
+
+def polygon(
+    rng: np.random.Generator, corners: int, radii: tuple[float, float], centre: float = 0.0
+) -> Zone:
+    """A polygon round a place at the distance `centre`, radii, from the origin, with corners at
+    random angles and distances, radii.
+    """
+    evenly = rng.uniform() + np.arange(corners) / corners
+    angles = 2.0 * math.pi * (evenly + rng.uniform(-0.3, 0.3, corners) / corners)
+    distances = rng.uniform(*radii, corners)
+    north = centre + distances * np.cos(angles)
+    return Zone(tuple(north.tolist()), tuple((distances * np.sin(angles)).tolist()))
+
+
+def generated(kind: str, rng: np.random.Generator) -> tuple[Zone, ...]:
+    """Zones of a kind of GENERATED round the origin, in radii."""
+    if kind == "triangle":
+        return (polygon(rng, 3, (2.0, 12.0)),)
+    if kind == "smaller than a turn":
+        return (polygon(rng, int(rng.integers(3, 7)), (0.5, 2.5)),)
+    width = rng.uniform(1.5, 3.5)
+    length = rng.uniform(3.0, 15.0)
+    beside = rng.uniform(-0.3, 0.3) * width
+    ring = (length, length, -length, -length)
+    slot = Zone(ring, (beside + width, beside - width, beside - width, beside + width))
+    if kind == "slot":
+        return (slot,)
+    field = slot._replace(east=(length, -length, -length, length))
+    hole = polygon(rng, int(rng.integers(3, 7)), (0.2, 1.0), rng.uniform(1.5, 4.0))
+    return field, hole._replace(exclude=True)
+
+
+GENERATED = ("triangle", "slot", "hole near home", "smaller than a turn")
+
+
+def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
+    """Fly in generated fences until so many are accepted; whether all flights stayed inside."""
+    flown = list[Row]()
+    refusals = dict.fromkeys(GENERATED, 0)
+    for number, kind in enumerate(cycle(GENERATED)):
+        rng = np.random.default_rng([seed, number])
+        wind = str(rng.choice([*WINDS]))
+        course = rng.uniform(-math.pi, math.pi)
+        prepared = windy(aircraft_of("osprey_servo"), WINDS[wind], (0.0, 0.0), GENERATED_DURATION)
+        try:
+            row = row_of_flight(OSPREY, (kind, wind), prepared, generated(kind, rng), course)
+        except ParameterError as refused:
+            refusals[kind] += 1
+            print(f"fence {number}, {kind}, {wind}: {refused}")
+        else:
+            flown.append(row)
+            show(row)
+        sys.stdout.flush()
+        if len(flown) == accepted:
+            break
+    print(f"refused: {refusals}")
+    return not any(row.outside or row.lost for row in flown)
 
 
 def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]:
@@ -240,35 +311,23 @@ def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]
     return homes
 
 
-def row_of(
-    name: str,
-    shape: str,
-    wind: str,
-    beyond: list[float],
-    banks: list[float],
-    lost: int,
-    largest: float,
-) -> Row:
-    """A row from the distances beyond the fence, m, and the largest banks of the flights."""
+def row_of(name: str, shape: str, wind: str, beyond: list[float], lost: int, home: int) -> Row:
+    """A row from the distances beyond the fence, m."""
     outside = sum(distance > 0.0 for distance in beyond)
-    turned = sum(bank > 0.9 * largest for bank in banks)
-    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost, 0)
+    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), lost, home)
 
 
 def main() -> int:
     """Fly, print the rows and store them."""
     parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=[*AIRCRAFT], help="aircraft")
-    parser.add_argument(
-        "--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences; not stored"
-    )
-    parser.add_argument(
-        "--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds; not stored"
-    )
     parser.add_argument("--aircraft", type=int, default=2000, help="ospreys in each row")
     parser.add_argument("--seed", type=int, default=7, help="of the ospreys")
     parser.add_argument(
         "--from-outside", action="store_true", help="start ospreys outside of a fence; not stored"
+    )
+    parser.add_argument(
+        "--generated", type=int, metavar="N", help="fly in N generated fences; not stored"
     )
     chosen = parser.parse_args()
     writer = csv.writer(sys.stdout)
@@ -276,11 +335,13 @@ def main() -> int:
     writer.writerow(Row._fields)
     if chosen.from_outside:
         return int(not all(fly_home(chosen.aircraft, chosen.seed, writer.writerow)))
+    if chosen.generated:
+        return int(not fly_generated(chosen.generated, chosen.seed, writer.writerow))
     for name in chosen.only:
         options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
         begun = evidence.origin(f"python -m benchmarks.fence --only {name}{options}")
         flown = list[Row]()
-        for shape, wind in product(chosen.shapes, chosen.winds):
+        for shape, wind in product(SHAPES, WINDS):
             of_fleet = name == OSPREY
             row = (
                 fly_fleet(shape, wind, chosen.aircraft, chosen.seed)
@@ -291,10 +352,9 @@ def main() -> int:
             writer.writerow(row)
             sys.stdout.flush()
             failed |= bool(row.outside or row.lost)
-        if len(flown) == len(SHAPES) * len(WINDS):
-            evidence.write(
-                f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun
-            )
+        evidence.write(
+            f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun
+        )
     return int(failed)
 
 
