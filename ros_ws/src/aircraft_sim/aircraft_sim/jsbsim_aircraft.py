@@ -47,7 +47,9 @@ class Command(NamedTuple):
 
 
 NamedProperties = tuple[tuple[str, float], ...]
-"""Properties of a model, and the value of each at the command 1."""
+"""Properties of a model, and the value of each at the command 1; empty of a rudder that is none."""
+
+NONE = "none"
 
 
 # outside of JSBSim's settings
@@ -60,13 +62,17 @@ def named_properties(
     """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5
     fcs/cmdAilL_rad=-0.5".
 
-    The number is the property's value at the command 1, which is the default. Raises ParameterError
-    for an unknown input, for what is no property of an aircraft, and for the value 0.
+    The number is the property's value at the command 1, which is the default; "none" of a rudder
+    is a model without rudder. Raises ParameterError for an unknown input, for what is no property
+    of an aircraft, and for the value 0.
     """
-    named = []
+    named = list[tuple[str, NamedProperties]]()
     for name, text in commands.items():
         require(name in INPUTS, key, repr(name), f"an input: {', '.join(INPUTS)}")
         paths = []
+        if (name, text.strip()) == ("rudder", NONE):
+            named.append((name, ()))
+            continue
         for word in text.split():
             path, _, number = word.partition("=")
             at_one = _number(number or "1")
@@ -160,10 +166,18 @@ class FlightCondition(NamedTuple):
         named = dict(self.named)
         return {
             name: command._replace(trim_property=None, named=named[name])
-            if name in named
+            if named.get(name)
             else command
             for name, command in INPUTS.items()
         }
+
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs in the order of INPUTS, without a rudder that is none."""
+        return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
+
+    def paired_outputs(self) -> tuple[str, ...]:
+        """The outputs that the inputs move, one by one in the order of OUTPUTS."""
+        return tuple(OUTPUTS)[: len(self.inputs())]
 
 
 class Trim(NamedTuple):

@@ -80,7 +80,7 @@ class JsbsimModel:
                 (node := self._node(path), node.get_double_value(), at_one)
                 for path, at_one in command_paths(command, engines)
             ]
-            for command in condition.commands().values()
+            for command in map(condition.commands().__getitem__, condition.inputs())
         ]
         self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
         self._state_nodes = [
@@ -98,8 +98,9 @@ class JsbsimModel:
         self._cut = False
         self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
         self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
+        inputs = condition.inputs()
         self._no_thrust = np.where(
-            [command.each_engine for command in INPUTS.values()], -self.trim.commands, 0.0
+            [INPUTS[name].each_engine for name in inputs], -self.trim.commands[: len(inputs)], 0.0
         )
         self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
         self._wind_model = wind_model
@@ -108,7 +109,7 @@ class JsbsimModel:
             if wind_model.turbulence is None
             else turbulence.initial_state(wind_model.turbulence)
         )
-        self._position = np.zeros(len(INPUTS))
+        self._position = np.zeros(len(inputs))
         self._altitude = self._node("position/h-sl-ft")
         self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._apply_wind(self._wind(0))
@@ -120,11 +121,11 @@ class JsbsimModel:
         self.truth_names = (
             *(f"x.{name}" for name in STATES),
             *(f"gust.{name}" for name in AXES),
-            *(f"actuator.{name}" for name in INPUTS),
+            *(f"actuator.{name}" for name in inputs),
         )
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """From t to t + duration with the command u held, shape (4,), deviations from trim.
+        """From t to t + duration with the command u held, shape (m,), deviations from trim.
 
         Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground:
         landed on the wheels with a sink of at most SOFT, else the aircraft has hit the ground.

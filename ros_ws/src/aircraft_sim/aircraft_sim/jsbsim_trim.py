@@ -199,7 +199,12 @@ def sideslip_zero(condition: FlightCondition) -> float:
 
     Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central
     differences in frozen flight give the derivatives. Gravity is left out: the coupling of bank to
-    sideslip is much slower. Where the rate is positive, Assumption 3 does not hold. Raises
+    sideslip is much slower. Where the rate is positive, Assumption 3 does not hold. Without rudder
+    the aileron holds p, and r follows: the rate is the largest real part of the roots of
+
+        beta_dot = Y beta / V - r,  r_dot = N beta
+
+    with Y and N at that aileron; the damping of yaw, left out, makes them decay faster. Raises
     FlightEnded.
     """
     solution = trim_solution(condition)
@@ -218,7 +223,12 @@ def sideslip_zero(condition: FlightCondition) -> float:
         return np.asarray((ends[0] - ends[1]) / (2.0 * step))
 
     beta = derivative("beta", 0.01)
-    u = np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
+    held = [name for name in ("aileron", "rudder") if name in condition.inputs()]
+    u = np.column_stack([derivative(name, 0.05) for name in held])
+    if len(held) == 1:
+        side, _, yaw = beta - u[:, 0] * beta[1] / u[1, 0]
+        motion = np.array([[side / condition.speed, -1.0], [yaw, 0.0]])
+        return float(np.linalg.eigvals(motion).real.max())
     return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / condition.speed
 
 

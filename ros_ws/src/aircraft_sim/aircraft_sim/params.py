@@ -92,7 +92,8 @@ class AircraftConfig(NodeConfig):
     )
     commands: dict[str, str] = Field(
         default={},
-        description="of JSBSim: by input, properties with their values at the command 1",
+        description="of JSBSim: by input, properties with their values at the command 1; "
+        "`rudder: none` of a model without rudder",
     )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
@@ -311,7 +312,8 @@ class AircraftConfig(NodeConfig):
         throttle is -1 until the model has its trim.
         """
         if self.is_jsbsim:
-            return np.array([-float(command.each_engine) for command in INPUTS.values()])
+            inputs = self.flight_condition().inputs()
+            return np.array([-float(INPUTS[name].each_engine) for name in inputs])
         return load_airframe(self.airframe).no_thrust()
 
     def _check_jsbsim(self) -> None:
@@ -358,12 +360,10 @@ class AircraftConfig(NodeConfig):
         """Outputs and inputs with their units, the effects of the inputs, and the trim speed."""
         vanes: dict[str, Unit] = dict.fromkeys(self.vanes.channels, "rad")
         if self.is_jsbsim:
-            positive = {name: command.positive for name, command in INPUTS.items()}
+            condition = self.flight_condition()
+            positive = {name: INPUTS[name].positive for name in condition.inputs()}
             return AircraftChannels(
-                {**OUTPUTS, **vanes},
-                dict.fromkeys(INPUTS, "1"),
-                positive,
-                self.flight_condition().speed,
+                {**OUTPUTS, **vanes}, dict.fromkeys(positive, "1"), positive, condition.speed
             )
         airframe = load_airframe(self.airframe)
         inputs = {name: channel.unit for name, channel in airframe.inputs.items()}

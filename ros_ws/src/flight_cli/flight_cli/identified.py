@@ -36,11 +36,18 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
     stops = new_table(
         "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
     )
-    columns = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
+    columns = (
+        "input",
+        "steps of",
+        *(f"{name}_dot" for name in identified.condition.paired_outputs()),
+        "lag, s",
+        "D",
+    )
     responses = new_table(
         "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns
     )
-    for j, name in enumerate(INPUTS):
+    inputs = identified.condition.inputs()
+    for j, name in enumerate(inputs):
         stops.add_row(
             name,
             *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])),
@@ -51,10 +58,12 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
         )
     console.print(stops)
     console.print(responses)
-    for name, spread in zip(INPUTS, steps.spread, strict=True):
+    for name, spread in zip(inputs, steps.spread, strict=True):
         if spread < LINEAR:
             differ = f"the slopes of its steps differ by a factor of {1.0 / spread:.2g}"
             console.print(f"{name} is not linear: {differ}; the largest is used")
+    if len(inputs) < len(INPUTS):
+        console.print("the rudder moves nothing: the scenario has none, and r is not commanded")
     for sentence in steps.rejected:
         say(console, f"rejected: {sentence}")
 
@@ -82,19 +91,25 @@ def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
     )
     if answer.delay_margin:
         margin += f", {speed_of_margin(identified.selection.study, answer)}"
+    held = "p and r"
+    mend = "the sideslip feedback of --guidance flies it"
+    if "r" not in controller.outputs:
+        held = "p"
+        mend = "without a rudder no feedback holds it"
     if identified.sideslip_zero > 0.0:
         say(
             console,
-            f"with p and r constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s:"
-            " a zero in the right half plane, outside the theorem; the sideslip feedback of "
-            "--guidance flies it",
+            f"with {held} constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s: a zero "
+            f"in the right half plane, outside the theorem; {mend}",
         )
     sign = controller.sampled_sign()[0].name.lower()
     say(console, f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}")
 
 
 def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
-    headings = [f"{name}\n{display_unit(unit).unit}" for name, unit in OUTPUTS.items()]
+    condition = identified.condition
+    units = {name: display_unit(OUTPUTS[name]) for name in condition.paired_outputs()}
+    headings = [f"{name}\n{unit.unit}" for name, unit in units.items()]
     alone = ", with the gains alone" if identified.scenario().rise_di().learn is not None else ""
     flights = new_table(
         f"\nFlights of 60 s in one process{alone}: rms of the error",
@@ -102,13 +117,13 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
         ("flight", "outcome"),
         ("outcome",),
     )
-    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS])
+    largest = new_table(
+        "\nLargest deviation of a command from trim", ["flight", *condition.inputs()]
+    )
     for title, flight in identified.flights.items():
-        errors = [
-            f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()
-        ]
+        errors = [f"{flight.rms[name] * unit.factor:.3g}" for name, unit in units.items()]
         flights.add_row(title, *errors, flight.text)
-        largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
+        largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in condition.inputs()))
     console.print(flights)
     console.print(largest)
 
@@ -117,6 +132,7 @@ def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, 
     """What the step tests gave, SI."""
     trim = identified.trim
     steps = identified.responses
+    outputs = identified.condition.paired_outputs()
     by_input = {
         name: {
             "trim": float(trim.commands[j]),
@@ -124,11 +140,11 @@ def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, 
             "upper": float(trim.upper[j]),
             "step": float(steps.size[j]),
             "spread": float(steps.spread[j]),
-            "Omega": dict(zip(OUTPUTS, steps.Omega[:, j].tolist(), strict=True)),
+            "Omega": dict(zip(outputs, steps.Omega[:, j].tolist(), strict=True)),
             "lag": float(steps.lag[j]),
             "D": identified.D[j],
         }
-        for j, name in enumerate(INPUTS)
+        for j, name in enumerate(identified.condition.inputs())
     }
     return {
         "airframe": identified.condition.title,

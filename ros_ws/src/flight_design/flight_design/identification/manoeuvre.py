@@ -42,7 +42,9 @@ TURN_START = 2.0
 CLIMB_START = 30.0
 
 
-def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
+def reference_parameters(
+    speed: float, authority: float, outputs: tuple[str, ...] = tuple(OUTPUTS)
+) -> dict[str, Any]:
     """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of
     the throttle (m/s^2).
 
@@ -53,22 +55,23 @@ def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
             2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority,
             omega up to 1.2 rad/s
         p   0.15 rad/s right and left for 1 s each: banks of 9 degrees
-        r   the coordinated turn g/V0 sin(bank)
+        r   the coordinated turn g/V0 sin(bank), where `outputs` have r
 
     The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not
     commanded: the nose drops in them.
     """
     q = min(PULSE_Q, GRAVITY / speed)
     p = PULSE_P
+    turn = {"bank_rate": "p", "turn_rate": "r", "speed": speed}
     slow = min(NATURAL_FREQUENCY["V"], AUTHORITY_FRACTION * authority * math.e / PULSE_V)
     return {
         "rate": RATE,
-        "outputs": list(OUTPUTS),
+        "outputs": list(outputs),
         "second_order": {
             "natural_frequency": [
-                slow if name == "V" else NATURAL_FREQUENCY[name] for name in OUTPUTS
+                slow if name == "V" else NATURAL_FREQUENCY[name] for name in outputs
             ],
-            "damping": [DAMPING[name] for name in OUTPUTS],
+            "damping": [DAMPING[name] for name in outputs],
         },
         "rise": 0.1,
         "pulses": {
@@ -84,8 +87,7 @@ def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
                 "value": [p, -p, -p, p],
             },
         },
-        "coordinated_turn": {"bank_rate": "p", "turn_rate": "r", "speed": speed},
-    }
+    } | ({"coordinated_turn": turn} if "r" in outputs else {})
 
 
 def moderate_turbulence(altitude: float) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
+    NONE,
     OUTPUTS,
     FlightCondition,
     NamedProperties,
@@ -123,7 +124,9 @@ class IdentifiedAircraft(NamedTuple):
     def D(self) -> tuple[int, ...]:  # noqa: N802 - the paper's name
         """D in the canonical order of the inputs."""
         controller = self.selection.chosen
-        return tuple(controller.D[controller.inputs.index(name)] for name in INPUTS)
+        return tuple(
+            controller.D[controller.inputs.index(name)] for name in self.condition.inputs()
+        )
 
     def scenario(self) -> Scenario:
         """The content of the scenario file."""
@@ -180,15 +183,17 @@ def identify(
     """
     condition = FlightCondition(require_aircraft(name), speed, altitude, nanoseconds(STEP), named)
     trim = _trim(condition, progress)
+    if not has_rudder(condition):
+        condition = condition._replace(named=(*named, ("rudder", ())))
     stall = slowest_trim(condition) if guided else None
     measured = _measured(condition, trim, progress)
     Omega = measured.Omega
     range_ = min(-trim.lower[THROTTLE], trim.upper[THROTTLE])
     authority = float(abs(Omega[THROTTLE, THROTTLE]) * range_)
-    commands = reference_parameters(speed, authority)
-    scaled = _in_units_of_the_manoeuvre(Omega, trim)
+    commands = reference_parameters(speed, authority, condition.paired_outputs())
+    scaled = _in_units_of_the_manoeuvre(condition, Omega, trim)
     V_bandwidth = airspeed_bandwidth(authority, float(measured.lag[THROTTLE]))
-    setting = _setting(trim, measured.lag, V_bandwidth)._replace(requirement=needed)
+    setting = _setting(condition, trim, measured.lag, V_bandwidth)._replace(requirement=needed)
 
     def scenario_text(selection: Selection) -> str:
         return _text(condition, trim, measured, commands, selection, stall)
@@ -218,19 +223,33 @@ def _measured(condition: FlightCondition, trim: Trim, progress: Callable[[str], 
         for k in range(divide(nanoseconds(duration), condition.step_ns, "step", "the step test")):
             vehicle.advance(k * condition.step_ns, u, condition.step_ns)
             rows.append(vehicle.y())
-        return np.array(rows)
+        return np.array(rows)[:, : len(condition.inputs())]
 
-    return step_responses(
-        fly, trim.lower, trim.upper, tuple(OUTPUTS), tuple(INPUTS), STEP, progress
-    )
+    inputs = condition.inputs()
+    lower, upper = (stops[: len(inputs)] for stops in (trim.lower, trim.upper))
+    return step_responses(fly, lower, upper, condition.paired_outputs(), inputs, STEP, progress)
 
 
-def _in_units_of_the_manoeuvre(Omega: FloatArray, trim: Trim) -> FloatArray:
+def has_rudder(condition: FlightCondition) -> bool:
+    """Whether half of the rudder moves the aircraft within a second, or the user says none."""
+    if "rudder" not in condition.inputs():
+        return True  # the user has said so
+    flown = []
+    for rudder in (0.5, -0.5):
+        vehicle = _vehicle(condition)
+        vehicle.advance(0, np.array([0.0, 0.0, 0.0, rudder]), nanoseconds(1.0))
+        flown.append(vehicle.y())
+    return not np.array_equal(flown[0], flown[1])
+
+
+def _in_units_of_the_manoeuvre(
+    condition: FlightCondition, Omega: FloatArray, trim: Trim
+) -> FloatArray:
     """Omega with outputs in units of the manoeuvre. Raises ParameterError where outputs and inputs
     cannot be paired.
     """
-    outputs = tuple(OUTPUTS)
-    inputs = tuple(INPUTS)
+    outputs = condition.paired_outputs()
+    inputs = condition.inputs()
     scaled = Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     try:
         require_channels(scaled, ChannelPairing(outputs, inputs))
@@ -273,7 +292,7 @@ def _too_weak(Omega: FloatArray, trim: Trim, outputs: Sequence[str], inputs: Seq
     """The outputs whose own input, at full travel, moves the output less than a tenth of what
     another input does, in sentences after a "; ".
     """
-    reach = Omega * np.minimum(-trim.lower, trim.upper)
+    reach = Omega * np.minimum(-trim.lower, trim.upper)[: len(inputs)]
     sentences = []
     for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         if abs(reach[i, i]) < 0.1 * np.abs(reach[i]).max():
@@ -367,11 +386,12 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
             "name": condition.title,
             "source": "step tests in JSBSim",
             "speed": condition.speed,
-            "states": dict(OUTPUTS),
+            "states": {name: OUTPUTS[name] for name in condition.paired_outputs()},
             "inputs": {
-                name: {"unit": "1", "positive": effect.positive} for name, effect in INPUTS.items()
+                name: {"unit": "1", "positive": INPUTS[name].positive}
+                for name in condition.inputs()
             },
-            "outputs": list(OUTPUTS),
+            "outputs": list(condition.paired_outputs()),
             "A": np.zeros_like(Omega).tolist(),
             "B": Omega.tolist(),
         },
@@ -397,20 +417,22 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
     )
 
 
-def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
+def _setting(
+    condition: FlightCondition, trim: Trim, lag: FloatArray, V_bandwidth: float
+) -> LoopSetting:
     """The loop of the gains. The parameters to be selected are 1."""
-    inputs = list(INPUTS)
+    inputs = list(condition.inputs())
     base = RiseDiConfig.validate_mapping(
         unit_gains(lag.tolist(), DELAY)
         | {
             "rate": CONTROL_RATE,
-            "outputs": list(OUTPUTS),
+            "outputs": list(condition.paired_outputs()),
             "inputs": inputs,
             "max_age": 0.1,
             "hold": 0.5,
             "ramp": 2.0,
-            "lower": trim.lower.tolist(),
-            "upper": trim.upper.tolist(),
+            "lower": trim.lower[: len(inputs)].tolist(),
+            "upper": trim.upper[: len(inputs)].tolist(),
         },
         "controller",
     )
@@ -434,8 +456,9 @@ def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
     faster one.
     """
     period = 1.0 / CONTROL_RATE
-    slew = np.zeros(len(INPUTS))
-    for j, (name, total) in enumerate(zip(INPUTS, total_lag(lag, DELAY, period), strict=True)):
+    slew = np.zeros(len(lag))
+    totals = total_lag(lag, DELAY, period)
+    for j, (name, total) in enumerate(zip(tape["u"].names, totals, strict=True)):
         count = max(round(float(total) / period), 1)
         u = tape["u"][name]
         slew[j] = np.max(np.abs(u[count:] - u[:-count]), initial=0.0) / (count * period)
@@ -485,9 +508,9 @@ SCENARIO_YAML = gain_yaml.yaml_template("""\
       vertical: {{ gust | flow }}
     # turbulence: {{ turbulence | flow }}  # moderate, to fly in instead
 {% endif %}
-    actuators:                 # elevator, throttle, aileron, rudder: deviations of the normalised commands from trim
-      lower: {{ trim.lower.tolist() | flow }}
-      upper: {{ trim.upper.tolist() | flow }}
+    actuators:                 # {{ inputs | join(", ") }}: deviations of the normalised commands from trim
+      lower: {{ trim.lower[:inputs | length].tolist() | flow }}
+      upper: {{ trim.upper[:inputs | length].tolist() | flow }}
 
 /**/reference_model:
   ros__parameters:
@@ -505,7 +528,9 @@ SCENARIO_YAML = gain_yaml.yaml_template("""\
 {% for name, pulse in commands.pulses.items() %}
       {{ name }}: {{ pulse | flow }}
 {% endfor %}
+{% if commands.coordinated_turn %}
     coordinated_turn: {{ commands.coordinated_turn | flow }}  # r += g/V0 sin(bank commanded)
+{% endif %}
 {% endif %}
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
@@ -541,12 +566,12 @@ def _text(
         condition=condition,
         below=gain_yaml.below_requirement(assessed.unmet, assessed.controller.outputs),
         named={
-            name: " ".join(f"{path}={at_one!r}" for path, at_one in paths)
+            name: " ".join(f"{path}={at_one!r}" for path, at_one in paths) or NONE
             for name, paths in condition.named
         },
         trim=trim,
-        inputs=list(INPUTS),
-        outputs=list(OUTPUTS),
+        inputs=list(condition.inputs()),
+        outputs=list(condition.paired_outputs()),
         Omega=steps.Omega,
         duration=DURATION,
         rate=RATE,
