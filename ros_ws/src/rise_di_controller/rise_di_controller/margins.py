@@ -247,8 +247,7 @@ def _modal_form(
     condition of their vectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
-    eigenvalues, real_or_complex = np.linalg.eig(A)
-    modes: ComplexArray = real_or_complex.astype(np.complex128)
+    eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
     size = np.linalg.norm(modes, axis=(1, 2))
     try:
         inverse: ComplexArray = np.linalg.inv(modes).astype(np.complex128)
@@ -257,8 +256,7 @@ def _modal_form(
     with np.errstate(over="ignore"):
         independent = size * np.linalg.norm(inverse, axis=(1, 2)) <= MOST_CONDITION
     inverse[~independent] = 0.0
-    form = SchurForm(eigenvalues.astype(np.complex128), inverse @ B, K @ modes)
-    return form, np.asarray(independent)
+    return SchurForm(eigenvalues, inverse @ B, K @ modes), np.asarray(independent)
 
 
 def _from_inputs_to_inputs(
