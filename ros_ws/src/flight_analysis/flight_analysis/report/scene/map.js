@@ -201,7 +201,7 @@ export function drawMarks(ctx, width, height, {scale}, wind, units, colour) {
   if (!wind || Math.hypot(...wind) < 0.05) return;
   const [north, east] = wind.map(value => value / Math.hypot(...wind) * ARROW);
   arrow(ctx, MARGIN + 46 - east / 2, MARGIN + 20 + north / 2, east, -north, colour("--plant"));
-  label(ctx, windText(units, ...wind), MARGIN + 72, MARGIN + 20, colour("--plant"), "left");
+  label(ctx, windText(units, ...wind), MARGIN + 24, MARGIN - 6, colour("--plant"), "left");
 }
 
 function arrow(ctx, x, y, right, down, fill) { // from a point on, with a head
