@@ -171,7 +171,7 @@ def experiment(
             "signs of the channel map; sizes not known",
         ),
         scenario_text(
-            heading,
+            [heading],
             airframe_file,
             wait + controller.duration,
             none,
@@ -467,13 +467,13 @@ def signs_alone(sign: FloatArray) -> Channels:
 
 
 def scenario_text(
-    heading: str,
+    heading: Sequence[str],
     airframe_file: str,
     duration: float,
     commands: Mapping[str, Any],
     controller: Mapping[str, Any],
 ) -> str:
-    """The text of a scenario."""
+    """The text of a scenario; `heading`: the lines at the top."""
     sections = {
         "flight": {"duration": float(duration)},
         "aircraft": {"airframe": airframe_file, "rate": RATE, "step": 1.0 / RATE},
@@ -482,7 +482,7 @@ def scenario_text(
         "recorder": {"rate": 100.0},
     }
     body = {f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}
-    return comment([heading]) + dump_yaml(body)
+    return comment(filter(None, heading)) + dump_yaml(body)
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -114,10 +114,10 @@ def flying_scenario(
         turning = identified._replace(channels=_without_sideslip(channels, identified.pairing))
     model = turning.airframe("identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, model)
-    heading = (
-        f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
-    )
-    heading += f"\n# {gain_yaml.margins_sentence(flown, margins)}"
+    heading = [
+        f"The aircraft behind the map {channel_map.name}, with gains from its identified response.",
+        gain_yaml.margins_sentence(flown, margins),
+    ]
     values = flown.model_dump(exclude_defaults=True)
     text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, values)
     lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
