@@ -72,7 +72,7 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
-def _require_flyable(scenario: Scenario, *, learns: bool) -> None:
+def require_flyable(scenario: Scenario, *, learns: bool) -> None:
     """Raise ParameterError for an aircraft or a controller beyond a campaign."""
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -129,7 +129,7 @@ def build_course(scenario: Scenario, *, learns: bool = False) -> Course:
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
-    _require_flyable(scenario, learns=learns)
+    require_flyable(scenario, learns=learns)
     airframe = aircraft.load()[0]
     plant = aircraft.plant()
     tick_ns = period_ns(controller.rate, "controller.rate")

@@ -183,12 +183,6 @@ class RiseDiConfig(ControllerConfig):
                 "one, with part 0 if it does not fly yet",
             )
             require(
-                self.allocation is None,
-                "learn",
-                "an allocation beside it",
-                "none: A and B are those of the inputs of the law",
-            )
-            require(
                 not self.vanes,
                 "learn",
                 "observer.vanes beside it",

@@ -173,7 +173,9 @@ class LearnerStation:
         if output is None or not controller.has_internals:
             return
         if controller.mode is Mode.ENGAGED:
-            self._learner.take(output.stamp_ns, output.inputs.y, output.u, controller.digest)
+            # u of the law: with an allocation `output` has that of the effectors
+            u = controller.state.u
+            self._learner.take(output.stamp_ns, output.inputs.y, u, controller.digest)
         if not self._learning.ticked(controller, t_ns):
             return
         proposal = proposed(self._learner, self._learning, controller, t_ns)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning_loop import Entry, Learn
+from flight_analysis.closed_loop.loop_margins import distribution
 from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
@@ -66,7 +67,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         airframe = sketched(Path(condition.name).stem, controller, condition.speed)
         rough = ROUGH
     else:
-        airframe = load_airframe(aircraft.airframe)
+        airframe = of_law(load_airframe(aircraft.airframe), controller)
         rough = KNOWN
     prior = controller.learn.prior
     if prior is not None and prior.file is not None:
@@ -115,6 +116,15 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 def quick_learner(scenario: Scenario) -> Learn | None:
     """The learner of a campaign."""
     return learner(scenario, quick=True)
+
+
+def of_law(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
+    """The airframe with the inputs of the law, in the order of its outputs."""
+    if controller.allocation is None:
+        return airframe
+    order = [controller.outputs.index(name) for name in airframe.outputs]
+    T = distribution(airframe, controller)[:, order]
+    return airframe.through(T, [controller.inputs[k] for k in order])
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:

@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The table of what refuses the section `learn`, beside the code that refuses."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pytest import approx
+from tests.conftest import refusing
+
+from aircraft_sim.airframe import load_airframe
+from c_export.constants import exportable
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_bringup.graph import second_stage
+from flight_campaign import learning_flights, tuning
+from flight_design.learning import scenario_learner
+
+PAGE = Path(__file__).parents[3] / "docs" / "learning.md"
+
+
+def learning() -> dict[str, Any]:
+    """The section learn of a scenario."""
+    section = find_scenario("osprey_learn").rise_di().learn
+    assert section is not None
+    return section.model_dump()
+
+
+REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
+    "`rise-di compare`, `benchmark`": (
+        lambda: tuning.build_benchmark(find_scenario("osprey_learn")),
+        r"controller\.learn: found a section, expected none: only rise-di fly and",
+    ),
+    "`rise-di export` without `--run RUN`": (
+        lambda: exportable(find_scenario("osprey_learn").rise_di()),
+        r"learn: found a section, expected none: C code replaces no model in flight",
+    ),
+    "`observer.vanes`": (
+        lambda: find_scenario("osprey_vanes").vary(controller={"learn": learning()}),
+        r"learn: found observer\.vanes beside it, expected none: a learner designs",
+    ),
+    "a campaign with guidance": (
+        lambda: learning_flights.require_flyable(find_scenario("osprey_learn_route")),
+        r"guidance: found a section beside controller\.learn, expected none",
+    ),
+    "a campaign of JSBSim": (
+        lambda: learning_flights.require_flyable(find_scenario("jsbsim_c172p_learn")),
+        r"airframe: found jsbsim:c172p, expected an airframe with matrices",
+    ),
+    "a flight behind a bridge": (
+        lambda: second_stage(find_scenario("osprey_learn"), bridge=True),
+        r"controller\.learn: found a bridge, expected a simulated aircraft",
+    ),
+}
+
+
+def test_table_has_every_refusal() -> None:
+    table = PAGE.read_text().partition("These refuse the section `learn`")[2]
+    rows = re.findall(r"^\| (.+?) \| .+ \|$", table, re.MULTILINE)
+    assert rows[0] == "refused"
+    assert set(rows[1:]) == set(REFUSALS)
+
+
+@pytest.mark.parametrize("pair", REFUSALS)
+def test_row_of_the_table_is_refused(pair: str) -> None:
+    refuse, sentence = REFUSALS[pair]
+    with refusing(sentence):
+        refuse()
+
+
+def test_learner_beside_an_allocation_sees_the_inputs_of_the_law() -> None:
+    vtail = find_scenario("osprey_vtail")
+    allocation = vtail.controller.allocation
+    assert allocation is not None
+    effectors = load_airframe("osprey_vtail")
+    rough = scenario_learner.of_law(effectors, vtail.rise_di())
+    T = np.reshape(allocation.T, (len(allocation.effectors), -1))
+    columns = [list(effectors.inputs).index(name) for name in allocation.effectors]
+    seen = [vtail.controller.inputs.index(name) for name in rough.inputs]
+    assert rough.matrix_b() == approx((effectors.matrix_b()[:, columns] @ T)[:, seen])
