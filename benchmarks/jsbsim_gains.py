@@ -103,7 +103,8 @@ def main() -> None:
                 phase=math.radians(options.phase_margin)
             )
             more = select_gains(selection.study, selection.setting._replace(requirement=needed))
-            slower = selection.chosen.softening[selection.chosen.outputs.index("V")] / SOFTENING
+            softening = np.broadcast_to(selection.chosen.softening, len(selection.chosen.outputs))
+            slower = softening[selection.chosen.outputs.index("V")] / SOFTENING
             row += [
                 verdict(selection),
                 f"{slower:.3g}",
