@@ -86,8 +86,8 @@ def main() -> None:
     parser.add_argument("aircraft", nargs="*", default=list(CONDITIONS))
     parser.add_argument("--phase-margin", type=float, default=60.0)
     options = parser.parse_args()
-    rows = []
-    refused = []
+    rows: list[list[str]] = []
+    refused: list[tuple[list[str], Selection]] = []
     for name in options.aircraft:
         for speed, altitude in CONDITIONS[name]:
             print(f"{name} at {speed} m/s", file=sys.stderr)

@@ -282,7 +282,7 @@ def _is_library(spec: ModuleSpec) -> bool:
 def _imported(tree: ast.Module, spec: ModuleSpec) -> list[str]:
     """Names in the import statements of a module, of modules and of what may be a module."""
     package = spec.name if spec.submodule_search_locations else spec.name.rpartition(".")[0]
-    names = []
+    names: list[str] = []
     for statement in ast.walk(tree):
         if isinstance(statement, ast.Import):
             names += [alias.name for alias in statement.names]
