@@ -47,7 +47,7 @@ class Command(NamedTuple):
 
 
 NamedProperties = tuple[tuple[str, float], ...]
-"""Properties of a model, and the value of each at the command 1; empty of a rudder that is none."""
+"""Properties of a model, and the value of each at the command 1; empty without rudder."""
 
 NONE = "none"
 
@@ -172,11 +172,11 @@ class FlightCondition(NamedTuple):
         }
 
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs in the order of INPUTS, without a rudder that is none."""
+        """Names of the inputs in the order of INPUTS, without a missing rudder."""
         return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
 
     def paired_outputs(self) -> tuple[str, ...]:
-        """The outputs that the inputs move, one by one in the order of OUTPUTS."""
+        """The outputs paired with `inputs`, in the order of OUTPUTS."""
         return tuple(OUTPUTS)[: len(self.inputs())]
 
 

@@ -204,7 +204,7 @@ def sideslip_zero(condition: FlightCondition) -> float:
 
         beta_dot = Y beta / V - r,  r_dot = N beta
 
-    with Y and N at that aileron; the damping of yaw, left out, makes them decay faster. Raises
+    with Y and N at the aileron; the damping of yaw, left out, adds decay. Raises
     FlightEnded.
     """
     solution = trim_solution(condition)
