@@ -88,12 +88,13 @@ class Search(Likelihood):
         coarse = self.coarse
         begin = np.zeros(len(self.prior)) if flown is None else flown
         turbulent = np.full(len(coarse._spans), TURBULENT)
-        theta = self._started(begin, turbulent, winds=flown is not None)
+        theta = self._started(begin, turbulent, winds=True)
         counts = np.bincount(coarse.levels(theta))
         if counts.max() < ALIKE * counts.sum():
             return None
         same = np.full(len(self._spans), counts.argmax())
-        return self._fit_at(self._refined(theta, same, used), None, used, flown)
+        end = self._refined(theta, same, used, unsettled=0)
+        return self._fit_at(end, None, used, flown)
 
     def _fit_at(
         self,
@@ -167,16 +168,19 @@ class Search(Likelihood):
         theta: FloatArray,
         levels: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
+        unsettled: int = 1,
     ) -> End:
-        """The end of the search from a start, with the levels of the spans by theta or given."""
+        """The end of the search from a start, with the levels of the spans by theta or given. In
+        the first step, and `unsettled` further ones, every span counts, and the search goes on.
+        """
         for iteration in range(STEPS):
             self.progress()
             flown = self.levels(theta) if levels is None else levels
-            counted = used & self._counted(theta, flown) if iteration > 1 else used
+            counted = used & self._counted(theta, flown) if iteration > unsettled else used
             theta, hessian, progressed = self._step(
                 theta, flown, counted, np.ones(len(theta), dtype=bool)
             )
-            if iteration > 1 and progressed < PROGRESS:
+            if iteration > unsettled and progressed < PROGRESS:
                 break
         winds = self.levels(theta) if levels is None else levels
         return End(self.cost(theta, used, winds), theta, hessian, winds)
