@@ -144,6 +144,7 @@ class MarginSearch(NamedTuple):
         steps = RELAXATION ** np.eye(len(self.model.lag))
         selected = search._best(np.ones((1, len(steps))))
         fractions = [selected.fraction]
+        short = list[int]()
         while True:
             yield selected
             stalled = (
@@ -162,7 +163,7 @@ class MarginSearch(NamedTuple):
                 )
                 fractions.append(selected.fraction)
                 continue
-            weak = search._weak_channel(selected.controller)
+            weak, short = search._weak_channel(selected.controller, short if self.quick else ())
             if weak is None:
                 return search._checked(selected)
             selected = search._best(selected.relaxation * steps[[weak]])
@@ -241,17 +242,27 @@ class MarginSearch(NamedTuple):
         fraction = self._margin_fraction(flown, laws, speed.plant)[1]
         return min(self._delay_fraction(delay), fraction)
 
-    def _weak_channel(self, controller: RiseDiConfig) -> int | None:
-        """The channel with the least phase margin of uncertain aircraft; None if that is enough."""
-        if len(self.plant.A) == 1:
-            return None
-        uncertain = self.plant._replace(A=self.plant.A[1:], B=self.plant.B[1:])
-        each = [
-            phase_margins(uncertain, law, loop_of(controller)).min(axis=0)
-            for law in _laws(controller)
-        ]
-        worst = np.min(each, axis=0)
-        return int(np.argmin(worst)) if worst.min() < self.needed.uncertain_phase else None
+    def _weak_channel(
+        self, controller: RiseDiConfig, short: Sequence[int] = ()
+    ) -> tuple[int | None, list[int]]:
+        """The channel with the least phase margin of uncertain aircraft, None if that is enough,
+        and the places in `plant` of the aircraft with too little.
+
+        The rest of the aircraft count once those that were `short` in the step before have enough.
+        """
+        needed = self.needed.uncertain_phase
+        for places in (list(short), list(range(1, len(self.plant.A)))):
+            if not places:
+                continue
+            uncertain = self.plant._replace(A=self.plant.A[places], B=self.plant.B[places])
+            loop = loop_of(controller)
+            each = [phase_margins(uncertain, law, loop) for law in _laws(controller)]
+            margins = np.min(each, axis=0)
+            if margins.min() < needed:
+                lacking = np.flatnonzero(margins.min(axis=1) < needed)
+                channel = int(np.argmin(margins.min(axis=0)))
+                return channel, [places[k] for k in lacking]
+        return None, []
 
     def _refusal(self, selected: SelectedObserver) -> ParameterError:
         """What is missing at the last step of the search."""

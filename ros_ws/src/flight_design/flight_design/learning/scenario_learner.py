@@ -89,7 +89,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             uncertain=errs,
             sketched=sketch,
             speeds=speeds,
-            quick=quick and not errs,
+            quick=quick,
         )[0]
 
     of_rough: dict[RiseDiConfig, RiseDiConfig] = {}
