@@ -180,6 +180,12 @@ class Definition(Config):
         )
         return equipped.vary(aircraft={"uncertainty": uncertainty})
 
+    def score(self, rms: FloatArray) -> FloatArray:
+        """The scores of N aircraft, (N,), of their rms errors, (m, N)."""
+        scenario = self.scenario()
+        units = scenario.aircraft.channels().outputs
+        return score(rms, score_units(scenario.controller.outputs, units, self.score_units))
+
     @property
     def cases(self) -> int:
         """Number of flights of each aircraft."""
@@ -383,12 +389,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     outputs = scenario.controller.outputs
     inputs = scenario.controller.effectors
     if result.mission is None:
-        figures = {
-            "score": score(
-                rms,
-                score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units),
-            )
-        }
+        figures = {"score": definition.score(rms)}
     else:
         figures = {name: values[:count] for name, values in result.mission.items()}
     for kind, names, values in (

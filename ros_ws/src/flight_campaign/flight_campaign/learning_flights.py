@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import drawn_entries, sampled_matrices
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -19,7 +17,6 @@ from flight_analysis.metrics import error_metrics, inputs_by_part, true_error
 from flight_campaign.benchmark_course import build_course
 from flight_campaign.engines import Job
 from flight_campaign.rows import Chunk
-from flight_campaign.statistics import score, score_units
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import require
 from flight_core.rates import period_ns
@@ -190,23 +187,17 @@ def _fly_side_by_side(
 
 def fly_chunk(definition: "Definition", job: Job, learner: MakeLearner) -> Chunk:
     """Fly a chunk of a campaign with learners."""
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - JAX, as above
+
     case, chunk = job
     first = chunk * definition.chunk
     count = definition.size(job)
-    part = definition.uncertainty
     scenario = definition.scenario(case)
-    airframe = load_airframe(scenario.aircraft.airframe)
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
-    entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
+    entries = drawn_fleet(definition, scenario, first, count).entries()
     flown = _fly_side_by_side(definition, case, first, count, learner)
-    outputs = scenario.controller.outputs
     by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
-    rms = np.array([by_kind["rms"][name] for name in outputs])
-    figures = {
-        "score": score(
-            rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units)
-        )
-    }
+    rms = np.array([by_kind["rms"][name] for name in scenario.controller.outputs])
+    figures = {"score": definition.score(rms)}
     for kind, by_channel in by_kind.items():
         figures |= {f"{kind}.{name}": values for name, values in by_channel.items()}
     for name in LearningOutcome._fields:
