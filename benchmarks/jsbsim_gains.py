@@ -103,8 +103,9 @@ def main() -> None:
                 phase=math.radians(options.phase_margin)
             )
             more = select_gains(selection.study, selection.setting._replace(requirement=needed))
-            softening = np.broadcast_to(selection.chosen.softening, len(selection.chosen.outputs))
-            slower = softening[selection.chosen.outputs.index("V")] / SOFTENING
+            outputs = selection.chosen.outputs
+            softening = np.broadcast_to(selection.chosen.softening, len(outputs))
+            slower = softening[outputs.index("V")] / SOFTENING
             row += [
                 verdict(selection),
                 f"{slower:.3g}",
