@@ -510,7 +510,7 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "dropped", "watched"),
+    "parameters, dropped, watched",
     [
         ({"SYSID_MYGCS": 254}, "254, or SYSID_MYGCS to 255", 254),
         ({"MAV_GCS_SYSID": 254}, "254, or MAV_GCS_SYSID to 255", 254),

@@ -134,7 +134,7 @@ def test_lander_waits_above_the_flare_and_leaves_to_an_operator(across: Scenario
 
 
 @pytest.mark.parametrize(
-    ("route", "landing", "sentence"),
+    "route, landing, sentence",
     [
         ({"east": [0.0, 0.0, 700.0, 700.0]}, {}, "expected a line to it, and one on"),
         ({"altitude": [0.0, 0.0, 0.0, 0.0]}, {}, "expected one that descends"),

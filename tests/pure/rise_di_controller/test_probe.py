@@ -138,7 +138,7 @@ def test_input_that_rests_at_a_limit_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes, sentence",
     [
         ({"effect": (0.1,)}, "probe.effect"),
         ({"effect": (0.0,) * 4}, "no output to probe"),

@@ -42,15 +42,15 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 OBSERVER_LAWS = ("rise_observer", "pi_observer")
 OBJECTIVE = "gust_turbulence"
-"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a
-sign that is an integral."""
+"""Laws and cost of a search whose gains are taken: the least cost. PI is RISE-DI with an integral
+as the sign."""
 SLOWER = 1.8
 """Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`,
-searched with 38 ms in q, they have the margins with 55 ms and miss them with 65 and 75 ms. Those of
-the rule have them from 75 ms on."""
+searched with 38 ms in q, the gains have the margins with 55 ms and miss the margins with 65 and 75
+ms. The gains of the rule have the margins from 75 ms on."""
 BY_RULE = "gains by a rule from the lags, a start"
 STABLE = Requirement(1e-3, 1.001, 1e3, 1e-3, 0.0)
-"""What gains have to have that are taken as a file has them: a stable loop."""
+"""What gains from a file need: a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
@@ -107,8 +107,8 @@ def select_gains(
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
         feedforward: Whether the engineering gains have the airframe as the model of a feedforward.
-        observer: Whether they have a feedforward and an observer, and gains beside these.
-        model: Airframe that the observer takes as its model; None: the airframe itself.
+        observer: Whether the gains have a feedforward and an observer beside.
+        model: Airframe that the observer takes as model; None: the airframe.
         margin: Least delay margin of the nominal loop with the observer, s.
         speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A
             schedule flies the observer from the one to the other. Empty: the observer holds at the
