@@ -458,7 +458,7 @@ def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
     period = 1.0 / CONTROL_RATE
     slew = np.zeros(len(lag))
     totals = total_lag(lag, DELAY, period)
-    for j, (name, total) in enumerate(zip(tape["u"].names, totals, strict=True)):
+    for j, (name, total) in enumerate(zip(INPUTS, totals, strict=False)):  # without rudder
         count = max(round(float(total) / period), 1)
         u = tape["u"][name]
         slew[j] = np.max(np.abs(u[count:] - u[:-count]), initial=0.0) / (count * period)
