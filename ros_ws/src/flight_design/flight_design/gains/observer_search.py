@@ -245,10 +245,10 @@ class MarginSearch(NamedTuple):
     def _weak_channel(
         self, controller: RiseDiConfig, short: Sequence[int] = ()
     ) -> tuple[int | None, list[int]]:
-        """The channel with the least phase margin of uncertain aircraft, None if that is enough,
-        and the places in `plant` of the aircraft with too little.
+        """The channel with the least phase margin of uncertain aircraft, None if enough, and the
+        places in `plant` of the aircraft with too little.
 
-        The rest of the aircraft count once those that were `short` in the step before have enough.
+        Aircraft `short` in the step before come first, the rest once no margin is too small.
         """
         needed = self.needed.uncertain_phase
         for places in (list(short), list(range(1, len(self.plant.A)))):

@@ -170,8 +170,8 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         unsettled: int = 1,
     ) -> End:
-        """The end of the search from a start, with the levels of the spans by theta or given. In
-        the first step, and `unsettled` further ones, every span counts, and the search goes on.
+        """The end of the search from a start, with the levels of the spans by theta or given. Every
+        span counts in the first step and in `unsettled` further steps, which never end the search.
         """
         for iteration in range(STEPS):
             self.progress()
