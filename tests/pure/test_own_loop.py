@@ -248,11 +248,9 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
     u = np.zeros((2, M))
     terminations = 0
     still = None
-    u[1] = (
-        # far beyond the limits of the law, so that the second aircraft leaves every bound within
-        # some steps
-        1e9
-    )
+    # far beyond the limits of the law, so that the second aircraft leaves every bound within
+    # some steps
+    u[1] = 1e9
     for k in range(1, round(3.0 * CONTROLLER.rate) + 1):
         observed, rewards, terminated, truncated, _ = flights.step(u)
         if still is not None:

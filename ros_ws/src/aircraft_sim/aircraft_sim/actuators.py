@@ -25,10 +25,8 @@ class Actuators(NamedTuple):
     stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
     # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
     lost_at: Array | None = None
-    weak_at: Array | None = (
-        # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
-        None
-    )
+    # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
+    weak_at: Array | None = None
     weak_effect: Array | None = None  # (m,) factor
     # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
     slow_at: Array | None = None

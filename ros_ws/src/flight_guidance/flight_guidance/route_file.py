@@ -45,10 +45,8 @@ class Waypoint(NamedTuple):
     speed: float | None = None
     turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
     wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
-    leave: float | None = (
-        # altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`
-        None
-    )
+    # altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`
+    leave: float | None = None
 
     @property
     def point(self) -> Point:
