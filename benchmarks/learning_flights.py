@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -227,10 +227,10 @@ def score(
     )
 
 
-@lru_cache(maxsize=4)
-def file_design(cell: Cell) -> RiseDiConfig | None:
-    """The start of a cell with feedforward and observer of the file."""
-    chosen = learning(cell, 0, LEARNED)
+@cache
+def file_design() -> RiseDiConfig | None:
+    """The start of OSPREY with feedforward and observer of the file."""
+    chosen = learning(OSPREY, 0, LEARNED)
     return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
 
 
@@ -340,7 +340,7 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
     start = start_of(chosen)
     controllers = {
         "alone": start,
-        "file": file_design(OSPREY),
+        "file": file_design(),
         "true": designed(start, chosen, aircraft),
     }
     return {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
@@ -380,7 +380,7 @@ def learn(name: str, cell: Cell, number: int) -> Row:
             others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
         if cell.kind in {"coupled", "untold"}:
             true = designed(start, chosen, aircraft)
-            controllers = {"alone": start, "file": file_design(OSPREY), "true": true}
+            controllers = {"alone": start, "file": file_design(), "true": true}
             others = {
                 key: frozen(controller, flight, aircraft) for key, controller in controllers.items()
             }
@@ -466,7 +466,7 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     aircraft = chosen.aircraft.sampled_airframe()
     B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
-    controllers = {"alone": start, "file": file_design(OSPREY)}
+    controllers = {"alone": start, "file": file_design()}
     controllers |= {} if dead else {"true": designed(start, chosen, damaged)}
     tapes = {
         key: simulate(chosen.vary(controller=value))
