@@ -76,7 +76,7 @@ def test_learner_beside_an_allocation_sees_the_inputs_of_the_law() -> None:
     allocation = vtail.controller.allocation
     assert allocation is not None
     effectors = load_airframe("osprey_vtail")
-    rough = scenario_learner.of_law(effectors, vtail.rise_di())
+    rough = scenario_learner.with_law_inputs(effectors, vtail.rise_di())
     T = np.reshape(allocation.T, (len(allocation.effectors), -1))
     columns = [list(effectors.inputs).index(name) for name in allocation.effectors]
     seen = [vtail.controller.inputs.index(name) for name in rough.inputs]

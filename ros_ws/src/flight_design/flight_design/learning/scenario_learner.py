@@ -67,7 +67,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         airframe = sketched(Path(condition.name).stem, controller, condition.speed)
         rough = ROUGH
     else:
-        airframe = of_law(load_airframe(aircraft.airframe), controller)
+        airframe = with_law_inputs(load_airframe(aircraft.airframe), controller)
         rough = KNOWN
     prior = controller.learn.prior
     if prior is not None and prior.file is not None:
@@ -118,7 +118,7 @@ def quick_learner(scenario: Scenario) -> Learn | None:
     return learner(scenario, quick=True)
 
 
-def of_law(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
+def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
     """The airframe with the inputs of the law, in the order of its outputs."""
     if controller.allocation is None:
         return airframe
