@@ -374,6 +374,16 @@ def test_predicted_error_is_that_of_a_flight_in_the_gusts() -> None:
     assert errors == approx([by_name[name] for name in NAMES], rel=0.01)
 
 
+@pytest.mark.parametrize("advantage, flies", [(0.0, False), (-2.0, False), (-1.0, True)])
+def test_first_model_about_a_sketch_waits_for_later_seconds(
+    advantage: float, flies: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """0: no model was there to test. The limit is 1.645 standard deviations, 5 % by chance."""
+    made = learner_that_finds(lateral()._replace(advantage=advantage), monkeypatch)
+    made._is_sketch = True
+    assert (made.propose(0).controller is not None) is flies
+
+
 @pytest.mark.parametrize("advantage, is_back", [(-2.0, True), (-1.0, False)])
 def test_refused_part_goes_back_to_the_file_that_predicts_better(
     advantage: float, is_back: bool, monkeypatch: pytest.MonkeyPatch

@@ -132,6 +132,7 @@ class Learner:
         self._has_proposed_rough = False
         self._by_rough: RiseDiConfig | None = None  # the proposal of the rough model
         self._believed = rough
+        self._is_sketch = rough.drift > DRIFT
         self._quick = quick
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
@@ -278,7 +279,8 @@ class Learner:
         refusals = []
         tried = list[Entry]()
         is_about_file = self._prior is self._rough
-        flies_file = is_about_file and not self._changed and self._design_of_rough is not None
+        flies_file = self._design_of_rough is not None
+        is_first = is_about_file and not self._changed and (flies_file or self._is_sketch)
         for part in identified.parts:
             if any(
                 is_within(part.outputs, outputs) or is_within(outputs, part.outputs)
@@ -295,8 +297,8 @@ class Learner:
             } - self._changed
             before = model if part.outputs in learned and not lost else None
             reason = "" if rough else part.refusal or not_white(part) or weaker(part, before)
-            if not (rough or reason or part.outputs in learned) and flies_file:
-                reason = unproven(part, self._rough.name)
+            if not (rough or reason or part.outputs in learned) and is_first:
+                reason = unproven(part, self._rough.name, flies=flies_file)
                 tried += part.entries
             if part.outputs in kept:
                 reason = kept[part.outputs]
@@ -530,7 +532,7 @@ class Learner:
             for part, known in tested.items()
             if end_ns - known.end_ns >= nanoseconds(RECORD)
         }
-        if not old or self._believed.drift > DRIFT:
+        if not old or self._is_sketch:
             return []
         begin_ns = end_ns - nanoseconds(RECORD)
         if self._record.fell_back(begin_ns, self._proposals) or self._record.oscillated(begin_ns):

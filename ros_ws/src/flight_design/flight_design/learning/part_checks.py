@@ -78,18 +78,20 @@ def back_to_file(part: Part) -> bool:
     return part.advantage < -LIKELIER
 
 
-def unproven(part: Part, name: str) -> str:
-    """The refusal of a first model beside the airframe file of a name, which flies on.
+def unproven(part: Part, name: str, *, flies: bool) -> str:
+    """The refusal of a first model beside the airframe of a name.
 
-    The model before was chosen on the record up to then. Later samples have to show an advantage
-    over the file, with a probability of at most 5 % where both are as near to the aircraft.
+    The model before was chosen on the record up to then, and later samples count. A file that
+    `flies` needs an advantage over it, with a probability of at most 5 % where both are as near to
+    the aircraft. A sketch does not fly, and no such disadvantage is enough.
     """
-    if part.advantage > LIKELIER:
+    limit = LIKELIER if flies else -LIKELIER
+    if part.advantage > limit and part.advantage != 0.0:  # 0: there was no model before
         return ""
     return (
         f"{' and '.join(part.outputs)}: found an advantage over the airframe {name} of "
         f"{part.advantage:.2g} standard deviations in the seconds since the model before, "
-        f"expected more than {LIKELIER:g}"
+        f"expected more than {limit:g}"
     )
 
 
