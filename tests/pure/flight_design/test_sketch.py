@@ -16,7 +16,7 @@ from flight_design.identification.innovation_filters import (
 )
 from flight_design.identification.sketch import sketch, sketched
 from flight_design.learning.learner import Learner
-from flight_design.learning.scenario_learner import learner
+from flight_design.learning.scenario_learner import learner, that_learns
 
 OUTPUTS = ("q", "V", "p", "r")
 INPUTS = ("elevator", "throttle", "aileron", "rudder")
@@ -76,3 +76,18 @@ def test_sketch_of_other_channels_is_refused() -> None:
         sketch("kite", np.eye(2), ("q", "p"), ("elevator", "aileron"), 20.0)
     with refusing(r"controller\.feedforward: found none"):
         sketched("c172p", find_scenario("jsbsim_c172p").controller, 46.3)
+
+
+def test_law_alone_learns_from_its_signs_and_sizes() -> None:
+    """Omega = diag(D omega / input_scale) of the law: no entry of the airframe file is read."""
+    alone = find_scenario("osprey_servo")
+    learning = that_learns(alone)
+    law = alone.rise_di()
+    rough = sketched("osprey", learning.rise_di(), alone.aircraft.channels().speed)
+    rows = [rough.index(name) for name in law.outputs]
+    columns = [list(rough.inputs).index(name) for name in law.inputs]
+    Omega = rough.matrix_b()[rows][:, columns]
+    assert_allclose(Omega, np.diag(np.array(law.D) * law.omega / law.input_scale))
+    observer = learning.rise_di().observer
+    assert observer is not None
+    assert observer.part == 0.0  # the law alone flies until a model is learned

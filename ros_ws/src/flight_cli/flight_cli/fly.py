@@ -45,7 +45,7 @@ from flight_guidance.route_formats import FENCES
 # fields of a flight of one aircraft alone
 OF_AIRCRAFT = (
     *("settings", "in_process", "lockstep", "composed", "bridge"),
-    *("send", "route", "fence", "namespace"),
+    *("send", "route", "fence", "namespace", "learn"),
 )
 
 
@@ -89,6 +89,10 @@ class Fly(RouteWords):
         "route.fence",
         metavar="FILE",
     )
+    learn: bool = setting(
+        "Learn A and B from the signs and sizes of the law alone, with no model of the aircraft.",
+        default=False,
+    )
     send: bool = option("Send commands to the autopilot once the bridge is engaged.", default=False)
     watch: bool = option("Serve the live page of the flight while it lasts.", default=False)
     namespace: str = option(
@@ -114,7 +118,7 @@ class Fly(RouteWords):
         learn = _learner(chosen)
         run = new_run(chosen, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
-        if self.route or self.fence or self.settings:
+        if self.route or self.fence or self.settings or self.learn:
             chosen = written(chosen, run / f"{chosen.name}.yaml")
         self._watch(run)
         with flight_progress(chosen.flight.duration, quiet=self.as_json) as (progress, announce):
@@ -144,6 +148,7 @@ class Fly(RouteWords):
         chosen = with_settings(found, self.settings)
         self._require_one_way(stepping=self.lockstep or chosen.flight.lockstep)
         files = self.route or self.fence
+        chosen = _that_learns(chosen) if self.learn else chosen
         needs = {"origin": files, "altitude": files, "simplify": self.route, "line": self.route}
         for name, file in needs.items():
             unset = file is not None or getattr(self, name) in (None, 0.0)
@@ -245,6 +250,13 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
         require_signs(autopilot.channel_map, scenario)
         require_limits(autopilot, scenario)
+
+
+def _that_learns(scenario: Scenario) -> Scenario:
+    """The scenario with a learner. Raises ParameterError for one with a model."""
+    from flight_design.learning.scenario_learner import that_learns  # noqa: PLC0415 - loads SciPy, which few flights need
+
+    return that_learns(scenario)
 
 
 def _learner(scenario: Scenario) -> Learn | None:

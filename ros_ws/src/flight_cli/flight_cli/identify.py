@@ -68,15 +68,14 @@ from flight_design.identification.innovation_filters import Actuation, recording
 from flight_design.identification.manoeuvre import manoeuvre_result
 from flight_design.identification.model_identification import Identification, model_yaml
 from flight_design.identification.model_identification import identify as identify_model
-from flight_design.identification.step_identification import IdentifiedAircraft
+from flight_design.identification.step_identification import STEP_MARGIN, IdentifiedAircraft
 from flight_design.identification.step_identification import identify as identify_aircraft
 from flight_log.log_content import StoredFile
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3
-REFLY_MARGIN = 0.03  # s. Without A the model of the loop has no damping
-STEP_MARGIN = 0.015  # and less margin than the aircraft.
+REFLY_MARGIN = 0.03  # s
 OF_LOG = ("scenario", "delay", "namespace", "refly")
 OF_STEPS = ("observer", "guidance", "learn", "command")
 OF_MARGINS = ("phase_margin", "accept")

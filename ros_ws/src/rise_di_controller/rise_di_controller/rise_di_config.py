@@ -86,6 +86,11 @@ class PriorConfig(Config):
         description="standard deviation of its entries over their values; none: 0.29, that of "
         "+-50 %",
     )
+    sketch: bool = Field(
+        default=False,
+        description="whether the rough model is the feedforward, a sketch by rule, as of an "
+        "aircraft of JSBSim, and not the airframe file",
+    )
 
 
 class LearnConfig(Config):

@@ -15,8 +15,11 @@ from aircraft_sim.uncertainty import KINEMATIC
 from flight_core.parameters import require
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_design.gains.observer_gains import gains_beside_sketch
+from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from flight_design.identification.likelihood import Unknown
 from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 STATES = {
     "V": "m/s",
@@ -133,6 +136,33 @@ def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
     )
 
 
+def with_sketch(
+    start: RiseDiConfig,
+    name: str,
+    Omega: FloatArray,
+    speed: float,
+    noise: FloatArray,
+    margin: float,
+) -> RiseDiConfig:
+    """A controller with feedforward and observer of a sketch, not yet flying; Omega (m, m) and
+    `noise`, (m,), in the law's order, `margin` the least delay margin, s. Raises ParameterError.
+    """
+    rough = sketch(name, Omega, start.outputs, start.inputs, speed)
+    model = model_for(rough, start, noise)
+    gains = gains_beside_sketch(model, start.outputs, tuple(rough.gusts), speed)
+    designed = with_aircraft_observer(
+        start, rough, [gains], noise, margin, uncertain=False
+    ).controller
+    assert designed.observer is not None  # noqa: S101 - it was designed
+    observer = designed.observer.model_copy(update={"part": 0.0})
+    return start.model_copy(update={"feedforward": designed.feedforward, "observer": observer})
+
+
+def _positive(name: str) -> str:
+    """What a positive input does."""
+    return INPUTS[name].positive if name in INPUTS else f"more {name}"
+
+
 def _airframe(
     name: str,
     source: str,
@@ -159,10 +189,7 @@ def _airframe(
         "source": source,
         "speed": speed,
         "states": {state: STATES[state] for state in states},
-        "inputs": {
-            input_name: {"unit": "1", "positive": INPUTS[input_name].positive}
-            for input_name in inputs
-        },
+        "inputs": {name: {"unit": "1", "positive": _positive(name)} for name in inputs},
         "outputs": list(outputs),
         "A": A.tolist(),
         "B": B.tolist(),

@@ -43,12 +43,7 @@ from flight_design.gains.channel_signs import require_channels
 from flight_design.gains.gain_selection import LoopSetting, Selection
 from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
 from flight_design.gains.nominal import sizes
-from flight_design.gains.observer_gains import gains_beside_sketch
-from flight_design.gains.observer_selection import (
-    model_for,
-    with_aircraft_observer,
-    with_extended_state_observer,
-)
+from flight_design.gains.observer_selection import with_extended_state_observer
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
 from flight_design.identification.manoeuvre import (
     CLIMB,
@@ -67,7 +62,7 @@ from flight_design.identification.manoeuvre import (
     reference_parameters,
     unit_gains,
 )
-from flight_design.identification.sketch import sketch
+from flight_design.identification.sketch import with_sketch
 from flight_design.identification.step_responses import Responses, step_responses
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import coupling
@@ -89,6 +84,10 @@ THROTTLE = list(INPUTS).index("throttle")
 
 # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 NOISE_SHARE = 100.0
+
+# s, least delay margin: without A the model of the loop has no damping, and less margin than the
+# aircraft
+STEP_MARGIN = 0.015
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
 """rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first
@@ -354,19 +353,10 @@ def that_learns(
     """
     start = selection.chosen
     name = Path(condition.name).stem
-    rough = sketch(name, _in_law_order(Omega, start), start.outputs, start.inputs, condition.speed)
     noise = np.array([NOISE[output] for output in start.outputs])
-    axes = tuple(rough.gusts)
-    gains = gains_beside_sketch(
-        model_for(rough, start, noise), start.outputs, axes, condition.speed
-    )
-    designed = with_aircraft_observer(
-        start, rough, [gains], noise, margin, uncertain=False
-    ).controller
-    assert designed.observer is not None  # noqa: S101 - it was designed
-    observer = designed.observer.model_copy(update={"part": 0.0})
-    sections = {"feedforward": designed.feedforward, "observer": observer, "learn": LearnConfig()}
-    return replace(selection, chosen=start.model_copy(update=sections))
+    rough = _in_law_order(Omega, start)
+    sketched = with_sketch(start, name, rough, condition.speed, noise, margin)
+    return replace(selection, chosen=sketched.model_copy(update={"learn": LearnConfig()}))
 
 
 def without_beta(scenario: Scenario) -> Scenario:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.jsbsim_aircraft import PREFIX
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning_loop import Entry, Learn
 from flight_analysis.closed_loop.loop_margins import distribution
@@ -25,12 +26,13 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
 from flight_design.identification.likelihood import KNOWN
-from flight_design.identification.sketch import ROUGH, sketched
+from flight_design.identification.sketch import ROUGH, sketched, with_sketch
+from flight_design.identification.step_identification import NOISE, STEP_MARGIN
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.proposals import Updates
-from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
 
 
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
@@ -62,21 +64,21 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     aircraft = scenario.aircraft
     if not isinstance(controller, RiseDiConfig) or controller.learn is None:
         return None
-    if aircraft.is_jsbsim:
-        condition = aircraft.flight_condition()
-        airframe = sketched(Path(condition.name).stem, controller, condition.speed)
+    prior = controller.learn.prior
+    sketch = aircraft.is_jsbsim or (prior is not None and prior.sketch)
+    if sketch:
+        name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
+        airframe = sketched(name, controller, aircraft.channels().speed)
         rough = ROUGH
     else:
         airframe = with_law_inputs(load_airframe(aircraft.airframe), controller)
         rough = KNOWN
-    prior = controller.learn.prior
     if prior is not None and prior.file is not None:
         airframe = _prior(prior.file, airframe)
     if prior is not None and prior.off is not None:
         rough = rough._replace(error=prior.off, effect=prior.off)
 
     speeds = _speeds(controller, airframe)
-    sketch = aircraft.is_jsbsim
 
     def design(start: RiseDiConfig, model: Airframe, *, errs: bool = False) -> RiseDiConfig:
         assert start.observer is not None  # noqa: S101 - a controller that learns has one
@@ -111,6 +113,30 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         None if sketch else design_of_rough,
         quick=quick,
     )
+
+
+def that_learns(scenario: Scenario) -> Scenario:
+    """A scenario that learns in flight with no model of its aircraft, from a scenario of the law
+    alone.
+
+        Omega = diag(D omega / input_scale),   V0 the trim speed
+
+    The signs and sizes are those of the law, and the rough model is the sketch by rule of Omega and
+    V0. Raises ParameterError for a controller with an observer, or for outputs beyond a sketch.
+    """
+    start = scenario.rise_di()
+    expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
+    require(start.observer is None, "learn", "an observer", expected)
+    aircraft = scenario.aircraft
+    channels = aircraft.channels()
+    measured = aircraft.sensors.noise or (0.0,) * len(channels.outputs)
+    by_name = dict(zip(channels.outputs, measured, strict=True))
+    noise = np.array([by_name[name] or NOISE[name] for name in start.outputs])
+    Omega = np.diag(np.array(start.D) * start.omega / start.input_scale)
+    name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
+    sketched = with_sketch(start, name, Omega, channels.speed, noise, STEP_MARGIN)
+    learn = LearnConfig(prior=PriorConfig(sketch=True))
+    return scenario.vary(controller=sketched.model_copy(update={"learn": learn}))
 
 
 def quick_learner(scenario: Scenario) -> Learn | None:
