@@ -34,13 +34,9 @@ def margin_behind(delay: float, start: RiseDiConfig) -> float:
 
     Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
     """
+    reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
     # 0.1 ms, as few digits as the file of a scenario
-    return max(margin_of(start), round(delay + reserve_of(start), 4))
-
-
-def reserve_of(start: RiseDiConfig) -> float:
-    """The delay margin left beyond the latest delay, s."""
-    return min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
+    return max(margin_of(start), round(delay + reserve, 4))
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import chain
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +35,6 @@ from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, 
 from flight_design.learning.designs import (
     margin_behind,
     margin_of,
-    reserve_of,
     with_deviations,
     with_margin,
     without_effect,
@@ -51,9 +49,7 @@ from flight_design.learning.part_checks import (
     explains,
     forgotten,
     is_within,
-    kept_by_file,
     not_white,
-    relative_deviations,
     sentence,
     too_late,
     unchanged,
@@ -61,7 +57,6 @@ from flight_design.learning.part_checks import (
     unproven,
     weaker,
 )
-from flight_design.learning.predicted_error import predicted_error, tolerates
 from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
 from rise_di_controller.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -130,7 +125,6 @@ class Learner:
         # None too once the rough model has not flown, or the law fell back
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
-        self._by_rough: RiseDiConfig | None = None  # the proposal of the rough model
         self._believed = rough
         self._is_sketch = rough.drift > DRIFT
         self._quick = quick
@@ -244,8 +238,6 @@ class Learner:
         ]
         sentences += [changed(change) for change in damaged if change.outputs not in dead]
         verdict = self._verdict(identified, without_model, lost=lost)
-        if kept := self._better_by_file(verdict, without_model):
-            verdict = self._verdict(identified, without_model, kept, lost=lost)
         if self._changed and any(
             another_airframe(part.entries, self._rough.name, AT_BOUND, self._believed.factor)
             for part in identified.parts
@@ -265,13 +257,10 @@ class Learner:
         self,
         identified: Identification,
         without_model: Mapping[tuple[str, ...], str],
-        kept: Mapping[tuple[str, ...], str] = MappingProxyType({}),
         *,
         lost: bool,
     ) -> Verdict:
-        """Which parts of an identification shall fly, those that are `kept` by the airframe file,
-        for its reason.
-        """
+        """Which parts of an identification shall fly."""
         end_ns = self._record.end_ns
         known = {part: value for part, value in self._known.items() if part not in without_model}
         model = self._model
@@ -300,24 +289,23 @@ class Learner:
             if not (rough or reason or part.outputs in learned) and is_first:
                 reason = unproven(part, self._rough.name, flies=flies_file)
                 tried += part.entries
-            if part.outputs in kept:
-                reason = kept[part.outputs]
-                tried += part.entries
             if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
-                is_back = part.outputs in kept or (is_about_file and back_to_file(part))
-                if part.outputs in learned and is_back:
+                if part.outputs in learned and is_about_file and back_to_file(part):
                     model = with_entries(model, as_in_file(part))
                     del known[part.outputs]
                     name = "" if self._design_of_rough is None else self._rough.name
-                    sentences.append(kept.get(part.outputs) or back(part, name))
+                    sentences.append(back(part, name))
                 continue
             entries = as_in_file(part) if rough else part.entries
             model = with_entries(model, entries)
+            deviation = {
+                entry.name: abs(entry.deviation * entry.unit / entry.value)
+                for entry in entries
+                if entry.value
+            }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(
-                end_ns, relative_deviations(entries), part.latest, rough, part.delays
-            )
+            known[part.outputs] = Known(end_ns, deviation, part.latest, rough, part.delays)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
                 if rough
@@ -325,32 +313,6 @@ class Learner:
             )
         tested = with_entries(model, tried) if tried else model
         return Verdict(model, known, sentences, refusals, tested)
-
-    def _better_by_file(
-        self, verdict: Verdict, without_model: Mapping[tuple[str, ...], str]
-    ) -> dict[tuple[str, ...], str]:
-        """The learned parts that fly better by the design for the airframe file, each with its
-        sentence: around the learned model, with u late as in the flight. None where this design
-        does not tolerate the latest delay. Raises ParameterError without a design of the verdict.
-        """
-        learned = [part for part, value in verdict.known.items() if not value.is_rough]
-        by_rough = self._by_rough
-        if by_rough is None or self._design_of_rough is None or self._changed or without_model:
-            return {}
-        latest = max((verdict.known[part].latest for part in learned), default=0.0)
-        late = latest + reserve_of(self._controller)
-        if not learned or not tolerates(by_rough, verdict.model, late):
-            return {}
-        proposed = self._designed(verdict.model, verdict.known, without_model)
-        by_model = predicted_error(proposed, verdict.model, latest)
-        by_file = predicted_error(by_rough, verdict.model, latest)
-        kept = {}
-        for part in learned:
-            rows = [self._controller.outputs.index(name) for name in part]
-            share = float(by_file[rows].sum() / by_model[rows].sum())
-            if share < 1.0:
-                kept[part] = kept_by_file(part, self._rough.name, share)
-        return kept
 
     def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> None:
         """Design for a verdict, and take it as proposed. Raises ParameterError without a design."""
@@ -394,7 +356,6 @@ class Learner:
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
-        self._by_rough = proposed
         self._propose(proposed)
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 

@@ -107,23 +107,6 @@ def _file_is_better(part: Part) -> str:
     return f"the file predicts later seconds better, by {-part.advantage:.2g} standard deviations"
 
 
-def kept_by_file(part: Iterable[str], name: str, share: float) -> str:
-    """Why the airframe file of a name flies a part, by its outputs, in place of a model."""
-    return (
-        f"{' and '.join(part)} by the airframe {name} as it is: around the model a gust and a step "
-        f"of the commands leave {100.0 * share:.0f} % of the error"
-    )
-
-
-def relative_deviations(entries: Iterable[Entry]) -> dict[str, float]:
-    """The standard deviations of entries by name, over their values, of those that are not 0."""
-    return {
-        entry.name: abs(entry.deviation * entry.unit / entry.value)
-        for entry in entries
-        if entry.value
-    }
-
-
 def as_in_file(part: Part) -> tuple[Entry, ...]:
     """The entries of a part as in the airframe file."""
     return tuple(entry._replace(error=0.0) for entry in part.entries)
