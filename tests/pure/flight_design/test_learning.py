@@ -536,7 +536,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
     before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
     inputs = ("aileron", "rudder")
-    return Part(inputs, ("p", "r"), LATERAL, before, after, "", latest, gusts=False)
+    return Part(inputs, ("p", "r"), LATERAL, before, after, "", (latest, latest), gusts=False)
 
 
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
@@ -591,6 +591,28 @@ def test_delay_margin_counts_the_delay_that_was_found(
     assert made.model is None  # what flies stays
 
 
+@pytest.mark.parametrize("latest, margin", [((0.004, 0.05), 0.03), ((0.03, 0.004), 0.04)])
+def test_late_thrust_costs_the_elevator_no_margin(
+    latest: tuple[float, float], margin: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop of V is slow: thrust may be 60 ms late where all inputs may be 30 ms late."""
+    entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
+    part = lateral()._replace(
+        inputs=("elevator", "thrust"), outputs=("q", "V"), entries=(entry,), latest=latest
+    )
+    made = learner_that_finds(part, monkeypatch)
+    flown = made.propose(0).controller
+    assert flown is not None
+    assert flown.observer is not None
+    assert flown.observer.margin == margin
+    assert made.model is not None
+    behind = dict(zip(part.inputs, np.add(latest, 0.01), strict=True))
+    late = np.array([max(behind.get(name, 0.0), 0.03) for name in flown.inputs])
+    law = linear_law(flown.tuned_law(), 4, 0.01)
+    loop = Loop(np.array(flown.lag), 0.0, 0.01)
+    assert is_stable(plant_of(made.model, flown), law, loop, late)
+
+
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
     """No file says that u is 40 ms late: with the margin of the start alone the loop is unstable
     from the first model on.
@@ -635,7 +657,7 @@ def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
     made = made_learner(scenario(learn={"updates": [10.0]}))
     test = Mock(return_value=())
     monkeypatch.setattr(design_learner, "change_test", test)
-    made._known = {("p", "r"): Known(0, {}, 0.0, False, (0.0, 0.0))}
+    made._known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
     before, meanwhile, after = flown
     for k in range(RECORDED):
         digest = before if k < 500 else meanwhile if k < 1500 else after

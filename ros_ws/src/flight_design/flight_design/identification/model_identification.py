@@ -80,7 +80,7 @@ class Part(NamedTuple):
     before: Prediction  # of the nominal model
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
-    latest: float  # s, the largest delay of an input and two standard deviations
+    latest: tuple[float, ...]  # s, of each input, its delay and two standard deviations
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
     delays: tuple[float, ...] = ()  # s, of each input
     advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify`
@@ -154,7 +154,7 @@ class _Study(NamedTuple):
             tuple(entries),
             *predictions,
             refusal,
-            float(np.max(delays + 2.0 * deviations)),
+            tuple((delays + 2.0 * deviations).tolist()),
             gusts,
             tuple(delays.tolist()),
             0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
+from flight_analysis.closed_loop.loop_margins import linear_loop
+from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import PRIOR
 from flight_design.identification.model_identification import with_entries
+from rise_di_controller.linear_loop import is_stable
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
@@ -30,13 +33,19 @@ def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
 
 
 def margin_behind(delay: float, start: RiseDiConfig) -> float:
-    """The delay margin of a model whose inputs are late by a delay, s: that of the start, or more.
+    """The delay margin of an input that is late by a delay, s: that of the start, or more.
 
     Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
     """
     reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
     # 0.1 ms, as few digits as the file of a scenario
     return max(margin_of(start), round(delay + reserve, 4))
+
+
+def tolerates(controller: RiseDiConfig, model: Airframe, late: FloatArray) -> bool:
+    """Whether the linear loop of a controller around a model is stable with u late, s, (m,)."""
+    linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
+    return is_stable(linear.nominal, linear.law, linear.loop._replace(delay=0.0), late)
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:

@@ -35,6 +35,7 @@ from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, 
 from flight_design.learning.designs import (
     margin_behind,
     margin_of,
+    tolerates,
     with_deviations,
     with_margin,
     without_effect,
@@ -76,7 +77,7 @@ class Known(NamedTuple):
 
     end_ns: int  # of its window
     deviation: Mapping[str, float]  # of its entries by name, 1
-    latest: float  # delay of an input and two standard deviations, s
+    latest: Mapping[str, float]  # of each input, delay and two standard deviations, s
     is_rough: bool  # that of the rough airframe as it is
     delays: tuple[float, ...]  # of each input, s
 
@@ -305,7 +306,8 @@ class Learner:
                 if entry.value
             }
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(end_ns, deviation, part.latest, rough, part.delays)
+            latest = dict(zip(part.inputs, part.latest, strict=True))
+            known[part.outputs] = Known(end_ns, deviation, latest, rough, part.delays)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is"
                 if rough
@@ -352,7 +354,7 @@ class Learner:
         """The rough airframe by a design for one that errs. Raises ParameterError."""
         name = self._rough.name
         try:
-            proposed = self._designed_behind(0.0, self._rough, {}, self._dead)
+            proposed = self._designed_with(margin_of(self._controller), self._rough, {}, self._dead)
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
@@ -514,26 +516,38 @@ class Learner:
     ) -> RiseDiConfig:
         """The controller of a model, with the law of the start in the parts without one.
 
-        Its delay margin is the one behind the latest delay of the parts. Raises ParameterError.
+        The loop around the model is stable with each input late by the margin behind its own
+        latest delay. The delay margin of all inputs at once is the least of these with which it
+        is so: an input whose delay is known worst, as thrust, costs the others no bandwidth.
+        Raises ParameterError.
         """
         start = self._controller
-        latest = max((value.latest for value in known.values()), default=0.0)
+        latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
+        behind = {name: margin_behind(delay, start) for name, delay in latest.items()}
+        late = np.array([behind.get(name, margin_of(start)) for name in start.inputs])
+        *smaller, largest = sorted(set(behind.values()) or {margin_of(start)})
         try:
-            return self._designed_behind(latest, model, known, dead)
+            # beside models at other speeds the check of the trim speed does not suffice
+            for margin in () if self._has_speeds else smaller:
+                proposed = self._designed_with(margin, model, known, dead)
+                if tolerates(proposed, model, late):
+                    return proposed
+            return self._designed_with(largest, model, known, dead)
         except ParameterError as error:
-            if margin_behind(latest, start) > margin_of(start):
-                raise ParameterError(f"u is up to {1e3 * latest:.0f} ms late: {error}") from None
+            if largest > margin_of(start):
+                worst = 1e3 * max(latest.values())
+                raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
             raise
 
-    def _designed_behind(
+    def _designed_with(
         self,
-        delay: float,
+        margin: float,
         model: Airframe,
         known: Mapping[tuple[str, ...], Known],
         dead: Mapping[tuple[str, ...], str],
     ) -> RiseDiConfig:
-        """`_designed`, with the delay margin behind a delay, s. While the rough model flies, parts
-        without another fly by it. Raises ParameterError.
+        """`_designed`, with a delay margin, s. While the rough model flies, parts without another
+        fly by it. Raises ParameterError.
         """
         start = self._controller
         flying = {output for part in known for output in part}
@@ -545,7 +559,7 @@ class Learner:
         bare = [output not in flying for output in start.outputs]
         designed = start.model_copy(update={"learn": None})
         if flying:
-            designed = design(with_margin(designed, margin_behind(delay, start)), model)
+            designed = design(with_margin(designed, margin), model)
             designed = with_deviations(
                 designed, {k: v for part in known.values() for k, v in part.deviation.items()}
             )
