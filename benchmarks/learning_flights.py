@@ -97,6 +97,7 @@ CELLS = {
         f"servos {1e3 * late:.0f} ms late": untold("turbulence", actuators={"delay": late})
         for late in (0.02, 0.03, 0.04)
     },
+    "loose elevator": untold("turbulence", actuators={"faults": ["elevator loose 0 0.01"]}),
     "slow servos": untold("turbulence", actuators={"lag": [0.04, 0.2, 0.04, 0.04]}),
     "noise x 3": untold("turbulence", sensors={"noise": [0.0051, 0.09, 0.0051, 0.0051]}),
     "y in steps": untold("turbulence", sensors={"quantisation": [0.005, 0.25, 0.005, 0.005]}),
