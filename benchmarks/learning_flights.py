@@ -386,10 +386,10 @@ def learn(name: str, cell: Cell, number: int) -> Row:
                 key: frozen(controller, flight, aircraft) for key, controller in controllers.items()
             }
         others = others | {"learner": frozen(flown.controller, flight, aircraft)}
+        margin = margin_left(flown.controller, chosen)
     values: dict[str, Any] = {key: value for key, (value, _) in others.items()}
     values |= {f"late_{key}": late for key, (_, late) in others.items()}
-    values["margin"] = margin_left(flown.controller, chosen)
-    return flown.row._replace(**values)
+    return flown.row._replace(margin=margin, **values)
 
 
 def with_prior(chosen: Scenario, folder: str) -> Scenario:
