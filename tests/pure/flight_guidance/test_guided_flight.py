@@ -130,6 +130,19 @@ def test_flying_wing_without_rudder_flies_route() -> None:
         wing.vary(guidance={"program": program(phi=0.1, r=0.05)})
 
 
+def test_lost_aileron_is_found_without_a_learner() -> None:
+    orbit = calm(40.0, program=program(north=0.0, east=400.0, radius=400.0))
+    actuators = orbit.aircraft.actuators.model_dump() | {"faults": ["aileron lost 4"]}
+    # an osprey off by up to 30 %, which else banks by 21 deg from then on
+    weaker = {"A": 0.3, "B": 0.3, "seed": 7, "number": 2}
+    tape = simulate(orbit.vary(aircraft={"actuators": actuators, "uncertainty": weaker}))
+    phi, ignored = channels(tape["guidance"], "pose.phi", "authority.roll")
+    begin = tape.time("guidance")[ignored == 0.0][0]
+    assert 4.0 < begin < 12.0  # after 2 s of the largest roll rate, and the turn before
+    # the largest bank by yaw is 10 deg
+    assert np.degrees(np.abs(phi[after(tape, 25.0)]).max()) < 12.0
+
+
 def test_small_corner_flown_with_small_bank() -> None:
     """A corner of half a degree takes a bank of about a degree."""
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the

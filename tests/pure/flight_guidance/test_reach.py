@@ -20,10 +20,11 @@ from flight_guidance.guidance_state import (
 )
 from flight_guidance.notices import LEARNED, Notices
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.reach import AUTHORITY, Authority
+from flight_guidance.reach import AUTHORITY, Authority, RollTest
 from flight_guidance.targets import reach_sentence, within_reach
 
 SPEED = 25.0  # m/s
+LAG = 0.4  # s, of p behind its command
 FREQUENCY = 5.0  # of p, rad/s
 CONFIG = GuidanceConfig.validate_mapping(
     {
@@ -94,6 +95,10 @@ def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
     held, _ = flown({"phi": 0.3}, Authority(p=0.0), phi=bank)
     # of a turn at this bank
     assert held.u_m[OWN.outputs.index("r")] == approx(GRAVITY * math.tan(bank) / SPEED)
+    radius = within_reach(OWN, Authority(p=0.0)).limits.radius
+    orbit = {"north": 0.0, "east": radius, "radius": math.ceil(OWN.limits.radius)}
+    wider = flown(orbit, Authority(p=0.0))[1]
+    assert wider.xtrack == approx(0.0, abs=1e-6)
     # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank
     # of 30 deg need not.
     assert [
@@ -129,9 +134,22 @@ def test_limits_are_said_once_and_end_with_the_model() -> None:
     quiet = dict.fromkeys((*Notices.CHANNELS, *LEARNED), 0.0)
     notices = Notices(0.0, 0.2, lambda speed: 99.0, reach=of)
     told = []
-    for t, authority in enumerate([Authority(), Authority(p=0.0), Authority(p=0.0), Authority()]):
+    flight = [
+        Authority(),
+        Authority(p=0.0),
+        Authority(p=0.0),
+        Authority(),
+        Authority(roll=0.0),
+        Authority(),
+    ]
+    for t, authority in enumerate(flight):
         told += notices.take(float(t), quiet | dict(zip(LEARNED, authority, strict=True)))
-    assert [notice.text for notice in told] == [f"by the learned model {dead}", "own limits again"]
+    assert [notice.text for notice in told] == [
+        f"by the learned model {dead}",
+        "own limits again",
+        "p ignores its command: the yaw rate flies the bank, at most 10 deg",
+        "p follows its command again",
+    ]
 
 
 def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
@@ -145,7 +163,36 @@ def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
         output = guidance.step(now_ns, now_ns)
         assert output is not None
         logged = dict(zip(guidance.names, output.log.tolist(), strict=True))
-        assert tuple(logged[name] for name in LEARNED) == (
-            (9.0, 1.0, 9.0, 2.0) if k else Authority()
+        assert Authority(*(logged[name] for name in LEARNED)) == (
+            Authority(9.0, 1.0, 9.0, 2.0) if k else Authority()
         )
         guidance.take_authority(channels)
+
+
+def rolled(share: float, gusts: float, begun: RollTest | None = None) -> RollTest:
+    """The test after 60 s of steps of the bank to either side, of an aircraft that rolls with a
+    share of the command, behind its lag, and with gusts, rad/s rms at 0.5 s.
+    """
+    dt = 0.02
+    noise = np.random.default_rng(3).normal(0.0, gusts * math.sqrt(2.0 * 0.5 / dt), 3000)
+    test = begun or RollTest()
+    p = 0.0
+    gust = 0.0
+    for k in range(3000):
+        command = 0.2 * math.copysign(1.0, math.sin(0.5 * k * dt))
+        gust += dt / 0.5 * (noise[k] - gust)
+        p += (1.0 - math.exp(-dt / LAG)) * (share * command - p)
+        test = test.after(dt, command, p + gust, LAG, 0.35)
+    return test
+
+
+def test_roll_rate_that_ignores_its_command_is_found_without_a_model_of_the_aircraft() -> None:
+    # 0.05 rad/s is ten times the p of an osprey without aileron in moderate turbulence
+    assert not any(rolled(share, 0.05).ignored for share in (1.2, 1.0, 0.7))
+    lost = rolled(0.0, 0.05)
+    assert lost.ignored
+    # The yaw alone rolls with up to half of the command: the aileron is not back.
+    assert rolled(0.5, 0.05, begun=lost).ignored
+    assert not rolled(1.0, 0.05, begun=lost).ignored
+    # Without a command there is no evidence.
+    assert not RollTest().after(60.0, 0.0, 0.1, LAG, 0.35).ignored

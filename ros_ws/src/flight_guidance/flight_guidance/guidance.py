@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.channels import POSE
+from flight_core.channels import POSE, UNKNOWN
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
@@ -37,7 +37,7 @@ from flight_guidance.guidance_state import (
 from flight_guidance.notices import LEARNED, LINK_AGE, STALE_TIME
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
-from flight_guidance.reach import Authority, authority_of
+from flight_guidance.reach import Authority, RollTest, authority_of
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
@@ -219,6 +219,7 @@ class Guidance:
         self._operated_ns: int | None = None
         self._link_lost = False
         self._authority = Authority()
+        self._roll = RollTest()
 
     @property
     def mode(self) -> Mode:
@@ -254,7 +255,7 @@ class Guidance:
         """Limit the steps from now on by what the inputs can do, from the channels of the topic
         `authority`.
         """
-        self._authority = authority_of(channels)
+        self._authority = authority_of(channels)._replace(roll=self._authority.roll)
 
     def _newest(
         self, last: StampedVector | None, sample: StampedVector, now_ns: int
@@ -440,6 +441,25 @@ class Guidance:
             self._link_lost = self.home()  # again at the next step while guidance does not fly
         return age_ns
 
+    def _test_roll(self, now_ns: int, y: Sequence[float]) -> None:
+        """Add to the authority whether p follows its command, up to the step at an instant."""
+        state = self._state
+        if self._params.multicopter is not None:
+            return
+        if state is None or self._begin is not Begin.NO:  # a gap is no evidence
+            self._roll = RollTest(ignored=self._roll.ignored and self._begin is Begin.AGAIN)
+        else:
+            at_p = self._params.outputs.index("p")
+            attitude = self._params.attitude
+            self._roll = self._roll.after(
+                seconds(now_ns - state.t_ns),
+                state.u_m[at_p],
+                y[at_p],
+                0.5 / attitude.k_phi,
+                attitude.roll_rate,
+            )
+        self._authority = self._authority._replace(roll=0.0 if self._roll.ignored else UNKNOWN)
+
     def _land(self) -> None:
         """Add the commands of the landing, unless an operator or the program has others."""
         state = self._state
@@ -476,6 +496,7 @@ class Guidance:
         self._land()
         y_values = tuple(y.value.tolist())
         pose_values = tuple(pose.value.tolist())
+        self._test_roll(now_ns, y_values)
         inputs = Inputs(
             now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority
         )

@@ -174,6 +174,7 @@ class GuidanceParams(NamedTuple):
     home: Home = Home()
     link_timeout_ns: int = 0  # of the operator's link; 0: no limit
     dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
+    rolls: bool = True  # else the yaw rate flies the bank
     channels: Channels = AIRPLANE
     multicopter: MulticopterParams | None = None  # None: of an airplane
 
@@ -196,7 +197,7 @@ class Inputs(NamedTuple):
     y: tuple[float, ...]  # the last y, in the order of u_m
     # commands that are new, by channel of Target; they name the modes
     commands: Mapping[str, float]
-    authority: Authority = Authority()  # of the inputs, as learned in flight
+    authority: Authority = Authority()  # of the inputs, as learned and tested in flight
 
 
 class GuidanceState(NamedTuple):

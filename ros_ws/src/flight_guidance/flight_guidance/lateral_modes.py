@@ -54,12 +54,18 @@ def lateral_bank(
             return _onto_leg(state, pose, speed, route, params)
         return _along_leg(state, pose, speed, route, params)
     target = state.target
-    orbit = Arc((target.north, target.east), target.radius)
+    orbit = _wide_enough(Arc((target.north, target.east), target.radius), params)
     position = (pose["north"], pose["east"])
     error = path.error(orbit, position)
     entered: Callable[[Point], Any] = partial(path.entered, orbit, None)
     wanted = follow(error, error.curvature, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(orbit, position)
+
+
+def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
+    """An orbit of at least the least radius, which grows as the largest bank falls in flight."""
+    radius = max(abs(orbit.radius), params.limits.radius)
+    return orbit._replace(radius=math.copysign(radius, orbit.radius))
 
 
 def _turn_to_course(
@@ -100,6 +106,8 @@ def _along_leg(
     """`lateral_bank` on a leg of the route."""
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
+    if isinstance(leg, Arc) and leg.end is None:
+        leg = _wide_enough(leg, params)
     error = path.error(leg, position)
     following = None if leg.end is None else route.legs[state.leg + 1]
     entry = error.curvature

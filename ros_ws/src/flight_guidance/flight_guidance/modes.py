@@ -184,7 +184,7 @@ def _wanted_rates(
     if state.mode is Mode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
     rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
-    if "p" in params.dead:
+    if not params.rolls:
         rates = rates._replace(r=yaw_for_bank(phi_c, state.phi, speed))
     return rates
 

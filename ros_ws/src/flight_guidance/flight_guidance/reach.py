@@ -30,6 +30,22 @@ YAWED_BANK = math.radians(10.0)
 6 deg of the osprey."""
 
 
+MEMORY = 10.0
+"""s, over which the roll rate is compared with its command."""
+
+ASKED = 2.0
+"""s of the largest roll rate. So much of a command is evidence: without an aileron the osprey is
+then 40 deg from its bank, or 7 deg for MEMORY. A turn of the osprey onto a course asks for less."""
+
+IGNORED = 0.3
+"""Largest share of a command that counts as ignored. With aileron the c172p and the 737 of JSBSim
+have at least 1 in turbulence; the osprey without aileron has 0.05 at most."""
+
+FOLLOWED = 0.8
+"""Least share that counts as followed again. `attitude.yaw_for_bank` alone rolls with up to half of
+the command."""
+
+
 class Authority(NamedTuple):
     """Least change of an output by the input from trim, units/s: 0 without an effect, UNKNOWN
     without a learned model.
@@ -39,6 +55,34 @@ class Authority(NamedTuple):
     p: float = UNKNOWN  # rad/s^2
     down: float = UNKNOWN  # of V, m/s^2
     up: float = UNKNOWN
+    roll: float = UNKNOWN  # 0 where the measured p ignores its command, by `RollTest`
+
+
+class RollTest(NamedTuple):
+    """Whether p follows its command. Needs no model and no u.
+
+        x_dot = (p_m - x) / lag,   a_dot = x^2 - a / MEMORY,   f_dot = x p - f / MEMORY
+
+    f / a is the share of the command that the aircraft flies, by least squares.
+    """
+
+    expected: float = 0.0  # x, rad/s
+    asked: float = 0.0  # a, rad^2/s
+    flown: float = 0.0  # f, rad^2/s
+    ignored: bool = False
+
+    def after(self, dt: float, command: float, p: float, lag: float, largest: float) -> "RollTest":
+        """The test after a step of a command and a measured p, rad/s, with the lag of p behind the
+        command, s, and the largest command. Without ASKED seconds of evidence the verdict stays.
+        """
+        kept = math.exp(-dt / MEMORY)
+        asked = kept * self.asked + dt * self.expected**2
+        flown = kept * self.flown + dt * self.expected * p
+        ignored = self.ignored
+        if asked > ASKED * largest**2:
+            ignored = flown < (FOLLOWED if ignored else IGNORED) * asked
+        expected = self.expected + (1.0 - math.exp(-dt / lag)) * (command - self.expected)
+        return RollTest(expected, asked, flown, ignored)
 
 
 AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "V")))

@@ -23,11 +23,12 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
     Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters.
     Reversals of the bank fit into the period of path following, and orbits have the radius for the
-    bank. Without an aileron the largest bank is YAWED_BANK. Without a throttle there is no climb,
-    and the sink stays: pitch then flies the airspeed at the floor.
+    bank. Where p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
+    throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
     """
     if authority == Authority():
         return params
+    rolls = min(authority.p, authority.roll) >= reach.LEAST
     dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
     limits = params.limits
     attitude = params.attitude
@@ -38,7 +39,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
         vertical = vertical._replace(sink=min(vertical.sink, sink))
     rate = attitude.roll_rate
     bank = min(limits.bank, reach.YAWED_BANK)
-    if "p" not in dead:
+    if rolls:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
     # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
@@ -51,6 +52,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     radius = limits.radius * (math.tan(0.8 * limits.bank) / math.tan(0.8 * bank))
     return params._replace(
         dead=dead,
+        rolls=rolls,
         vertical=vertical,
         limits=limits._replace(bank=bank, radius=radius),
         attitude=attitude._replace(roll_rate=rate),
