@@ -4,7 +4,9 @@
 flights without a scenario.
 """
 
+import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import AircraftState, PlantParams
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import true_error
 from flight_core.rates import nanoseconds
@@ -41,6 +44,35 @@ CALM_SERVO = PROTOTYPE_SERVO.vary(
 )
 """Scenario osprey_servo with these gains in calm air, without noise, at 100 Hz and in steps of 5
 ms."""
+
+
+def calm_osprey(
+    duration: float, wind: tuple[float, float] = (0.0, 0.0), **guidance: Any
+) -> Scenario:
+    """The osprey of osprey_route in a steady wind without noise, in larger steps than the
+    scenario's, with a section of guidance in place of the route.
+    """
+    return find_scenario("osprey_route").vary(
+        flight={"duration": duration},
+        aircraft={
+            "rate": 100.0,
+            "step": 0.005,
+            "wind": [*wind],
+            "turbulence": None,
+            "sensors": {},
+        },
+        reference_model={"rate": 100.0},
+        guidance={"route": None, "wind": math.hypot(*wind)} | guidance,
+    )
+
+
+def in_calm_air(path: Path, **guidance: object) -> Path:
+    """A file of the osprey in calm air, without a route."""
+    varied = find_scenario("osprey_route").vary(
+        aircraft={"wind": [0.0, 0.0], "turbulence": None}, guidance={"route": None} | guidance
+    )
+    path.write_text(scenario_yaml(varied))
+    return path
 
 
 def law_params(

@@ -15,6 +15,7 @@ import pytest
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
+from tests.closed_loop import in_calm_air as calm
 from tests.conftest import REPOSITORY, refusing
 from tests.nodes.world import OUTPUTS, World, diagnostics, world_of
 
@@ -84,15 +85,6 @@ class Flight:
     def logged(self, *parts: str) -> bool:
         """Whether a line of the log has all parts."""
         return any(all(part in line for part in parts) for line in self.node.log.lines)
-
-
-def calm(path: Path, **guidance: object) -> Path:
-    """The osprey in calm air, without a route."""
-    varied = find_scenario("osprey_route").vary(
-        aircraft={"wind": [0.0, 0.0], "turbulence": None}, guidance={"route": None} | guidance
-    )
-    path.write_text(scenario_yaml(varied))
-    return path
 
 
 @pytest.fixture
@@ -167,7 +159,7 @@ def test_learned_authority_limits_commands_and_a_bad_one_is_refused(flight: Flig
     flight.world.send("/authority", dict.fromkeys(AUTHORITY, 0.0), "/controller#1")
     flight.run()
     assert flight.last("authority.p") == 0.0
-    assert flight.logged("by the learned model no roll rate: p has no input with an effect")
+    assert flight.logged("from now on no roll rate: p has no input with an effect")
     flight.world.send("/authority", dict.fromkeys(AUTHORITY, -1.0), "/controller#1")
     flight.run()
     assert flight.refused("authority: bounds") == 1

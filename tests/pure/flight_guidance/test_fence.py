@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from benchmarks import fence as benchmark
 from pytest import approx
+from tests.closed_loop import calm_osprey as calm
 from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
@@ -216,22 +217,6 @@ def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
     level = holding(0, pose, 25.0, params)
     assert motion_of(level, pose, y, 25.0, params).phi == approx(0.3 * 2.0 * 0.9 / 5.0, rel=0.15)
     assert motion_of(level, pose, y | {"p": 9.0}, 25.0, params).phi <= params.limits.bank
-
-
-def calm(duration: float, wind: tuple[float, float] = (0.0, 0.0), **section: Any) -> Scenario:
-    """The osprey without noise, in larger steps than the scenario's."""
-    return find_scenario("osprey_route").vary(
-        flight={"duration": duration},
-        aircraft={
-            "rate": 100.0,
-            "step": 0.005,
-            "wind": list(wind),
-            "turbulence": None,
-            "sensors": {},
-        },
-        reference_model={"rate": 100.0},
-        guidance={"route": None, "wind": math.hypot(*wind)} | section,
-    )
 
 
 LEAST_RADIUS = 282.0

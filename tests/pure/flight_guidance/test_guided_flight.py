@@ -13,11 +13,12 @@ import pytest
 from benchmarks import path_laws
 from pytest import approx
 from rosbags.rosbag2 import StoragePlugin, Writer
+from tests.closed_loop import calm_osprey as calm
 from tests.conftest import invoke, refusing
 from tests.joint_states import path
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided_figures import flown_routes
@@ -29,6 +30,7 @@ from flight_guidance import guidance, guidance_state, modes
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Mode, Vertical
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.path import Route
 from flight_guidance.protection import climb_range
 from flight_guidance.route_file import Waypoint, read_route
 from flight_log.named_vectors import PATH, typestore
@@ -45,24 +47,6 @@ SECTION: dict[str, Any] = {
 MS = 1_000_000  # ns
 # a bank of 0.1 rad
 BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)
-
-
-def calm(duration: float, **section: Any) -> Scenario:
-    """The osprey in calm air without noise, with a section of guidance, in larger steps than the
-    scenario's.
-    """
-    return ROUTE.vary(
-        flight={"duration": duration},
-        aircraft={
-            "rate": 100.0,
-            "step": 0.005,
-            "wind": [0.0, 0.0],
-            "turbulence": None,
-            "sensors": {},
-        },
-        reference_model={"rate": 100.0},
-        guidance={"route": None, "wind": 0.0} | section,
-    )
 
 
 def program(**channels: float) -> dict[str, Any]:
@@ -139,8 +123,8 @@ def test_lost_aileron_is_found_without_a_learner() -> None:
     phi, ignored = channels(tape["guidance"], "pose.phi", "authority.roll")
     begin = tape.time("guidance")[ignored == 0.0][0]
     assert 4.0 < begin < 12.0  # after 2 s of the largest roll rate, and the turn before
-    # the largest bank by yaw is 10 deg
-    assert np.degrees(np.abs(phi[after(tape, 25.0)]).max()) < 12.0
+    # 1.6 times the largest bank of 10 deg, and 1 deg
+    assert np.degrees(np.abs(phi[after(tape, 25.0)]).max()) < 17.0
 
 
 def test_small_corner_flown_with_small_bank() -> None:
@@ -230,12 +214,16 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
 
 
+def northwards(altitude: float = 100.0) -> Route:
+    """A line to the north that ends at an altitude, m, and the orbit."""
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
+    return section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, altitude)])
+
+
 @pytest.mark.parametrize("leg", [2.0, 0.5])
 def test_leg_that_route_does_not_have_refused(leg: float) -> None:
     made = flying()
-    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
-    # a line and the orbit
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
+    made.take_route(northwards())
     with pytest.raises(
         ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"
     ):
@@ -247,9 +235,7 @@ def test_new_route_voids_legs_of_program() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
     made = flying(route=route, program=steps)
-    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
-    # a line and the orbit
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
+    made.take_route(northwards())
     signal = run(made, 1, 5)
     assert signal["leg"].tolist() == [0.0] * 4
     assert signal["target.V"][-1] == 26.0
@@ -259,7 +245,6 @@ def test_new_route_voids_legs_of_program() -> None:
 def test_route_waits_for_engagement(by: str) -> None:
     """A route sent while guidance is off is flown from the engagement on."""
     made = flying()
-    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
 
     def switch(*, on: bool) -> None:
         if by == "guidance/engage":
@@ -267,13 +252,13 @@ def test_route_waits_for_engagement(by: str) -> None:
         else:
             made.pause(paused=not on, forget=not on)
 
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
+    made.take_route(northwards())
     assert run(made, 1, 2)["mode.lateral"][0] == guidance_state.Lateral.ROUTE
     switch(on=False)
     switch(on=True)  # the route that was flown before is not flown on
     assert run(made, 2, 3)["mode.lateral"][0] != guidance_state.Lateral.ROUTE
     switch(on=False)
-    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 130.0)]))
+    made.take_route(northwards(130.0))
     made.take_target({"V": 27.0})
     switch(on=True)
     signal = run(made, 3, 4)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pytest import approx
+from tests.closed_loop import calm_osprey
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import landing_results, landing_touch
 from flight_core.channels import POSE
@@ -36,17 +36,12 @@ ROUTE = {
 @pytest.fixture(scope="module")
 def across() -> Scenario:
     """An approach of the osprey in 4 m/s across, at 100 Hz."""
-    base = find_scenario("osprey_route").vary(
-        reference_model={"rate": 100.0},
-        aircraft={"turbulence": None, "rate": 100.0, "step": 0.005, "wind": [0.0, 4.0]},
-        guidance={"route": None, "wind": 4.0},
-    )
-    return base.vary(guidance={"route": ROUTE, "landing": {"waypoint": 1}})
+    return calm_osprey(37.0, (0.0, 4.0), route=ROUTE, landing={"waypoint": 1})
 
 
 @pytest.fixture(scope="module")
 def approach(across: Scenario) -> Tape:
-    return simulate(across.vary(flight={"duration": 37.0}))
+    return simulate(across)
 
 
 def section_with(scenario: Scenario, **changes: Any) -> GuidanceConfig:

@@ -157,6 +157,9 @@ def test_wind_that_airspeed_cannot_beat_refused(
         GuidanceConfig.validate_mapping(SECTION | {"wind": wind, "route": route}, "guidance")
 
 
+CORNER = ((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+
+
 class Flown:
     """Guidance on a route, with poses as given."""
 
@@ -168,7 +171,8 @@ class Flown:
     ) -> None:
         self.made = Guidance(config)
         self._k = 0
-        self.made.take_route(config.plan([Waypoint(*waypoint) for waypoint in waypoints]))
+        self.route = config.plan([Waypoint(*waypoint) for waypoint in waypoints])
+        self.made.take_route(self.route)
         self.at(*start)
 
     def at(
@@ -223,7 +227,7 @@ def test_leg_passed_far_away_is_missed() -> None:
     )
     assert flown.at(990.0, 600.0)["leg"] == 0.0
     log = flown.at(1010.0, 600.0)
-    end = flown.made.route.legs[0].end if flown.made.route else None
+    end = flown.route.legs[0].end
     assert end is not None
     assert log["missed"] == approx(math.dist(end, (1010.0, 600.0)))
     assert (log["leg"], abs(log["joining"])) == (1.0, 1.0)
@@ -234,16 +238,14 @@ def test_leg_passed_far_away_is_missed() -> None:
 def test_leg_passed_near_is_flown() -> None:
     flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (1000.0, 2000.0, 100.0))
     flown.at(5.0, 0.0)
-    route = flown.made.route
-    assert route is not None
-    end = route.legs[0].end
+    end = flown.route.legs[0].end
     assert end is not None
     log = flown.at(end[0] + 1.0, 0.9 * R)
     assert (log["leg"], log["missed"], log["joining"]) == (1.0, 0.0, 0.0)
 
 
 def test_leg_joined_at_a_point_along_it() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    flown = Flown(*CORNER)
     flown.made.take_target({"leg": 0.0, "along": 900.0})
     log = flown.at(0.0, 500.0)
     assert (log["target.along"], abs(log["joining"])) == (900.0, 1.0)
@@ -260,19 +262,15 @@ def test_leg_joined_at_a_point_along_it() -> None:
 
 
 def test_skip_leaves_waypoint_ahead_out() -> None:
-    flown = Flown(
-        (0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0)
-    )
+    flown = Flown(*CORNER, (0.0, 3000.0, 100.0))
     assert flown.made.skip()
     log = flown.at(100.0, 0.0)
-    route = flown.made.route
-    assert route is not None
     assert log["leg"] == 2.0  # the line after the fillet
-    assert log["target.along"] == approx(path.length(route.legs[2]))
+    assert log["target.along"] == approx(path.length(flown.route.legs[2]))
 
 
 def test_resume_flies_last_leg_from_nearest_point() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    flown = Flown(*CORNER)
     assert not flown.made.resume()  # the route is flown
     assert flown.made.hold()
     assert flown.at(700.0, 400.0)["mode.lateral"] == Lateral.HEADING
@@ -323,26 +321,23 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     """
     centre = (2000.0, 0.0)
     flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
-    route = flown.made.route
-    assert route is not None
-    circle = route.legs[1]
+    circle = flown.route.legs[1]
     # the last line touches the orbit round the last waypoint
     assert circle.end == approx((2000.0, -R), abs=10.0)
-    end = route.legs[0].end
+    end = flown.route.legs[0].end
     assert end is not None
-    assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0
+    assert flown.at(end[0] + 0.5, end[1], path.end_course(flown.route.legs[0]))["leg"] == 1.0
     half = circling(flown, centre, max(turns, wait / 36.2) - 0.5)
     assert 0.5 < half["loitered"] < 1.0
-    flown.at(*end, path.end_course(route.legs[0]))
+    flown.at(*end, path.end_course(flown.route.legs[0]))
     log = circling(flown, centre, 2.0, first=math.degrees(path.course_of(centre, end)))
     assert log["leg"] == 2.0
 
 
 def test_steep_leg_begins_with_circle_that_is_left_at_altitude() -> None:
     flown = Flown((0.0, 0.0, 100.0), (1500.0, 0.0, 400.0), (1500.0, 2500.0, 400.0), start=(0.0, -R))
-    assert flown.made.route is not None
     assert "flown on circles round the waypoint before" in flown.notices[0]
-    circle = flown.made.route.legs[0]
+    circle = flown.route.legs[0]
     assert (isinstance(circle, Arc), flown.at(0.0, -R + 1.0)["target.altitude"]) == (True, 400.0)
     assert circle.end is not None
     course = path.end_course(circle)

@@ -15,14 +15,14 @@ import pymap3d
 import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
+from tests.closed_loop import in_calm_air
 from tests.conftest import refusing
 from tests.recordings import require_equal_bits
 from tests.ros.conftest import Start
 from tests.ros.flight_bringup.test_lockstep import FIRST_CHUNKS, ROUGH, fly, scenario_file
 from tests.ros.peer import OUTPUTS, Peer
 
-from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
@@ -121,13 +121,7 @@ def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
 @pytest.fixture
 def calm(tmp_path: Path) -> Path:
     """The osprey in calm air, without a route."""
-    varied = find_scenario("osprey_route").vary(
-        aircraft={"wind": [0.0, 0.0], "turbulence": None},
-        guidance={"route": None},
-    )
-    path = tmp_path / "calm.yaml"
-    path.write_text(scenario_yaml(varied))
-    return path
+    return in_calm_air(tmp_path / "calm.yaml")
 
 
 class Flight:

@@ -14,6 +14,10 @@ YAW_TO_BANK = 1.5
 """1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off
 for the worse."""
 
+SKIDDING = 1.6
+"""Bank of the osprey in a turn by the rudder over that of a coordinated turn at the same rate: the
+sideslip rolls until then. 1.3 to 1.7 where A and B are 30 % off."""
+
 LARGEST_YAW = math.radians(20.0)
 """Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its
 stop."""
@@ -76,11 +80,12 @@ def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within
     +-g tan(LARGEST_YAW) / V.
 
-        r_m = g tan(phi_c) / V + k (phi_c - phi),  k = YAW_TO_BANK
+        r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 
-    A yaw rolls an aircraft to the same side: the outer wing is faster, and the dihedral rolls away
-    from the sideslip.
+    phi_c is that of a coordinated turn at the same rate. A yaw rolls an aircraft to the same side:
+    the outer wing is faster, and the dihedral rolls away from the sideslip.
     """
     xp = array_namespace(phi)
     turn = GRAVITY / speed
-    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * (phi_c - phi), turn * math.tan(LARGEST_YAW))
+    off = SKIDDING * phi_c - phi
+    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * off, turn * math.tan(LARGEST_YAW))

@@ -441,23 +441,15 @@ class Guidance:
             self._link_lost = self.home()  # again at the next step while guidance does not fly
         return age_ns
 
-    def _test_roll(self, now_ns: int, y: Sequence[float]) -> None:
-        """Add to the authority whether p follows its command, up to the step at an instant."""
+    def _test_roll(self, y: Sequence[float]) -> None:
+        """Add to the authority whether p follows the command of the last step."""
         state = self._state
-        if self._params.multicopter is not None:
+        params = self._params
+        if state is None or params.multicopter is not None:
             return
-        if state is None or self._begin is not Begin.NO:  # a gap is no evidence
-            self._roll = RollTest(ignored=self._roll.ignored and self._begin is Begin.AGAIN)
-        else:
-            at_p = self._params.outputs.index("p")
-            attitude = self._params.attitude
-            self._roll = self._roll.after(
-                seconds(now_ns - state.t_ns),
-                state.u_m[at_p],
-                y[at_p],
-                0.5 / attitude.k_phi,
-                attitude.roll_rate,
-            )
+        at_p = params.outputs.index("p")
+        dt = seconds(params.period_ns)
+        self._roll = self._roll.after(dt, state.u_m[at_p], y[at_p], params.attitude.roll_rate)
         self._authority = self._authority._replace(roll=0.0 if self._roll.ignored else UNKNOWN)
 
     def _land(self) -> None:
@@ -496,7 +488,7 @@ class Guidance:
         self._land()
         y_values = tuple(y.value.tolist())
         pose_values = tuple(pose.value.tolist())
-        self._test_roll(now_ns, y_values)
+        self._test_roll(y_values)
         inputs = Inputs(
             now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority
         )

@@ -15,17 +15,13 @@ from flight_core.channels import UNKNOWN
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
 from flight_guidance.guidance_state import LARGEST, Lateral
-from flight_guidance.reach import YAWED_BANK, Authority
+from flight_guidance.reach import Authority
 
 DWELL = 10.0
 """Time for which a condition lasts before the notice, and ends before a second notice, s."""
 
 LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
-
-YAWED = f"the yaw rate flies the bank, at most {math.degrees(YAWED_BANK):.0f} deg"
-ROLL = ("p follows its command again", f"p ignores its command: {YAWED}")
-"""Where p follows its command, and where not."""
 
 LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
@@ -157,22 +153,13 @@ class Notices:
         texts += self._outside(t, log["fence.clearance"])
         wind = math.hypot(log["wind.north"], log["wind.east"])
         largest = self._largest_wind(log["V_c"])
-        if (
-            authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))
-        ) != self._authority:
-            if authority.roll != self._authority.roll:
-                texts.append(ROLL[authority.roll == 0.0])
-            self._authority, reached, self._reached = (
-                authority,
-                self._reached,
-                self._reach(authority._replace(roll=UNKNOWN)),
-            )
-            if reached != self._reached:
-                texts.append(
-                    f"by the learned model {self._reached}"
-                    if self._reached
-                    else "own limits again" + ", but of the bank" * (authority.roll == 0.0)
-                )
+        authority = Authority(*(log.get(name, UNKNOWN) for name in LEARNED))
+        if authority != self._authority:
+            earlier = self._reached
+            self._authority = authority
+            self._reached = self._reach(authority)
+            if self._reached != earlier:
+                texts.append(f"from now on {self._reached or 'own limits again'}")
         if self._link.due(t, holds=log.get(LINK_AGE, 0.0) > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):

@@ -41,7 +41,7 @@ IGNORED = 0.3
 """Largest share of a command that counts as ignored. With aileron the c172p and the 737 of JSBSim
 have at least 1 in turbulence; the osprey without aileron has 0.05 at most."""
 
-FOLLOWED = 0.8
+FOLLOWED = 0.7
 """Least share that counts as followed again. `attitude.yaw_for_bank` alone rolls with up to half of
 the command."""
 
@@ -59,30 +59,28 @@ class Authority(NamedTuple):
 
 
 class RollTest(NamedTuple):
-    """Whether p follows its command. Needs no model and no u.
+    """Whether p follows its command p_m. Needs no model and no u.
 
-        x_dot = (p_m - x) / lag,   a_dot = x^2 - a / MEMORY,   f_dot = x p - f / MEMORY
+        a_dot = p_m^2 - a / MEMORY,   f_dot = p_m p - f / MEMORY
 
     f / a is the share of the command that the aircraft flies, by least squares.
     """
 
-    expected: float = 0.0  # x, rad/s
     asked: float = 0.0  # a, rad^2/s
     flown: float = 0.0  # f, rad^2/s
     ignored: bool = False
 
-    def after(self, dt: float, command: float, p: float, lag: float, largest: float) -> "RollTest":
-        """The test after a step of a command and a measured p, rad/s, with the lag of p behind the
-        command, s, and the largest command. Without ASKED seconds of evidence the verdict stays.
+    def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
+        """The test after a step of a command, at most `largest`, and a measured p, rad/s. Without
+        ASKED of evidence the verdict stays.
         """
         kept = math.exp(-dt / MEMORY)
-        asked = kept * self.asked + dt * self.expected**2
-        flown = kept * self.flown + dt * self.expected * p
+        asked = kept * self.asked + dt * command**2
+        flown = kept * self.flown + dt * command * p
         ignored = self.ignored
         if asked > ASKED * largest**2:
             ignored = flown < (FOLLOWED if ignored else IGNORED) * asked
-        expected = self.expected + (1.0 - math.exp(-dt / lag)) * (command - self.expected)
-        return RollTest(expected, asked, flown, ignored)
+        return RollTest(asked, flown, ignored)
 
 
 AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "V")))

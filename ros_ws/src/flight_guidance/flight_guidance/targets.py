@@ -60,7 +60,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
-    """The limits by a model learned in flight, as a sentence; empty where the own limits are
+    """The limits by what is learned in flight, as a sentence; empty where the own limits are
     less.
     """
     now = within_reach(params, authority)
@@ -69,6 +69,8 @@ def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
         for name, command in DEAD.items()
         if name in now.dead
     ]
+    if not authority.roll:
+        parts.append("the yaw rate flies the bank: p ignores its command")
     if min(authority.down, authority.up) < reach.LEAST:
         parts.append("no climb: V has no input with an effect")
     for name, nominal, limit, unit in (
