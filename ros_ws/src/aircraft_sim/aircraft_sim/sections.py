@@ -187,13 +187,20 @@ class SineConfig(Config):
     phase: Number = Field(default=0.0, description="the phase, rad")
 
 
-class UncertaintyConfig(Config):
+class DrawConfig(Config):
+    """Entries of A and B times 1 + d, drawn by a seed."""
+
+    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
+    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
+    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's draw")
+
+
+class UncertaintyConfig(DrawConfig):
     """An aircraft sampled around the airframe: every entry times 1 + d, d independent; rows of
     angles stay.
     """
 
-    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
-    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     entries: tuple[str, ...] = Field(
         default=(), description="entries with their own largest d, as A[q,alpha]"
     )
@@ -208,8 +215,6 @@ class UncertaintyConfig(Config):
         default=AIR_RELATIVE,
         description="effect of wind: by the aircraft's own A, or as published",
     )
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft")
 
     def _check(self) -> None:
         require(
@@ -225,7 +230,7 @@ class UncertaintyConfig(Config):
         return Spread(dict(zip(self.entries, self.parts, strict=True)), self.distribution)
 
 
-class DriftConfig(Config):
+class DriftConfig(DrawConfig):
     """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and
     independent.
     """
@@ -236,10 +241,6 @@ class DriftConfig(Config):
     duration: NonNegative = Field(
         default=60.0, description="how long the entries change, s; 0 is at once"
     )
-    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
-    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's change")
 
     def _check(self) -> None:
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")

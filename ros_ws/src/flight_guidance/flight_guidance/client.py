@@ -177,8 +177,7 @@ class TargetClient(GuidanceClient):
 
     def keep_link(self) -> None:
         """Publish a target without channels, which says that an operator is there."""
-        encoder = Encoder((), self._node.get_fully_qualified_name())
-        self._publisher.publish(encoder.encode(time.time_ns(), np.array(())))
+        self._publish({})
 
     def hold_link(self) -> NoReturn:
         """Keep the link, a message each LINK_PERIOD. Raises ParameterError where no guidance flies
@@ -192,6 +191,9 @@ class TargetClient(GuidanceClient):
     def _published(self, values: Mapping[str, float]) -> bool:
         if time.monotonic() - self._sent > TARGET_PERIOD:
             self._sent = time.monotonic()
-            encoder = Encoder([*values], self._node.get_fully_qualified_name())
-            self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
+            self._publish(values)
         return self._has_taken(values)
+
+    def _publish(self, values: Mapping[str, float]) -> None:
+        encoder = Encoder([*values], self._node.get_fully_qualified_name())
+        self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))

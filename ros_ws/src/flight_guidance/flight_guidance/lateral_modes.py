@@ -47,7 +47,10 @@ def lateral_bank(
     if state.lateral is Lateral.PHI:
         return state.target.phi, NOWHERE, 0.0
     if state.lateral in {Lateral.HEADING, Lateral.COURSE}:
-        wanted = _turn_to_course(state, pose, speed, params)
+        asked = (state.target.course, *course_and_speed(pose))
+        if state.lateral is Lateral.HEADING:
+            asked = (state.target.heading, state.psi, speed)
+        wanted = course_acceleration(*asked, params.k_chi)
         return bank_for(wanted, path_angle(pose["climb"], speed), STEEPEST), NOWHERE, 0.0
     if state.lateral is Lateral.ROUTE and route is not None:
         if state.joining:
@@ -68,15 +71,6 @@ def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
     return orbit._replace(radius=math.copysign(radius, orbit.radius))
 
 
-def _turn_to_course(
-    state: GuidanceState, pose: Mapping[str, float], speed: float, params: GuidanceParams
-) -> float:
-    """Acceleration to the right onto the commanded heading or course, m/s^2."""
-    if state.lateral is Lateral.HEADING:
-        return course_acceleration(state.target.heading, state.psi, speed, params.k_chi)
-    return course_acceleration(state.target.course, *course_and_speed(pose), params.k_chi)
-
-
 def _onto_leg(
     state: GuidanceState,
     pose: Mapping[str, float],
@@ -90,7 +84,10 @@ def _onto_leg(
     start, course = route.start(state.leg, state.target.along)
     radius = state.joining * route.radius
     error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
-    joined = partial(_joins, start, course, route.near(state.leg), flown)
+
+    def joined(place: Point) -> Any:
+        return path.joined(start, course, route.near(state.leg), place, flown)
+
     entry = path.error(route.legs[state.leg], start).curvature
     wanted = follow(error, entry, joined, state.slip, pose, speed, params)
     return wanted, error, path.joining_length(start, course, radius, position, flown)
@@ -123,11 +120,6 @@ def _along_leg(
             entered = partial(leaves, leg, near, pose)
     wanted = follow(error, entry, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(leg, position)
-
-
-def _joins(start: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
-    """`path.joined` by the position, for `follow`."""
-    return path.joined(start, course, near, position, flown)
 
 
 def follow(

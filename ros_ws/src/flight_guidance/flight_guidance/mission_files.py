@@ -22,7 +22,15 @@ from flight_guidance.route_json import (
     parsed_json,
     require_wgs84,
 )
-from flight_guidance.route_places import Above, Home, Place, Places, lon_lat, number_of
+from flight_guidance.route_places import (
+    Above,
+    Home,
+    Place,
+    Places,
+    is_position,
+    lon_lat,
+    number_of,
+)
 
 
 def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
@@ -321,16 +329,14 @@ def _group(item: Item, key: str) -> int:
 
 def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
     """A position of a plan: latitude, longitude and perhaps altitude."""
-    fits = isinstance(position, list) and 2 <= len(position) <= 3
-    require(fits, "fence", short_repr(position), "latitude and longitude")
+    require(is_position(position), "fence", short_repr(position), "latitude and longitude")
     latitude, longitude, *altitude = position
     return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)
 
 
 def home_of(position: Any) -> Home | None:
     """The home in latitude, longitude and perhaps altitude; None for anything else."""
-    fits = isinstance(position, list) and 2 <= len(position) <= 3
-    if not fits or not all(isinstance(value, int | float) for value in position):
+    if not is_position(position) or not all(isinstance(value, int | float) for value in position):
         return None
     return Home(position[0], position[1], position[2] if len(position) == 3 else None)
 

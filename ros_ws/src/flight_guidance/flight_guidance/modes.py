@@ -30,7 +30,6 @@ from flight_guidance.guidance_state import (
     GuidanceState,
     Inputs,
     Lateral,
-    Limits,
     Mode,
     Target,
     Vertical,
@@ -135,6 +134,7 @@ def step(
     params = within_reach(params, inputs.authority)
     state = begin(state, inputs, params)
     dt = seconds(inputs.t_ns - state.t_ns)
+    speed = airspeed(inputs.y, params)
     state = _with_attitude(state, inputs, dt, params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
     y = dict(zip(params.outputs, inputs.y, strict=True))
@@ -149,10 +149,10 @@ def step(
         lambda state, route: along_route(state, pose, dt, route),
         lambda state, leg, along, route: joining(state, leg, along, pose, route),
     )
-    state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
-    wanted, error, to_go = lateral_bank(state, pose, airspeed(inputs.y, params), route, params)
+    state, escape = _within_fence(state, pose, y, speed, params)
+    wanted, error, to_go = lateral_bank(state, pose, speed, route, params)
     if state.mode is Mode.ENGAGED:
-        wanted = escaping_bank(escape, wanted, pose, airspeed(inputs.y, params), params)
+        wanted = escaping_bank(escape, wanted, pose, speed, params)
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
     commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
@@ -410,7 +410,8 @@ def _pitch_within(
     """The commanded pitch, rad, within that of the climb rates to the least and the largest
     altitude.
     """
-    if not _is_bounded(params.limits):
+    limits = params.limits
+    if not (math.isfinite(limits.lowest) or math.isfinite(limits.highest)):
         return state.target.theta
     xp = array_namespace(speed)
     least, largest = (
@@ -419,18 +420,12 @@ def _pitch_within(
     return xp.minimum(xp.maximum(state.target.theta, least), largest)
 
 
-def _is_bounded(limits: Limits) -> bool:
-    return math.isfinite(limits.lowest) or math.isfinite(limits.highest)
-
-
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
     """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for`
     to the bounds.
     """
     vertical = params.vertical
     limits = params.limits
-    if not _is_bounded(limits):
-        return -vertical.sink, vertical.climb
     return climb_for(limits.lowest - altitude, vertical), climb_for(
         limits.highest - altitude, vertical
     )

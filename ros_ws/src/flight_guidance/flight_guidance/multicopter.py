@@ -58,7 +58,7 @@ WIND_TIME = 3.0
 """T, s: long against a leg's end, short against a leg."""
 
 LONGEST_LEAD = 0.5
-"""s. Largest age of a pose over which its attitude is brought to now."""
+"""s. Largest age of a pose over which the attitude is brought to now."""
 
 
 class Wanted(NamedTuple):

@@ -332,7 +332,7 @@ class GuidanceConfig(NodeConfig):
         """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a
         third of the authority.
         """
-        frequency = self.natural_frequency[self.outputs.index("p")]
+        frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority
         return self.roll_rate or min(FASTEST_ROLL, reach.roll_rate(authority, frequency))
 
@@ -342,7 +342,7 @@ class GuidanceConfig(NodeConfig):
         """
         if self.sideslip_gain is not None:
             return self.sideslip_gain
-        k_chi = self.natural_frequency[self.outputs.index("p")] / 14.0
+        k_chi = self._frequency()["p"] / 14.0
         return min(0.5, k_chi * self.speed * math.radians(1.0) / 1.5)
 
     def least_period(self) -> float:
@@ -386,7 +386,7 @@ class GuidanceConfig(NodeConfig):
         """The numbers of the equations."""
         if self.drag is not None:
             return self._multicopter_params(self.drag)
-        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        frequency = self._frequency()
         floor, (climb, sink) = self._floor(), self.climb_limits()
         roll = frequency["p"] / 4.0
         pitch = frequency["q"] / 4.0
@@ -400,10 +400,7 @@ class GuidanceConfig(NodeConfig):
             "r": yaw * turn,
             "V": 0.25 * frequency["V"],
         }
-        return GuidanceParams(
-            outputs=self.outputs,
-            period_ns=period_ns(self.rate, "rate"),
-            speed=self.speed,
+        return self._common(
             k_chi=roll / 3.5,
             attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta(), lead),
             vertical=self._vertical(climb, sink),
@@ -419,32 +416,42 @@ class GuidanceConfig(NodeConfig):
                 *self._altitudes(),
             ),
             slew=tuple(slew[name] for name in self.outputs),
+            turn_lag=max(2.0 / yaw - lead, 0.0),
+        )
+
+    def _common(self, **numbers: Any) -> GuidanceParams:
+        """The numbers of the equations, for every kind of aircraft."""
+        return GuidanceParams(
+            outputs=self.outputs,
+            period_ns=period_ns(self.rate, "rate"),
+            speed=self.speed,
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
-            turn_lag=max(2.0 / yaw - lead, 0.0),
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
+            **numbers,
         )
 
+    def _frequency(self) -> dict[str, float]:
+        """The natural frequency of the reference model by output, rad/s."""
+        return dict(zip(self.outputs, self.natural_frequency, strict=True))
+
     def _gains(self, drag: float) -> MulticopterParams:
-        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        frequency = self._frequency()
         return multicopter_rules.gains(frequency, self.bank, drag, self.roll_authority or math.inf)
 
     def _multicopter_params(self, drag: float) -> GuidanceParams:
         """The numbers of the equations of a multicopter."""
         gains = self._gains(drag)
-        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        frequency = self._frequency()
         climbs = vertical(self.outputs)
         rates = {"p": gains.tilt_rate, "q": gains.tilt_rate, "r": gains.yaw_rate}
         rates[climbs] = self.acceleration / frequency[climbs]
         climb = self.climb or multicopter_rules.CLIMB * self.speed
         sink = self.sink or multicopter_rules.SINK * self.speed
         gain = self.altitude_gain or frequency[climbs] / 4.0
-        return GuidanceParams(
-            outputs=self.outputs,
-            period_ns=period_ns(self.rate, "rate"),
-            speed=self.speed,
+        return self._common(
             k_chi=0.0,
             attitude=AttitudeParams(gains.k_tilt, gains.k_tilt, gains.tilt_rate, 0.0, 0.0, 0.0),
             vertical=VerticalParams(gain, self.acceleration, climb, sink, 0.0),
@@ -460,11 +467,6 @@ class GuidanceConfig(NodeConfig):
                 *self._altitudes(),
             ),
             slew=tuple(frequency[name] * rates[name] for name in self.outputs),
-            max_age_ns=nanoseconds(self.max_age),
-            hold_ns=nanoseconds(self.hold),
-            fence=self.fence_zones(),
-            home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
-            link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
             channels=MULTICOPTER,
             multicopter=gains,
         )

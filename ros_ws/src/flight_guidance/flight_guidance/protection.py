@@ -34,6 +34,11 @@ def speed_floor(stall_speed: float) -> float:
     return FLOOR * stall_speed
 
 
+def _share(value: Scalar) -> Scalar:
+    xp = array_namespace(value)
+    return xp.minimum(xp.maximum(value, 0.0), 1.0)
+
+
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
     """Largest climb rate, m/s: ratio climb - (1 - ratio) sink, ratio = clip((V - 0.9 V_floor) /
     (0.1 V_floor), 0, 1).
@@ -41,8 +46,7 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
     Below the floor pitch flies the speed: at nine tenths of the floor the aircraft sinks at the
     largest rate.
     """
-    xp = array_namespace(speed)
-    ratio = xp.minimum(xp.maximum((speed - 0.9 * floor) / (0.1 * floor), 0.0), 1.0)
+    ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
     return ratio * climb - (1.0 - ratio) * sink
 
 
@@ -52,8 +56,7 @@ def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scal
 
     The mirror of `climb_limit`: beyond the largest airspeed pitch flies the speed.
     """
-    xp = array_namespace(speed)
-    ratio = xp.minimum(xp.maximum((1.1 * largest - speed) / (0.1 * largest), 0.0), 1.0)
+    ratio = _share((1.1 * largest - speed) / (0.1 * largest))
     return (1.0 - ratio) * climb - ratio * sink
 
 
@@ -70,7 +73,6 @@ def climb_range(
     climb to 0.4 rad/s.
     """  # noqa: D400, D415 - what follows is an equation
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
-    xp = array_namespace(shortfall)
     ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
-    least, largest = (xp.minimum(xp.maximum(2.0 - ratio, 0.0), 1.0) for ratio in ratios)
+    least, largest = (_share(2.0 - ratio) for ratio in ratios)
     return -sink * least, climb * largest

@@ -166,12 +166,16 @@ def number_of(text: str | None) -> float | str | None:
         return text
 
 
+def is_position(value: Any) -> bool:
+    """Whether a value is a list of two or three."""
+    return isinstance(value, list) and 2 <= len(value) <= 3
+
+
 def lon_lat(
     position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = ""
 ) -> Place:
     """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
-    fits = isinstance(position, list) and 2 <= len(position) <= 3
-    require(fits, "route", short_repr(position), "longitude, latitude, altitude")
+    require(is_position(position), "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
     return Place(
         "route",

@@ -32,7 +32,7 @@ POINTS = 64
 
 
 class Ways(NamedTuple):
-    """The map: the aim of each cell, and whether the straight way onto the orbit round home is
+    """The map: the aim of a cell, and whether the straight way onto the orbit round home is
     free; shapes (rows, columns).
     """
 
@@ -118,8 +118,9 @@ def ways(fence: Fence) -> Ways:
     to_go, following = _shortest(seeds, room, cost, cell)
     leads_home = np.isfinite(to_go)
     if (lost := is_open & ~leads_home).any():
-        roomiest = lost & (room >= _largest_neighbour(np.where(lost, room, -math.inf)))
-        _, held = _shortest(roomiest, np.where(lost, room, -math.inf), cost, cell)
+        lost_room = np.where(lost, room, -math.inf)
+        roomiest = lost & (room >= np.max(_neighbours(lost_room, -math.inf), axis=0))
+        _, held = _shortest(roomiest, lost_room, cost, cell)
         following = np.where(lost, held, following)
     following = np.where(~is_open & (room >= 0.0), _uphill(room), following)
     ahead = following
@@ -163,16 +164,12 @@ def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
-    """The values of the neighbour at each of STEPS; `fill` beside the map."""
+    """The values of the neighbours at STEPS; `fill` beside the map."""
     padded = np.pad(values, 1, constant_values=fill)
     rows, columns = values.shape
     return [
         padded[1 + row : 1 + row + rows, 1 + column : 1 + column + columns] for row, column in STEPS
     ]
-
-
-def _largest_neighbour(values: FloatArray) -> FloatArray:
-    return np.asarray(np.max(_neighbours(values, -math.inf), axis=0))
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
@@ -219,7 +216,7 @@ def _shortest(
 def _nearest(
     north: FloatArray, east: FloatArray, to_north: FloatArray, to_east: FloatArray
 ) -> NDArray[np.intp]:
-    """Number of the nearest of places for each place."""
+    """Number of the nearest of places for a place."""
     rows = [
         np.argmin((to_north - n) ** 2 + (to_east - e) ** 2)
         for n, e in zip(north, east, strict=True)
