@@ -23,7 +23,7 @@ from flight_design.gains.airframe_properties import airframe_facts, output_coord
 PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(
     Path(__file__).with_name("published_airframes.yaml").read_text()
 )
-NAVION, F4C = PUBLISHED.values()
+NAVION, F4C, B747 = PUBLISHED.values()
 
 
 def airframe(values: Mapping[str, Any]) -> Airframe:
@@ -65,6 +65,16 @@ def states(**units: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     return lambda values: {"states": values["states"] | units}
 
 
+def first_input(**values: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """A change of the unit or the sign of the first input."""
+
+    def change(frame: Mapping[str, Any]) -> dict[str, Any]:
+        name, channel = next(iter(frame["inputs"].items()))
+        return {"inputs": frame["inputs"] | {name: channel | values}}
+
+    return change
+
+
 WRONG: dict[str, tuple[dict[str, Any], Callable[[Mapping[str, Any]], dict[str, Any]],
 tuple[str, ...]]] = {
     "transposed": (NAVION, lambda v: {"A": np.transpose(v["A"]).tolist()}, ("A is transposed",)),
@@ -77,11 +87,17 @@ tuple[str, ...]]] = {
     "SI declared ft/s": (NAVION, states(V="ft/s", w="ft/s"), ("feet and metres",)),
     "alpha as w": (NAVION, states(w="rad"),
     ("states.w: found rad, expected a speed", "alpha perhaps")),
-    "elevator per rad declared deg": (
-        NAVION,
-        lambda v: {"inputs": v["inputs"] | {"elevator": {"unit": "deg", "positive": "nose down"}}},
-        ("inputs.elevator.unit", "B is per rad, and the unit deg?"),
-    ),
+    "elevator per rad declared deg": (NAVION, first_input(unit="deg"),
+    ("inputs.elevator.unit", "B is per rad, and the unit deg?")),
+    "elevator per crad declared rad": (B747, first_input(unit="rad"),
+    ("B is per crad, and the unit rad?",)),
+    "elevator named nose up": (B747, first_input(positive="nose up"),
+    ("correct `positive`, or the sign of the column elevator",)),
+    "columns of B": (B747, exchanged("B", 2, 3, axis=1), ("order elevator, thrust, aileron",)),
+    "crad declared rad": (B747, states(q="rad/s", theta="rad"), ("crad and rad are mixed up",)),
+    "crad declared deg": (B747, states(q="deg/s", theta="deg"), ("crad and deg are mixed up",)),
+    "name of a book": (NAVION, lambda v: {"states": {"VT": "ft/s", "w": "m/s", "q": "rad/s",
+    "theta": "rad"}, "outputs": ["q", "VT"]}, ("states.VT: found VT, expected V:",)),
     "sign of the elevator": (NAVION, lambda v: {"B": (np.array(v["B"]) * [-1.0, 1.0]).tolist()},
     ("q_dot = 11.04",)),
     "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]},
@@ -107,7 +123,7 @@ def test_shipped_airframes_are_not_refused(name: str) -> None:
     check_identities(load_airframe(name))
 
 
-@pytest.mark.parametrize("values", [NAVION, F4C], ids=["navion", "f4c"])
+@pytest.mark.parametrize("values", PUBLISHED.values(), ids=PUBLISHED)
 def test_textbook_matrices_are_not_refused(values: dict[str, Any]) -> None:
     assert airframe(values).matrix_a().shape == (len(values["A"]),) * 2
 

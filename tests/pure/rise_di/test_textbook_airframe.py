@@ -8,20 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.signal import StateSpace
 
 from rise_di import own_airframe
 
-# of beta, r, p, phi in rad and s
-A = np.array(
-    [
-        [-0.0558, -0.9968, 0.0802, 0.0415],
-        [0.598, -0.115, -0.0318, 0.0],
-        [-3.05, 0.388, -0.465, 0.0],
-        [0.0, 0.0805, 1.0, 0.0],
-    ]
-)
-B = np.array([[0.00729, 0.0], [-0.475, 0.00775], [0.153, 0.143], [0.0, 0.0]])  # rudder, aileron
+TABLES = Path(__file__).parents[1] / "published_airframes.yaml"
 
 
 def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
@@ -32,6 +24,9 @@ def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
     # 1.7 degrees of sideslip. One size of the commands and no samples: a quarter of the time.
     monkeypatch.setattr(own_airframe, "SIZES", (0.125,))
     monkeypatch.setattr(own_airframe, "SAMPLES", 0)
+    table = yaml.safe_load(TABLES.read_text())["b747"]
+    A = np.array(table["A"])[4:, 4:]  # of beta, r, p, phi in rad and s
+    B = np.array(table["B"])[4:, 2:]
     made = own_airframe.new_airframe(
         StateSpace(A, B, np.eye(4), np.zeros((4, 2))),
         folder=tmp_path,

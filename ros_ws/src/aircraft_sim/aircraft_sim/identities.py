@@ -4,14 +4,14 @@
 the size of a control.
 
 The names of the states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles,
-p, q, r angular rates, h a height; FRD axes. A state of a different name is not checked. Source of
-the identities: the linear equations of motion about straight flight, B. L. Stevens, F. L. Lewis,
-Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight,
-3rd ed. (1996), eq. (4.9,18).
+p, q, r angular rates, h a height; FRD axes. A state of a different name is not checked, but VT
+and further names of these are refused. Source of the identities: the linear equations of motion
+about straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003),
+sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import combinations
+from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,12 @@ KINDS = {
     **dict.fromkeys(("h", "altitude"), (LENGTH, "a height, as m or ft")),
 }
 """Dimension of the states that have a name of the field."""
+ALIASES = {
+    **dict.fromkeys(("VT", "Vt", "V_T", "vt", "Va", "TAS"), "V"),
+    **dict.fromkeys(("alfa", "aoa", "AoA"), "alpha"),
+    **dict.fromkeys(("P", "Q", "R", "Theta", "Phi", "Psi", "Alpha", "Beta"), ""),
+}
+"""Names of books for the states of KINDS; empty: the name in small letters."""
 OF_RATES = {
     "theta": "q r phi",
     "phi": "p q r theta phi",
@@ -93,6 +99,8 @@ FACTORS = {
     "knots and m/s": 3600.0 / 1852.0,
     "knots and ft/s": FOOT * 3600.0 / 1852.0,
     "km/h and m/s": 3.6,
+    "crad and rad": 100.0,
+    "crad and deg": np.pi / 1.8,
 }
 """Ratios of units that are taken for each other."""
 
@@ -134,19 +142,20 @@ class Finding(NamedTuple):
     actual: str
     expected: str
     mend: str = ""
+    mended: Model | None = None  # the model with the mend
 
 
 def check(model: Model) -> None:
-    """Raise ParameterError for the first contradiction, with the rearrangement of A or B that mends
-    every contradiction.
+    """Raise ParameterError for the first contradiction, with the first mend of every contradiction:
+    the finding's own, else a rearrangement of A or B.
     """
     findings = list(contradictions(model))
     if not findings:
         return
-    key, actual, expected, mend = findings[0]
-    mend = next(
-        (text for text, changed in rearranged(model) if not any(contradictions(changed))), mend
-    )
+    key, actual, expected, mend, mended = findings[0]
+    simplest = [] if mended is None else [(mend, mended)]
+    mends = chain(simplest, rearranged(model))
+    mend = next((text for text, changed in mends if not any(contradictions(changed))), mend)
     way_out = f": {mend}" if mend else ""
     skip = "(identities: false in the file skips this check)"
     raise ParameterError(
@@ -175,6 +184,12 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
         "A is transposed: write a row a state derivative, a column a state",
         model._replace(file_A=A.T),
     )
+    for order in _orders(len(inputs)):
+        listed = ", ".join(inputs[k] for k in order)
+        yield (
+            f"the columns of B have the order {listed}",
+            model._replace(file_B=B[:, np.argsort(order)]),
+        )
     one_order = "A and B need one order of the states"
     for order in _orders(len(A)):
         listed = ", ".join(names[k] for k in order)
@@ -188,12 +203,6 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
         yield f"the rows of B have the order {listed}: {one_order}", model._replace(file_B=B[place])
         both = model._replace(file_A=A[np.ix_(place, place)])
         yield f"A has the states in the order {listed}, unlike B: {one_order}", both
-    for order in _orders(len(inputs)):
-        listed = ", ".join(inputs[k] for k in order)
-        yield (
-            f"the columns of B have the order {listed}",
-            model._replace(file_B=B[:, np.argsort(order)]),
-        )
 
 
 def _orders(count: int) -> Iterator[list[int]]:
@@ -206,6 +215,9 @@ def _orders(count: int) -> Iterator[list[int]]:
 
 def _dimensions(model: Model) -> Iterator[Finding]:
     for name, unit in model.states.items():
+        if name in ALIASES:
+            known = ALIASES[name] or name.lower()
+            yield Finding(f"states.{name}", name, f"{known}: the name by which a state is checked")
         dimension, words = KINDS.get(name, (None, ""))
         if dimension is not None and quantity(unit).dimension != dimension:
             near = {"w": "alpha", "v": "beta", "alpha": "w", "beta": "v"}.get(name)
@@ -260,11 +272,15 @@ def _mend(ratio: float) -> str:
         return "the entry is missing"
     sign = "the sign is reversed" if ratio < 0.0 else ""
     size = abs(ratio)
-    for words, factor in FACTORS.items():
-        if min(abs(size / factor - 1.0), abs(size * factor - 1.0)) < 0.06:
-            return f"{words} are mixed up, give each state the unit that A has" + (
-                ", and " + sign if sign else ""
-            )
+    away = {
+        words: min(abs(size / factor - 1.0), abs(size * factor - 1.0))
+        for words, factor in FACTORS.items()
+    }
+    nearest = min(away, key=lambda words: away[words])
+    if away[nearest] < 0.06:
+        return f"{nearest} are mixed up, give each state the unit that A has" + (
+            ", and " + sign if sign else ""
+        )
     return sign
 
 
@@ -317,11 +333,14 @@ def _effects(model: Model) -> Iterator[Finding]:
                 if value
                 else "the entry is missing"
             )
+            reversed_column = np.where(np.arange(len(model.inputs)) == k, -1.0, 1.0)
+            mended = model._replace(file_B=model.file_B * reversed_column)
             yield Finding(
                 f"inputs.{name}",
                 f"{row}_dot = {value:.4g} {name} beside {phrase!r}",
                 f"{'more' if sign > 0 else 'less'} than 0",
                 mend,
+                mended if _moves_most(model, row, k) else None,
             )
 
 
@@ -343,12 +362,29 @@ def _strengths(model: Model) -> Iterator[Finding]:
         )
         ratio = abs(float(model.matrix_b()[i, k])) / scale if scale > 0.0 else least
         if not least <= ratio <= most:
-            large = ratio > most
-            mend = "B is per rad, and the unit deg?" if large else "B is per deg, and the unit rad?"
+            mend = ""
+            mended = None
+            declared = model.inputs[k]
+            for unit in (*model.states.values(), "deg", "rad"):
+                factor = quantity(declared).si / quantity(unit).si
+                if quantity(unit).dimension == ANGLE and least <= ratio * factor <= most:
+                    mend = f"B is per {unit}, and the unit {declared}?"
+                    mended = model._replace(
+                        inputs=(*model.inputs[:k], unit, *model.inputs[k + 1 :])
+                    )
+                    break
             known = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
             yield Finding(
                 f"inputs.{name}.unit",
                 f"{rate}_dot = {model.matrix_b()[i, k]:.3g} {name} in SI",
                 known,
                 mend,
+                mended,
             )
+
+
+def _moves_most(model: Model, row: str, k: int) -> bool:
+    """Whether no control surface moves a state at once by more than input k."""
+    effects = np.abs(model.matrix_b()[list(model.states).index(row)])
+    surfaces = [name in model.angular for name in model.effects]
+    return bool(effects[k] >= np.max(effects[surfaces], initial=0.0))
