@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.signal import StateSpace
 
-from rise_di import own_airframe
+from rise_di import own_airframe, select_gains
 
 TABLES = Path(__file__).parents[1] / "published_airframes.yaml"
 
@@ -37,6 +37,9 @@ def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
         outputs="p, r",
         text="NASA CR-2144",
     )
+    # the command of the header of the scenario
+    again = select_gains(made.airframe_file, made.scenario_file, samples=0).chosen
+    assert dict(zip(again.outputs, again.inputs, strict=True)) == {"p": "aileron", "r": "rudder"}
     assert made.note.endswith("paired by C B: p by aileron, r by rudder")
     assert "The first flight has aileron at 100 % of its end stop: the gusts ask for it" in (
         made.shortfall

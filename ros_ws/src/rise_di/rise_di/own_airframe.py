@@ -177,8 +177,6 @@ def _flying(
     `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text
     names them.
     """
-    square = len(airframe.inputs) == len(airframe.outputs)
-    inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)] if square else []
     shortfall = ""
     scenario = ""
     controller = first_flight.placeholder(airframe, lag)
@@ -189,9 +187,7 @@ def _flying(
                 airframe, str(path), str(files[1]), section, lag, size
             )
 
-        selection = select_gains(
-            trial, _parsed(text(trial, controller), files[1]), inputs=inputs, samples=SAMPLES
-        )
+        selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
         section = gain_yaml.as_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)

@@ -102,7 +102,7 @@ def select_gains(
             the scenario.
         delay: Pure delay in s; None: that of the scenario.
         inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty:
-            the airframe's.
+            those of the scenario, else the airframe's.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -144,7 +144,8 @@ def select_gains(
     loop = _mixed(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame, mixing)
     seen = through_allocation(frame, loop.base)
     setting = loop._replace(
-        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order"),
+        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order")
+        or _pairing(chosen.controller, seen),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
@@ -321,6 +322,14 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
                 for value, name in zip(bounds, loop.base.inputs, strict=True)
             )
     return loop._replace(base=loop.base.model_copy(update=limits))
+
+
+def _pairing(controller: ControllerConfig, seen: Airframe) -> tuple[str, ...]:
+    """Input of each output of an airframe by a controller of the same names, else ()."""
+    pairs = dict(zip(controller.outputs, controller.inputs, strict=True))
+    inputs = tuple(pairs.get(name, "") for name in seen.outputs)
+    same = controller.allocation is None and sorted(inputs) == sorted(seen.inputs)
+    return inputs if same else ()
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
