@@ -67,7 +67,7 @@ from flight_design.identification.step_responses import Responses, step_response
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import coupling
 from rise_di_controller.law import total_lag
-from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
+from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
 
 # The step tests
 
@@ -356,7 +356,8 @@ def that_learns(
     noise = np.array([NOISE[output] for output in start.outputs])
     rough = _in_law_order(Omega, start)
     sketched = with_sketch(start, name, rough, condition.speed, noise, margin)
-    return replace(selection, chosen=sketched.model_copy(update={"learn": LearnConfig()}))
+    learn = LearnConfig(prior=PriorConfig(sketch=True))
+    return replace(selection, chosen=sketched.model_copy(update={"learn": learn}))
 
 
 def without_beta(scenario: Scenario) -> Scenario:
