@@ -75,10 +75,10 @@ function view(t, v, [from, to], most) {
   return {x: indices.map(k => t[k]), y: indices.map(k => v[k])};
 }
 
-async function views(data) { // of the traces that the page decimates, by index; a trace may have the view of the whole flight
+async function views(data) { // of the traces that the page decimates, by index
   const [from, to] = range ?? [-Infinity, Infinity], margin = range ? MARGIN * (to - from) : 0;
   const wide = [from - margin, to + margin];
-  const long = [...data.entries()].filter(([, {meta, x}]) => meta && (range || !x));
+  const long = [...data.entries()].filter(([, {meta}]) => meta);
   return new Map(await Promise.all(long.map(
     async ([index, {meta}]) => [index, view(await samples(meta.t), await samples(meta.v), wide, meta.most)])));
 }

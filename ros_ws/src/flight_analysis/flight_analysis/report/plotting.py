@@ -4,9 +4,8 @@
 
 The figures of a page share the time axis and the margins, so the subplots line up. A figure holds
 short curves. `SampleStore` holds the samples of longer curves: the page decimates the samples to
-the view. A figure also holds the extremes of a very long curve, since the page takes long to unpack
-the samples. Of a curve of more than MAX_STORED samples the page has the smallest and the largest
-value of each bin of time alone; the figures in numbers are of all samples.
+the view. Of a curve of more than MAX_STORED samples the page has the smallest and the largest value
+of each bin of time alone; the figures in numbers are of all samples.
 """
 
 import base64
@@ -30,10 +29,9 @@ T = TypeVar("T", bound=np.generic)
 MAX_POINTS = 2400
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
-# samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
-MAX_READ = 100_000
-# samples of a curve on a page, of 400 s at 500 Hz: with all of them an hour of flight has 141 MB
-MAX_STORED = 200_000
+# samples of a curve on a page, of 120 s at 500 Hz, 25 times MAX_POINTS for zooms: with all of
+# them an hour of flight has 141 MB
+MAX_STORED = 60_000
 # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
 # digits of a hover
 MANTISSA = 16
@@ -315,39 +313,12 @@ def _trace(
     )
     if len(values) <= most:
         return trace | {"x": t_ns / NANOSECONDS, "y": values}
-    trace |= {
-        "meta": {
-            "t": context.samples.times(t_ns),
-            "v": context.samples.values(values),
-            "most": most,
-        }
+    meta = {
+        "t": context.samples.times(t_ns),
+        "v": context.samples.values(values),
+        "most": most,
     }
-    if len(values) <= MAX_READ:
-        return trace
-    rows = extremes(values, most)
-    return trace | {
-        "x": (t_ns[rows] / NANOSECONDS).astype(np.float32),
-        "y": values[rows].astype(np.float32),
-    }
-
-
-def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
-    """Rows of the minimum, the maximum and the first NaN in `most` / 2 bins, as the page decimates
-    a view.
-    """
-    width = -(-len(values) // (most // 2))
-    bins = _bins(values, width)
-    gaps = np.isnan(bins)
-    below, above = (
-        (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins))
-        if gaps.any()
-        else (bins, bins)
-    )
-    low = below.argmin(axis=1)
-    high = above.argmax(axis=1)
-    gap = np.where(gaps.any(axis=1), gaps.argmax(axis=1), low)
-    rows = np.unique(np.array([low, high, gap]) + width * np.arange(len(bins)))
-    return rows[rows < len(values)]
+    return trace | {"meta": meta}
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:

@@ -10,21 +10,25 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
+# samples of a window, 82 s at 100 Hz: the frequencies of a long flight are as many as of 14 min
+MAX_WINDOW = 8192
+
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values
     in unit / sqrt(Hz).
 
-    The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample
-    repeats the last sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length.
-    The square of the density, integrated over the frequencies, is the variance. Source: Welch 1967.
+    The Hann windows span a tenth of the flight, at most MAX_WINDOW, overlap by half, without the
+    mean. A missing sample repeats the last sample, for LONGEST_INTERVAL at most: a gap of the log
+    may be of any length. The square of the density, integrated over the frequencies, is the
+    variance. Source: Welch 1967.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
     places = np.cumsum(np.minimum(np.diff(places, prepend=0), longest))
     grid = np.arange(places[-1] + 1)
     held = signal.values[np.searchsorted(places, grid, side="right") - 1]
-    window = max(len(grid) // 10, min(len(grid), 256))
+    window = max(min(len(grid) // 10, MAX_WINDOW), min(len(grid), 256))
     frequency, power = _welch(held, 1e9 / period_ns, window)
     return frequency[1:], dict(zip(signal.names, np.sqrt(power[1:]).T, strict=True))
 
