@@ -79,8 +79,7 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
     yield row(
         f"{name}: share within {100 * (within - 1.0):.0f} % of the true model", share, at_least=near
     )
-    file = [each for each in chosen if not math.isnan(each.file)]
-    worse = float(np.mean([each.learner > WORSE * each.file for each in file])) if file else 0.0
+    worse = float(np.mean([each.learner > WORSE * each.file for each in chosen]))
     yield row(f"{name}: share 5 % worse than the model of the file", worse, at_most=0.05)
     margins = [each.margin for each in chosen]
     yield row(f"{name}: least delay margin left", min(margins), "s", at_least=0.0)
