@@ -138,6 +138,7 @@ def test_recording_flight_followed_to_end(browser: Browser, recorded: Path, tmp_
     with serving(tmp_path) as address:
         browser.open(address)
         browser.wait_for(f"{STATE} === 'WAITING'")
+        assert browser.run(TIME) == 0
         with path.open("ab") as recorder:  # as a recorder, it never makes the file shorter
             recorder.write(content[: len(content) // 2])
             recorder.flush()

@@ -1,8 +1,10 @@
 // The tapes of the instruments: airspeed and altitude over their commands, and the heading.
 import {prepared} from "./canvas.js";
 import {ticks} from "./charts.js";
+import {fixed} from "./units.js";
 
 const BOX = 22; // px, height of the box with the value
+const EDGE = 7; // px, within which a label would be cut
 const HEADING_SPAN = 90; // deg, that the heading tape shows
 
 function boxed(ctx, text, x, y, width, colour) {
@@ -41,10 +43,10 @@ export function drawTape(canvas, {name, unit, value, command, span, right}, colo
     ctx.moveTo(right ? width : 0, y(mark));
     ctx.lineTo(right ? width - 6 : 6, y(mark));
     ctx.stroke();
-    ctx.fillText(text, right ? width - 9 : 9, y(mark));
+    if (Math.abs(y(mark) - middle) < (height - top) / 2 - EDGE) ctx.fillText(text, right ? width - 9 : 9, y(mark));
   }
   ctx.restore();
-  boxed(ctx, value.toFixed(span < 50 ? 1 : 0), width / 2, middle, width - 14, colour);
+  boxed(ctx, fixed(value, span < 50 ? 1 : 0), width / 2, middle, width - 14, colour);
   if (!Number.isFinite(command)) return;
   const at = Math.min(Math.max(y(command), top + 5), height - 5), edge = right ? width : 0, inwards = right ? -1 : 1;
   ctx.fillStyle = colour("--reference"); // the command: a notch at the edge, at the end of the tape where it is beyond

@@ -75,7 +75,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
     if (!recording) seek(Number.isFinite(ASKED) ? ASKED : begin());
   }
   if (clock.live) {
-    clock.t = end();
+    clock.t = flight.end > -Infinity ? flight.end : 0;
     clock.live = flight.head.state !== "ended";
   }
   if (flight.head.control) offer();
@@ -324,11 +324,11 @@ function drawReadouts() {
     values.guidance = named("mode", guidance) ?? "-";
     values.holds = ["mode.lateral", "mode.vertical"].map(name => named(name, guidance) ?? "-").join(", ");
     const at = name => guidance.at(name, clock.t), leg = at("leg"), after = flight.info.to_end?.[leg];
-    const last = leg + 1 >= (flight.info.to_end?.length ?? Infinity); // the last orbit has no end
+    const onRoute = named("mode.lateral", guidance) === "ROUTE", last = leg + 1 >= (flight.info.to_end?.length ?? Infinity); // the last orbit has no end
     const toGo = distance => `${distanceText(units, distance)}, ${minutes(distance / Math.max(pose?.speed, 1))}`;
-    values.leg = !Number.isFinite(leg) ? "-" : last || !Number.isFinite(at("to_go")) ? leg.toFixed(0) : `${leg}: ${toGo(at("to_go"))}`;
+    values.leg = !Number.isFinite(leg) || !onRoute ? "-" : last || !Number.isFinite(at("to_go")) ? leg.toFixed(0) : `${leg}: ${toGo(at("to_go"))}`;
     values["cross-track"] = shownAs(units.near, at("xtrack"), 1);
-    values["route to go"] = last || after === undefined ? "-" : toGo(at("to_go") + after);
+    values["route to go"] = last || !onRoute || after === undefined ? "-" : toGo(at("to_go") + after);
   }
   const toNorth = guidance?.at("wind.north", clock.t), toEast = guidance?.at("wind.east", clock.t);
   if (Number.isFinite(toNorth) && Number.isFinite(toEast)) values.wind = windText(units, toNorth, toEast);

@@ -188,7 +188,7 @@ export class Scene {
     ctx.fillRect(0, 0, width, height);
     const pose = poseAt(flight, t);
     if (!pose) {
-      this.say(ctx, width, height, flight.get("pose")?.count ? "NO POSE YET" : "NO POSE IN THE LOG", colour);
+      this.say(ctx, width, height, flight.get("pose")?.count || flight.series?.size === 0 ? "NO POSE YET" : "NO POSE IN THE LOG", colour);
       return;
     }
     const map = this.mode === "map", eye = map ? null : this.eye(pose);
@@ -205,7 +205,10 @@ export class Scene {
     if (map) takeMarks(labels, width, height);
     for (const beside of others) {
       const placed = poseAt(beside.flight, beside.t), at = placed && see(placed.place);
-      if (!at) continue;
+      if (!at) {
+        if (map && beside.name) this.legend += `${beside.name}: no pose yet `;
+        continue;
+      }
       this.aircraft(ctx, see, placed, deflections(beside.flight, beside.t), colour, beside.name ? 0.7 : 0.35);
       labels.add(beside.name, at.slice(0, 2), colour("--ghost"), {needed: true});
     }

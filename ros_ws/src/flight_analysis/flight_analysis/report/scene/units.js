@@ -11,9 +11,12 @@ export const UNITS = {
   "ft, kt": {speed: KNOTS, ...FEET},
 };
 
+// A number with so many digits; 0 has no sign.
+export const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]+$)/, "");
+
 // A value with its unit; "-" without a value.
 export function shownAs({unit, factor}, value, digits) {
-  return Number.isFinite(value) ? `${(value * factor).toFixed(digits)} ${unit}` : "-";
+  return Number.isFinite(value) ? `${fixed(value * factor, digits)} ${unit}` : "-";
 }
 
 // A distance in the near unit, or from 1000 m on in the far one.
