@@ -174,22 +174,14 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     assert slowed * speed * rolled < ahead < speed * (rolled + longest / 63.0)
 
 
+def motion(north: float, east: float, course: float = 0.0) -> Motion:
+    """Of an osprey with level wings in calm air."""
+    x, y, phi = np.array([north, east, 0.0])
+    return Motion(x, y, phi, course, 25.0, (0.0, 0.0), math.radians(30.0), 0.35, 0.4)
+
+
 def test_turn_begins_at_last_moment() -> None:
     fence = Fence((FIELD,), (200.0, 0.0))
-    bank = math.radians(30.0)
-
-    def motion(north: float, east: float, course: float = 0.0) -> Motion:
-        return Motion(
-            np.float64(north),
-            np.float64(east),
-            np.float64(0.0),
-            course,
-            25.0,
-            (0.0, 0.0),
-            bank,
-            0.35,
-            0.4,
-        )
 
     def action(north: float, before: float = 0.0, course: float = 0.0) -> float:
         return float(last_safe_turn(fence, before, motion(north, 0.0, course)).action)
@@ -286,21 +278,9 @@ def test_outside_is_a_state_of_its_own() -> None:
     of flight inside.
     """
     fence = Fence((FIELD,), (0.0, 0.0))
-    bank = math.radians(30.0)
 
     def escape(north: float, before: float, heading: float = 0.0) -> Escape:
-        motion = Motion(
-            np.float64(north),
-            np.float64(0.0),
-            np.float64(0.0),
-            heading,
-            25.0,
-            (0.0, 0.0),
-            bank,
-            0.35,
-            0.4,
-        )
-        return last_safe_turn(fence, before, motion)
+        return last_safe_turn(fence, before, motion(north, 0.0, heading))
 
     assert (float(escape(1400.0, 0.0).action), bool(escape(1400.0, 0.0).begins)) == (BACK, True)
     # south
@@ -317,10 +297,7 @@ def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
     turn leaves by 200 m.
     """
     funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
-    phi = np.float64(0.0)
-    bank = math.radians(30.0)
-    motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
-    escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion)
+    escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion(0.0, 0.0))
     assert 5.0 < float(escape.predicted) < 12.5
     assert float(escape.action) == HOME
 

@@ -26,9 +26,9 @@ from flight_bringup.graph import GUIDANCE, second_stage
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_guidance import guidance, guidance_state, modes
+from flight_guidance import guidance, modes
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Mode, Vertical
+from flight_guidance.guidance_state import Lateral, Mode, Vertical
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
 from flight_guidance.protection import climb_range
@@ -210,7 +210,7 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     assert made.step(6500 * MS, 6500 * MS) is not None
     state = made.state
     assert state is not None
-    assert (state.lateral, state.target.phi) == (guidance_state.Lateral.PHI, 0.0)
+    assert (state.lateral, state.target.phi) == (Lateral.PHI, 0.0)
     assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
 
 
@@ -241,49 +241,46 @@ def test_new_route_voids_legs_of_program() -> None:
     assert signal["target.V"][-1] == 26.0
 
 
-@pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
+SWITCHES = pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
+
+
+def switch(made: Guidance, by: str, *, on: bool) -> None:
+    if by == "guidance/engage":
+        made.engage(engaged=on)
+    else:
+        made.pause(paused=not on, forget=not on)
+
+
+@SWITCHES
 def test_route_waits_for_engagement(by: str) -> None:
     """A route sent while guidance is off is flown from the engagement on."""
     made = flying()
-
-    def switch(*, on: bool) -> None:
-        if by == "guidance/engage":
-            made.engage(engaged=on)
-        else:
-            made.pause(paused=not on, forget=not on)
-
     made.take_route(northwards())
-    assert run(made, 1, 2)["mode.lateral"][0] == guidance_state.Lateral.ROUTE
-    switch(on=False)
-    switch(on=True)  # the route that was flown before is not flown on
-    assert run(made, 2, 3)["mode.lateral"][0] != guidance_state.Lateral.ROUTE
-    switch(on=False)
+    assert run(made, 1, 2)["mode.lateral"][0] == Lateral.ROUTE
+    switch(made, by, on=False)
+    switch(made, by, on=True)  # the route that was flown before is not flown on
+    assert run(made, 2, 3)["mode.lateral"][0] != Lateral.ROUTE
+    switch(made, by, on=False)
     made.take_route(northwards(130.0))
     made.take_target({"V": 27.0})
-    switch(on=True)
+    switch(made, by, on=True)
     signal = run(made, 3, 4)
-    assert (signal["mode.lateral"][0], signal["leg"][0]) == (guidance_state.Lateral.ROUTE, 0.0)
+    assert (signal["mode.lateral"][0], signal["leg"][0]) == (Lateral.ROUTE, 0.0)
     # at the begin of the leg
     assert (signal["target.altitude"][0], signal["target.V"][0]) == (100.0, 25.0)
 
 
-@pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
+@SWITCHES
 def test_commands_while_disengaged_are_void(by: str) -> None:
     """Commands given while guidance did not fly are not flown afterwards."""
     made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
     made.take_target({"altitude": 300.0})
-    if by == "guidance/engage":
-        made.engage(engaged=False)
-    else:
-        made.pause(paused=True, forget=True)
+    switch(made, by, on=False)
     for k in range(1, 5):
         made.take_y(StampedVector(20 * MS * k, np.zeros(4)), 20 * MS * k)
         assert made.step(20 * MS * k, 20 * MS * k) is None
     made.take_target({"V": 27.0})
-    if by == "guidance/engage":
-        made.engage(engaged=True)
-    else:
-        made.pause(paused=False, forget=False)
+    switch(made, by, on=True)
     made.take_target({"climb": 1.0})  # from now on
     made.take_pose(pose(100 * MS), 100 * MS)
     signal = run(made, 5, 6, np.zeros(4))

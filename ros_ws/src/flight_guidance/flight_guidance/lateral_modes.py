@@ -50,8 +50,8 @@ def lateral_bank(
         asked = (state.target.course, *course_and_speed(pose))
         if state.lateral is Lateral.HEADING:
             asked = (state.target.heading, state.psi, speed)
-        wanted = course_acceleration(*asked, params.k_chi)
-        return bank_for(wanted, path_angle(pose["climb"], speed), STEEPEST), NOWHERE, 0.0
+        angle = path_angle(pose["climb"], speed)
+        return bank_for(course_acceleration(*asked, params.k_chi), angle, STEEPEST), NOWHERE, 0.0
     if state.lateral is Lateral.ROUTE and route is not None:
         if state.joining:
             return _onto_leg(state, pose, speed, route, params)
@@ -67,8 +67,9 @@ def lateral_bank(
 
 def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
     """An orbit of at least the least radius, which grows as the largest bank falls in flight."""
-    radius = max(abs(orbit.radius), params.limits.radius)
-    return orbit._replace(radius=math.copysign(radius, orbit.radius))
+    return orbit._replace(
+        radius=math.copysign(max(abs(orbit.radius), params.limits.radius), orbit.radius)
+    )
 
 
 def _onto_leg(

@@ -410,8 +410,7 @@ def _pitch_within(
     """The commanded pitch, rad, within that of the climb rates to the least and the largest
     altitude.
     """
-    limits = params.limits
-    if not (math.isfinite(limits.lowest) or math.isfinite(limits.highest)):
+    if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
         return state.target.theta
     xp = array_namespace(speed)
     least, largest = (

@@ -438,8 +438,9 @@ class GuidanceConfig(NodeConfig):
         return dict(zip(self.outputs, self.natural_frequency, strict=True))
 
     def _gains(self, drag: float) -> MulticopterParams:
-        frequency = self._frequency()
-        return multicopter_rules.gains(frequency, self.bank, drag, self.roll_authority or math.inf)
+        return multicopter_rules.gains(
+            self._frequency(), self.bank, drag, self.roll_authority or math.inf
+        )
 
     def _multicopter_params(self, drag: float) -> GuidanceParams:
         """The numbers of the equations of a multicopter."""
