@@ -117,16 +117,3 @@ def test_ended_recording_opened_by_viewer_itself(recorded: Path) -> None:
         "found a recording that has ended, expected one in progress; viewers open its .mcap file"
         in ended.stderr
     )
-
-
-def test_a_missing_extra_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
-    (tmp_path / "foxglove.py").write_text("raise ModuleNotFoundError(name='foxglove')\n")
-    ended = subprocess.run(
-        command(recorded, "--foxglove"),
-        capture_output=True,
-        text=True,
-        check=False,
-        env={"PYTHONPATH": str(tmp_path)},
-    )
-    expected = "error: --foxglove: found no Python package foxglove, expected it: make foxglove\n"
-    assert (ended.returncode, ended.stderr) == (2, expected)

@@ -172,14 +172,13 @@ def test_failsafe_fills_the_header(browser: Browser, tmp_path: Path) -> None:
         assert (browser.run(mode), browser.run(alarm)) == ("ENGAGED", False)
         press(browser, "End")
         browser.wait_for(f"{alarm} && {mode} === 'HOLD'")
-        size = "parseFloat(getComputedStyle(document.getElementById('mode')).fontSize)"
-        assert browser.run(size) >= 20.0  # px, read from 2 m
+        assert browser.run("parseFloat(getComputedStyle(mode).fontSize)") >= 20.0  # px, from 2 m
         assert "flash" in browser.run(
             "getComputedStyle(document.querySelector('header')).animationName"
         )
         # a button is read in an alarm too
-        colours = "(({color, backgroundColor}) => [color, backgroundColor])"
-        assert len(set(browser.run(f"{colours}(getComputedStyle(units))"))) == 2
+        colours = "(({color, backgroundColor}) => color !== backgroundColor)"
+        assert browser.run(f"{colours}(getComputedStyle(units))")
         wide(browser, PHONE)
         # the longest state
         browser.run("void (document.getElementById('mode').textContent = 'ENGAGED DEAD RECKONING')")
@@ -188,9 +187,7 @@ def test_failsafe_fills_the_header(browser: Browser, tmp_path: Path) -> None:
 
 
 def test_readouts_and_gaps(browser: Browser, tmp_path: Path) -> None:
-    """A number below the noise reads 0, both cursors are read out, and a gap is left blank at each
-    zoom.
-    """
+    """A number below the noise reads 0, both cursors are read out, and a gap is left blank."""
     stamps = np.arange(4000, dtype=np.int64) * 10_000_000
     kept = (stamps < 10_000_000_000) | (stamps > 20_000_000_000)
     run = written(tmp_path / "run", np.ones(kept.sum()), stamps[kept])
@@ -209,12 +206,11 @@ def test_readouts_and_gaps(browser: Browser, tmp_path: Path) -> None:
     with shown(browser, run):
         browser.run(TEXTS)
         assert any(text.startswith("y_m 0") for text in texts(browser, chart))
-        for key in ("a", "w"):  # the whole flight, and a window of 20 s
-            press(browser, key)
-            assert texts(browser, chart)
-            if key == "a":  # the gap is from a quarter to a half of 40 s
-                assert browser.run(f"{inked}([0.32, 0.48])") == 0
-                assert browser.run(f"{inked}([0.10, 0.25])") > 50
+        press(browser, "a")
+        assert texts(browser, chart)
+        # the gap is from a quarter to a half of 40 s
+        assert browser.run(f"{inked}([0.32, 0.48])") == 0
+        assert browser.run(f"{inked}([0.10, 0.25])") > 50
         browser.run(
             "void document.querySelector('#charts canvas').dispatchEvent(new "
             "PointerEvent('pointermove', {clientX: document.querySelector('#charts "

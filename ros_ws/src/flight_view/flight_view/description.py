@@ -87,7 +87,7 @@ def mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, 
     """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north,
     east, altitude, m.
 
-    Raises ParameterError for a route that cannot be flown.
+    Raises ParameterError for a route with no way to fly.
     """
     drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
     return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}
