@@ -38,8 +38,8 @@ ASKED = 2.0
 then 40 deg from its bank, or 7 deg for MEMORY. A turn of the osprey onto a course asks for less."""
 
 IGNORED = 0.3
-"""Largest share of a command that counts as ignored. With aileron the c172p and the 737 of JSBSim
-have at least 1 in turbulence; the osprey without aileron has 0.05 at most."""
+"""Largest share of a command that counts as ignored. In strong turbulence the osprey, the c172p and
+the 737 of JSBSim have at least 0.8, with 0.3 of the aileron 0.75; without aileron 0.05 at most."""
 
 FOLLOWED = 0.7
 """Least share that counts as followed again. `attitude.yaw_for_bank` alone rolls with up to half of
