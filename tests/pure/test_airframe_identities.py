@@ -84,7 +84,6 @@ tuple[str, ...]]] = {
     ("V_dot = 9.81 theta", "sign is reversed")),
     "g in ft/s^2": (NAVION, scaled("A", 0, 3, 3.28084), ("expected -g = -9.81", "feet and metres")),
     "speed in ft/s": (NAVION, lambda _: {"speed": 176.0}, ("speed", "A fits 53.64 m/s")),
-    "SI declared ft/s": (NAVION, states(V="ft/s", w="ft/s"), ("feet and metres",)),
     "alpha as w": (NAVION, states(w="rad"),
     ("states.w: found rad, expected a speed", "alpha perhaps")),
     "elevator per rad declared deg": (NAVION, first_input(unit="deg"),
@@ -103,12 +102,8 @@ tuple[str, ...]]] = {
     "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]},
     ("no input moves theta at once",)),
     "pitch driven by its rate": (NAVION, scaled("A", 2, 2, -1.0), ("q_dot = 2.948 q", "air damps")),
-    "sign of v and r": (F4C, scaled("A", 0, 2, -1.0),
-    ("v_dot = 175.6 r", "-V0 = -178", "sign is reversed")),
-    "heading in deg": (F4C, states(psi="deg"), ("psi_dot = 0.01769 r", "degrees and radians")),
     "a state missing": (F4C, lambda v: {"states": {name: v["states"][name] for name in "vpr"}},
     ("expected 3 rows of 3",)),
-    "unknown unit": (F4C, states(v="furlong/h"), ("states.v: found 'furlong/h'", "ft/s^2")),
     "feedthrough": (F4C, lambda _: {"D": [[0.0, 0.0], [0.1, 0.0]]},
     ("D: found a feedthrough of 0.1", "take an output")),
     "output without a unit": (NAVION, lambda _: {"outputs": ["q", "n"], "C": [[0, 0, 1, 0]] * 2},
@@ -142,6 +137,19 @@ def test_wrong_airframe_is_told_in_one_sentence(mistake: str) -> None:
 def test_file_may_differ_on_purpose() -> None:
     values = NAVION | {"speed": 176.0, "identities": False}
     assert airframe(values).speed == 176.0
+
+
+def test_file_has_its_speed_with_a_unit_and_is_named_when_its_ending_is_wrong(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "navion.yaml"
+    path.write_text(yaml.safe_dump(NAVION | {"speed": "176 ft/s"}, sort_keys=False))
+    navion = load_airframe(path)
+    assert navion.speed == pytest.approx(53.6448)  # 176 * 0.3048
+    with refusing(f"found '.*navion.yml', expected {path}, which exists"):
+        load_airframe(path.with_suffix(".yml"))
+    with refusing("expected a gust of the airframe plane: none, write its key gusts"):
+        navion.gust_direction("vertical")
 
 
 def test_multirotor_in_hover_is_not_refused() -> None:

@@ -101,8 +101,8 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
             "error: flight.duration: found -1.0, expected greater than 0",
         ),
         (
-            ["fly", "--set", "wind.sigma=1"],
-            "error: --set: found 'wind.sigma=1', expected a parameter of the scenario and",
+            ["fly", "--set", "controler.k_g=1"],
+            "error: --set: found 'controler.k_g=1', expected a parameter of the scenario and its",
         ),
         (
             ["fly", "--set", "controller.k_g"],
@@ -117,6 +117,7 @@ def test_bad_input_is_one_sentence_and_status_2(
     shown = rise_di(*arguments, cwd=tmp_path)
     assert shown.returncode == 2
     assert shown.stderr.startswith(sentence)
+    assert ("the section is controller perhaps" in shown.stderr) == ("controler." in sentence)
     assert len(shown.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 

@@ -32,7 +32,7 @@ from flight_core.parameters import (
     Positive,
     require,
 )
-from flight_core.units import ANGLE, GRAVITY, quantity, si_per_unit
+from flight_core.units import ANGLE, GRAVITY, in_si, quantity, si_per_unit
 from flight_core.vectors import FloatArray, selection_matrix
 
 EXPECTED = "an airframe file"
@@ -90,7 +90,9 @@ class Airframe(Config):
 
     name: str
     source: str = Field(description="where the figures come from")
-    speed: NonNegative = Field(default=0.0, description="the trim speed V0, m/s; 0 in hover")
+    speed: NonNegative = Field(
+        default=0.0, description="the trim speed V0, m/s, or with a unit; 0 in hover"
+    )
     span: Positive | None = Field(
         default=None, description="the wing span b, m, for rotary gusts; none: not known"
     )
@@ -385,12 +387,9 @@ class Airframe(Config):
         Raises:
             ParameterError: The axis is not in the file.
         """
-        require(
-            gust in self.gusts,
-            "gusts",
-            f"{gust!r}",
-            f"a gust of the airframe {self.name}: {', '.join(self.gusts)}",
-        )
+        known = ", ".join(self.gusts) or "none, write its key gusts, as rise_di.new_airframe does"
+        expected = f"a gust of the airframe {self.name}: {known}"
+        require(gust in self.gusts, "gusts", f"{gust!r}", expected)
         direction = np.zeros(len(self.states))
         for state, value in self.gusts[gust].items():
             direction[self.index(state)] = value / self.speed
@@ -461,6 +460,8 @@ def _parsed(name: str, path: Path, content: bytes) -> Airframe:
     """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
+    if isinstance(speed := parsed.get("speed"), str):
+        parsed["speed"] = in_si(speed, f"airframe {name}: speed", "m/s")
     airframe = Airframe.validate_mapping(parsed, f"airframe {name}")
     check_identities(airframe)
     return airframe

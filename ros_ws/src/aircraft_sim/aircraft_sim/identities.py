@@ -27,12 +27,6 @@ KINDS = {
     **dict.fromkeys(("h", "altitude"), (LENGTH, "a height, as m or ft")),
 }
 """Dimension of the states that have a name of the field."""
-ALIASES = {
-    **dict.fromkeys(("VT", "Vt", "V_T", "vt", "Va", "TAS"), "V"),
-    **dict.fromkeys(("alfa", "aoa", "AoA"), "alpha"),
-    **dict.fromkeys(("P", "Q", "R", "Theta", "Phi", "Psi", "Alpha", "Beta"), ""),
-}
-"""Names of books for the states of KINDS; empty: the name in small letters."""
 OF_RATES = {
     "theta": "q r phi",
     "phi": "p q r theta phi",
@@ -215,8 +209,8 @@ def _orders(count: int) -> Iterator[list[int]]:
 
 def _dimensions(model: Model) -> Iterator[Finding]:
     for name, unit in model.states.items():
-        if name in ALIASES:
-            known = ALIASES[name] or name.lower()
+        known = "V" if name.lower() == "vt" else name.lower()  # as books have it
+        if name not in KINDS and known in KINDS:
             yield Finding(f"states.{name}", name, f"{known}: the name by which a state is checked")
         dimension, words = KINDS.get(name, (None, ""))
         if dimension is not None and quantity(unit).dimension != dimension:

@@ -9,7 +9,7 @@ from typing import Any
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_cli.words import option
 from flight_core.files import parse_yaml
-from flight_core.parameters import Config, nest, require
+from flight_core.parameters import Config, nest, one_of, require
 
 
 def settings_option() -> Any:
@@ -27,17 +27,11 @@ def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> d
         name, equals, value = text.partition("=")
         key = name.strip()
         section = key.partition(".")[0]
-        fits = (
-            bool(equals)
-            and section != key
-            and section in (SCHEMAS if owner == "scenario" else {owner})
-        )
-        require(
-            fits,
-            "--set",
-            repr(text),
-            f"a parameter of the {owner} and its value, as in controller.k_g=2.0",
-        )
+        sections = tuple(SCHEMAS) if owner == "scenario" else (owner,)
+        fits = bool(equals) and section != key and section in sections
+        expected = f"a parameter of the {owner} and its value, as in controller.k_g=2.0"
+        near = f"; the section is {one_of(sections, section)}"
+        require(fits, "--set", repr(text), expected + near * (section not in sections))
         require(key not in changes, "--set", "a parameter twice", "each once")
         changes[key] = parse_yaml(value, f"--set {text!r}", "a value")
     return changes

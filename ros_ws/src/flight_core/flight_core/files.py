@@ -179,7 +179,8 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
         expected = f"{expected}, from the folder {Path.cwd()}"
         if text.startswith(EXAMPLES) and not is_file(path):
             path = CHECKOUT / text
-    require(is_file(path), key, repr(text), expected)
+    near = Path(f"{text.removesuffix('.yml')}.yaml")
+    require(is_file(path), key, repr(text), f"{near}, which exists" if is_file(near) else expected)
     return path
 
 
