@@ -358,14 +358,12 @@ def _strengths(model: Model) -> Iterator[Finding]:
         if not least <= ratio <= most:
             mend = ""
             mended = None
-            declared = model.inputs[k]
+            units = model.inputs
             for unit in (*model.states.values(), "deg", "rad"):
-                factor = quantity(declared).si / quantity(unit).si
+                factor = quantity(units[k]).si / quantity(unit).si
                 if quantity(unit).dimension == ANGLE and least <= ratio * factor <= most:
-                    mend = f"B is per {unit}, and the unit {declared}?"
-                    mended = model._replace(
-                        inputs=(*model.inputs[:k], unit, *model.inputs[k + 1 :])
-                    )
+                    mend = f"B is per {unit}, and the unit {units[k]}?"
+                    mended = model._replace(inputs=(*units[:k], unit, *units[k + 1 :]))
                     break
             known = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
             yield Finding(

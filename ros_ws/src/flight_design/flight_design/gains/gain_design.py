@@ -144,7 +144,7 @@ def select_gains(
     loop = _mixed(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame, mixing)
     seen = through_allocation(frame, loop.base)
     setting = loop._replace(
-        inputs=_paired(inputs, chosen.controller, seen),
+        inputs=_pairing(inputs, chosen.controller, seen),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
@@ -323,19 +323,17 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
     return loop._replace(base=loop.base.model_copy(update=limits))
 
 
-def _paired(
+def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, seen: Airframe
 ) -> tuple[str, ...]:
-    """Input of each output of an airframe: `inputs`, else those of a controller of the same names,
-    else (). Raises ParameterError.
-    """
-    names = as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order")
-    if names:
-        return names
+    """Inputs as asked for, else of each output by a controller of the same names, else ()."""
+    asked = as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order")
+    if asked:
+        return asked
     pairs = dict(zip(controller.outputs, controller.inputs, strict=True))
-    names = tuple(pairs.get(name, "") for name in seen.outputs)
-    same = controller.allocation is None and sorted(names) == sorted(seen.inputs)
-    return names if same else ()
+    paired = tuple(pairs.get(name, "") for name in seen.outputs)
+    same = controller.allocation is None and sorted(paired) == sorted(seen.inputs)
+    return paired if same else ()
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
