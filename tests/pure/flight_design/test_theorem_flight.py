@@ -12,7 +12,12 @@ import pytest
 import yaml
 from tests.conftest import REPOSITORY
 
-from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, load_scenario
+from flight_analysis.closed_loop.scenario import (
+    Scenario,
+    limits_beyond_stops,
+    load_scenario,
+    opposite_signs,
+)
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
@@ -69,6 +74,14 @@ def test_written_gains_are_those_of_the_theorem(
     assert "by Theorem 1" in text
     np.testing.assert_allclose(section["beta"], selected.literal.beta, rtol=1e-5)
     assert section["Lambda"] == [1.0] * 4
+
+
+def test_signs_against_those_of_the_airframe_is_named() -> None:
+    servo: Scenario = find_scenario("osprey_servo")
+    assert opposite_signs(servo) == ()
+    D = [-sign for sign in servo.controller.D]
+    expected = f"controller.D: found {D}, expected {list(servo.controller.D)}, the signs of C B"
+    assert opposite_signs(servo.vary(controller={"D": D})) == (expected,)
 
 
 def test_limits_outside_end_stops_are_named() -> None:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from flight_analysis.closed_loop.learning_loop import Learn
-from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
+from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.report.run_folder import (
     new_run,
@@ -113,8 +113,9 @@ class Fly(RouteWords):
         stepping = self.lockstep or chosen.flight.lockstep
         autopilot = self._autopilot(stepping=stepping)
         _require_flyable(chosen, autopilot, in_process=self.in_process)
-        for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
-            warn(f"warning: {sentence}")
+        if autopilot is None:
+            for sentence in limits_beyond_stops(chosen) + opposite_signs(chosen):
+                warn(f"warning: {sentence}")
         learn = _learner(chosen)
         run = new_run(chosen, self.runs)
         self.context.call_on_close(partial(remove_empty, run))

@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
+from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.arguments import FilePath, as_instance, as_path
@@ -21,6 +24,7 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.zones import described
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
+from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -488,3 +492,24 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
     ):
         rate = f"a whole fraction of the rate of {what} ({NANOSECONDS / part_ns:g} Hz)"
         require(period % part_ns == 0, "guidance.rate", f"{guidance.rate:g} Hz", rate)
+
+
+def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
+    """A sentence where D contradicts the signs of C B of the airframe file: the law then drives y
+    away from y_m. None beside an allocation, or without an airframe file.
+    """
+    controller = scenario.controller
+    aircraft = scenario.aircraft
+    if aircraft.is_jsbsim or controller.allocation is not None:
+        return ()
+    airframe = load_airframe(aircraft.airframe)
+    rows = [airframe.outputs.index(name) for name in controller.outputs]
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    Omega = (airframe.matrix_c() @ airframe.matrix_b())[np.ix_(rows, columns)]
+    try:
+        expected = signs(Omega).astype(int).tolist()
+    except DecompositionError as error:
+        return (f"controller.inputs: {error}",)
+    if expected == list(controller.D):
+        return ()
+    return (f"controller.D: found {list(controller.D)}, expected {expected}, the signs of C B",)
