@@ -117,6 +117,10 @@ def test_box_ahead_is_flown_to_and_a_missed_box_goes_around(across: Scenario) ->
     beside = ahead | {"east": [5.0, 5.0, 20.0, 20.0]}
     lander, state, pose, route = low(section_with(across, touchdown=beside), 4.0)
     assert lander.commands(state, pose, route)["leg"] == 1.0
+    notices = section_with(across, touchdown=beside).notices()
+    around = dict.fromkeys(notices.CHANNELS, 0.0) | {"leg": 1.0}
+    text = "goes around: no touch at the end of leg 0 in guidance.touchdown"
+    assert [notice.text for notice in notices.take(1.0, around)] == [text]
 
 
 def test_lander_waits_above_the_flare_and_leaves_to_an_operator(across: Scenario) -> None:

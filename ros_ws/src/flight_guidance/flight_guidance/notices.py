@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, the fence, a flight carried back, a strong wind, a lost link,
-new limits.
+"""Notices of guidance: a missed leg, a go-around, the fence, a flight carried back, a strong wind,
+a lost link, new limits.
 
 The node logs the sentences as warnings; the summary of a flight takes the same sentences from the
 log.
@@ -15,6 +15,7 @@ from flight_core.channels import UNKNOWN
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
 from flight_guidance.guidance_state import LARGEST, Lateral
+from flight_guidance.landing import Landing
 from flight_guidance.reach import Authority
 
 DWELL = 10.0
@@ -88,7 +89,7 @@ class Notices:
     `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed
     command, m/s, the wind up to which circles fit into the bank; `link_timeout`:
     guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`; `largest_tilt`: that of a
-    multicopter, rad.
+    multicopter, rad; `landing`: that of the route.
     """
 
     CHANNELS = (
@@ -116,7 +117,9 @@ class Notices:
         link_timeout: float = math.inf,
         reach: Callable[[Authority], str] = lambda authority: "",
         largest_tilt: float = math.inf,
+        landing: Landing | None = None,
     ) -> None:
+        self._landing = landing
         self._largest_tilt = largest_tilt
         self._tilted = _Lasting(0.0)
         self._reach = reach
@@ -143,6 +146,9 @@ class Notices:
         texts = []
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
+        if self._landing is not None and before == self._landing.leg < self._leg:
+            box = "" if self._landing.box is None else " in guidance.touchdown"
+            texts.append(f"goes around: no touch at the end of leg {before}{box}")
         action = self._action
         self._action = log["fence.action"]
         if abs(self._action) == RIGHT and self._action != action:

@@ -368,7 +368,10 @@ class GuidanceConfig(NodeConfig):
             )
         reach_of = partial(reach_sentence, self.params())
         wind_of = partial(largest_wind, wind=self.wind, bank=self.bank)
-        return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of)
+        landing = None
+        if self.landing is not None:
+            landing = self.landing_on(self.plan(self.waypoints()))
+        return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of, landing=landing)
 
     def climb_limits(self) -> tuple[float, float]:
         """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and
