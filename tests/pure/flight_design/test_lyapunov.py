@@ -19,6 +19,7 @@ from tests.closed_loop import law_params
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_core.vectors import FloatArray
 from flight_design.gains.lyapunov import (
     Evidence,
     Example,
@@ -29,7 +30,6 @@ from flight_design.gains.lyapunov import (
     fly,
     from_tape,
     integral,
-    largest_rise,
     lemma_2,
 )
 from rise_di_controller.decomposition import decompose
@@ -78,6 +78,11 @@ def osprey(
 def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) -> float:
     """The largest absolute value past an instant."""
     return float(np.max(np.abs(signal[t > after])))
+
+
+def largest_rise(signal: FloatArray) -> float:
+    """max_(j<k) (s_k - s_j), 0 if the signal, (N,), never rises."""
+    return float(np.max(signal - np.minimum.accumulate(signal)))
 
 
 @pytest.mark.equation(48)

@@ -34,7 +34,6 @@ FMU = "rise_di.fmu"
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
-MAX_SETS = 64  # of proof.c
 LEAST_SAMPLES = 4  # kept: the slope of y_m spans two periods
 
 FLOAT32_BOUND = 2.0**-10

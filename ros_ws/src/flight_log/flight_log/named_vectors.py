@@ -34,7 +34,6 @@ WAYPOINT = ("number", "north", "east", "altitude")
 """Channels of a sample of a route: the number of the waypoint in its message, and m."""
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
-FRAME_ID = 16  # offset of the text, after its length
 MAX_FLIGHT_TIME = 1e9  # s. A larger value is not a flight time.
 
 

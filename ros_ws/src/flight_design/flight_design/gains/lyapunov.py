@@ -207,13 +207,6 @@ def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
     return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
 
 
-def largest_rise(signal: FloatArray) -> float:
-    """Largest rise of a signal of shape (N,) above an earlier value: max_(j<k) (s_k - s_j), 0 if it
-    never rises.
-    """
-    return float(np.max(signal - np.minimum.accumulate(signal)))
-
-
 class Example(NamedTuple):
     """A flight for `fly`."""
 
