@@ -279,6 +279,12 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
             find_scenario("osprey_servo").vary(aircraft={"sensors": {"delay": 0.004}}),
             r"^sensors\.delay: found",
         ),
+        (
+            find_scenario("osprey_route").vary(
+                aircraft={"actuators": {"faults": ["aileron lost 60"]}}
+            ),
+            r"^aircraft\.actuators\.faults: found aileron lost, expected none of the roll",
+        ),
     ],
 )
 def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(

@@ -18,6 +18,7 @@ from jax import numpy as jnp
 from numpy.typing import NDArray
 
 from aircraft_sim import pose as pose_model
+from aircraft_sim.effector_faults import STOPPED
 from aircraft_sim.sections import StartConfig
 from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
@@ -127,6 +128,24 @@ class MissionState(NamedTuple):
     from_home: Array  # m
 
 
+def _require_aileron(scenario: Scenario) -> None:
+    """Raises ParameterError for a fault after which the aileron no longer follows u: these flights
+    do not compare p with its command.
+    """
+    aileron = scenario.controller.inputs[scenario.controller.outputs.index("p")]
+    dead = [
+        fault.subject
+        for fault in scenario.aircraft.actuators.read_faults()
+        if fault.input == aileron and fault.kind in STOPPED
+    ]
+    require(
+        not dead,
+        "aircraft.actuators.faults",
+        ", ".join(dead),
+        "none of the roll in a campaign of missions, in which no yaw rate flies the bank",
+    )
+
+
 def require_mission(scenario: Scenario) -> GuidanceConfig:
     """The section `guidance` of a scenario. Raises ParameterError for a guidance beyond a campaign
     of missions.
@@ -174,6 +193,7 @@ def require_mission(scenario: Scenario) -> GuidanceConfig:
         "bounds",
         "none in a campaign of missions",
     )
+    _require_aileron(scenario)
     profile = reference.profile()
     commanded = bool(profile.change.any() or profile.amplitude.any())
     require(
