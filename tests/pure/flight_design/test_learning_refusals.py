@@ -4,22 +4,22 @@
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from pytest import approx
-from tests.conftest import refusing
+from tests.conftest import REPOSITORY, refusing
 
 from aircraft_sim.airframe import load_airframe
 from c_export.constants import exportable
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import second_stage
 from flight_campaign import learning_flights, tuning
 from flight_design.learning import scenario_learner
 
-PAGE = Path(__file__).parents[3] / "docs" / "learning.md"
+PAGE = REPOSITORY / "docs" / "learning.md"
 
 
 def learning() -> dict[str, Any]:
@@ -57,6 +57,14 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "`--set learn` beside an observer": (
         lambda: scenario_learner.that_learns(find_scenario("osprey_observer")),
         r"learn: found an observer, expected none: a scenario of the law alone",
+    ),
+    "`--set learn` of outputs other than q, V, p, r": (
+        lambda: scenario_learner.that_learns(
+            load_scenario(REPOSITORY / "examples/hexarotor/hexarotor_flight.yaml").vary(
+                aircraft={"sensors": {"noise": []}}
+            )
+        ),
+        r"airframe hexarotor: found the outputs q, p, r, w, expected q, V, p, r",
     ),
 }
 

@@ -131,7 +131,8 @@ def that_learns(scenario: Scenario) -> Scenario:
     channels = aircraft.channels()
     measured = aircraft.sensors.noise or (0.0,) * len(channels.outputs)
     by_name = dict(zip(channels.outputs, measured, strict=True))
-    noise = np.array([by_name[name] or NOISE[name] for name in start.outputs])
+    # with_sketch refuses an output that NOISE lacks
+    noise = np.array([by_name[name] or NOISE.get(name, 0.0) for name in start.outputs])
     Omega = np.diag(np.array(start.D) * start.omega / start.input_scale)
     name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
     sketched = with_sketch(start, name, Omega, channels.speed, noise, STEP_MARGIN)
