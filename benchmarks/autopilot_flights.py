@@ -70,7 +70,7 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
     replayed = on_the_ground("replay", str(autopilot.run)).returncode == 0
     return {
         "engaged": summary["engagements"],
-        "outcome": summary["outcome"],
+        "outcome": summary["outcome"]["sentence"],
         "rms": {name: error["command"]["rms"] for name, error in summary["errors"].items()},
         "behind": {
             name: behind(log.tape, name, span)

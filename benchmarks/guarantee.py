@@ -30,7 +30,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
-from flight_analysis.report.flight_outcome import final_outcome
+from flight_analysis.report.shortfalls import judged
 from flight_design.gains.gain_design import select_gains
 from flight_design.identification.likelihood import PRIOR
 from flight_design.learning.scenario_learner import learner
@@ -110,7 +110,7 @@ def flight(scenario: Scenario, first: Unstable) -> str:
         path.write_text(as_yaml(frame))
         flown = scenario.vary(aircraft={"airframe": str(path)})
         tape = simulate(flown)
-        return final_outcome(tape.outcome, account(tape, flown))
+        return str(judged(tape.outcome, tape, flown, account(tape, flown)))
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:

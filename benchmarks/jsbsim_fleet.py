@@ -70,7 +70,7 @@ def _row(title: str, aircraft: IdentifiedAircraft) -> str:
 
 
 def _errors(flight: ManoeuvreResult) -> str:
-    if flight.outcome != COMPLETED:
+    if flight.outcome != str(COMPLETED):
         return flight.outcome
     return " / ".join(f"{flight.rms[name] * (1.0 if name == 'V' else 1e3):.2g}" for name in OUTPUTS)
 

@@ -30,6 +30,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
+from flight_core.outcome import End
 from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
@@ -47,7 +48,7 @@ def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool)
     outcome = fly_over_topics(
         scenario, run, lambda t, u: None, lockstep=True, one_process=one_process
     )
-    if outcome != "completed":
+    if outcome.end is not End.COMPLETED:
         sys.exit(f"error: {outcome}")
     topics: dict[int, str] = {}
     times = []

@@ -34,7 +34,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as runs:
             flight = _run("fly", name, "--lockstep", "--set", "composed", "--set", f"runs={runs}")
             replayed = {"differing": 0} | _run("replay", f"{runs}/latest")
-        results[name] = replayed | {"completed": flight.get("outcome") == "completed"}
+        results[name] = replayed | {"completed": flight.get("outcome", {}).get("status") == 0}
     print(json.dumps(results, indent=1))
 
 

@@ -376,7 +376,7 @@ def test_new_airframe_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         Path("navion_flight.yaml"),
     )
     tape = simulate(find_scenario("navion_flight.yaml"))
-    assert tape.outcome == "completed"
+    assert str(tape.outcome) == "completed"
     error = np.abs(tape["y"]["V"] - np.interp(tape.time("y"), tape.time("y_m"), tape["y_m"]["V"]))
     assert error.max() < 1.0  # m/s of a command of 1.6 and a gust of 1.6
     with refusing("expected a new file, or replace"):

@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes
 from flight_bringup.graph import NodeSpec
 from flight_bringup.processes import FlightProcesses, NotReadyError
+from flight_core.outcome import ended_early, never_flew
 
 # in place of a FlightMonitor
 SILENT_MONITOR: Any = SimpleNamespace(
@@ -119,10 +120,10 @@ def test_flight_without_matched_nodes_never_begins(
     popen = SimpleNamespace(pid=1, poll=lambda: None)
     flight.processes = [SimpleNamespace(node=NodeSpec("fake", name), popen=popen) for name in state]  # type: ignore[misc]
     late = "controller has an input without a publisher; recorder not ready after 0.05 s"
-    assert flight.begin() == f"never flew: {late}"
+    assert flight.begin() == never_flew(late)
     assert given == []
     state |= {name: {"ready", "matched"} for name in state}
-    assert flight.begin() == ""
+    assert flight.begin() is None
     assert given == [flight.start_time] == [pytest.approx(time.time() + 0.5, abs=0.4)]
 
 
@@ -143,7 +144,7 @@ def test_flight_by_a_clock_that_never_comes_is_told_so(
 
 
 LOSES_CONTACT = (
-    "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"
+    "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(6)\n"
 )
 
 
@@ -173,7 +174,7 @@ def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
         )
     for process in flight.processes:
         process.popen.wait()
-    assert flight.ended_early() == cause
+    assert flight.ended() == ended_early(cause)
     flight.stop()
 
 

@@ -29,6 +29,7 @@ from tests.recordings import count_messages, messages
 from tests.small_disk import small_disk
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.outcome import INTERRUPTED
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_log.follow import Follower, Messages
 from flight_log.repair import repair
@@ -91,7 +92,7 @@ def recorder(osprey_gust: Scenario, tmp_path: Path) -> Iterator[Recording]:
 
 def test_log_has_each_message_and_the_outcome_that_the_flight_left(recorder: Recording) -> None:
     recorder.run(1.0, *LOOP, "truth")
-    (recorder.folder / "outcome").write_text("interrupted")
+    (recorder.folder / "outcome").write_text(INTERRUPTED.text())
     log = recorder.end()
     sent = {
         topic: [raw for _, raw in recorder.world.sent[topic]]
@@ -102,7 +103,7 @@ def test_log_has_each_message_and_the_outcome_that_the_flight_left(recorder: Rec
         if topic in stored:
             stored[topic].append(data)
     assert stored == sent
-    assert (log.tape.outcome, log.tape.notes) == ("interrupted", ())
+    assert (log.tape.outcome, log.tape.notes) == (INTERRUPTED, ())
 
 
 def test_further_topics_recorded_from_their_first_publisher_on_with_its_qos(

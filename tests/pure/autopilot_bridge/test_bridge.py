@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup import fly as flying
 from flight_bringup.fly import _follow_real_time, _Span, interrupt, last
 from flight_bringup.processes import handle_signals
+from flight_core.outcome import Outcome, ended_early
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 
@@ -936,7 +937,7 @@ def followed(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = np.inf,
     begins: bool = False,
-) -> str:
+) -> Outcome:
     """The outcome of a flight of osprey_gust, 60 s, with an autopilot or else with an aircraft that
     begins it.
     """
@@ -981,14 +982,14 @@ def test_flight_ends_once_log_holds_it(
         learner_ended=str,
         started=0.0,
         start_time=1000.0,
-        ended_early=lambda: None,
+        ended=lambda: None,
         is_flying=lambda: True,
     )
     monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=recorded)
-    assert (
-        followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins)
-        == outcome
+    told = followed(
+        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins
     )
+    assert str(told) == outcome
     assert now[0] == approx(end, abs=0.1)
 
 
@@ -1006,7 +1007,7 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
         learner_ended=str,
         start_time=1000.0,
         started=time.monotonic(),
-        ended_early=lambda: None if waiting else "the end",
+        ended=lambda: None if waiting else ended_early("the end"),
     )
     monitor = SimpleNamespace(
         learned=list,
@@ -1015,7 +1016,7 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
         recorded=lambda: None,
     )
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
-    assert followed(*nodes, announce=announced.append) == "the end"
+    assert followed(*nodes, announce=announced.append) == ended_early("the end")
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
 
 
@@ -1025,22 +1026,22 @@ def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
         learner_ended=str,
         start_time=1000.0,
         started=time.monotonic() - 0.3,
-        ended_early=lambda: None,
+        ended=lambda: None,
     )
     monitor = SimpleNamespace(
         learned=list, engagement=list, newest=lambda: None, recorded=lambda: None
     )
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
-    assert followed(*nodes, engaged_for=59.8) == "not engaged within 0.2 s"
+    assert followed(*nodes, engaged_for=59.8) == ended_early("not engaged within 0.2 s")
 
 
 def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = iter(["", "", "the end"])
+    calls = iter([None, None, ended_early("the end")])
     processes = SimpleNamespace(
         learner_ended=str,
         start_time=1000.0,
         started=time.monotonic(),
-        ended_early=lambda: next(calls) or None,
+        ended=lambda: next(calls),
     )
     monitor = SimpleNamespace(
         learned=list, engagement=list, newest=lambda: None, recorded=lambda: None
@@ -1048,7 +1049,7 @@ def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatc
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     later = time.time() + 3600.0
     monkeypatch.setattr(time, "time", lambda: later)
-    assert followed(*nodes) == "the end"
+    assert followed(*nodes) == ended_early("the end")
 
 
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:

@@ -26,11 +26,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import Account, account
-from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.html import write_page
 from flight_analysis.report.paper import write_latex
 from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.sample_counts import TopicAccount
+from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.summary import (
     RecordedFlight,
     command_results,
@@ -47,7 +47,7 @@ from flight_cli.output import show_flight
 from flight_cli.replay import Replay
 from flight_cli.report import Report
 from flight_core.modes import Mode
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import COMPLETED, STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Signal, Tape
 from flight_log.clock import StampClock
@@ -78,7 +78,7 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `rise-di replay --json` prints."""
     with pytest.raises(typer.Exit) as end:
         Replay(run=log, as_json=True).execute()
-    assert end.value.exit_code in {0, 1, STATUS_INCOMPLETE}
+    assert end.value.exit_code in {0, 1, STATUS_SHORTFALL}
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result
 
@@ -89,7 +89,7 @@ def test_whole_log_lacks_nothing(
     """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends
     included.
     """
-    assert (figures["outcome"], figures["notes"], figures["account"]["lacks"]) == (
+    assert (figures["outcome"]["sentence"], figures["notes"], figures["account"]["lacks"]) == (
         "completed",
         [],
         [],
@@ -133,7 +133,7 @@ def test_every_command_says_what_log_lacks(
             read_flight(log)
         return
     summary = read_flight(log).summary
-    assert summary["outcome"].startswith(f"completed, log incomplete: {topic} ")
+    assert summary["outcome"]["sentence"].startswith(f"completed, log incomplete: {topic} ")
     for table in TABLES:
         if json.dumps(summary[table]) != json.dumps(figures[table]):
             assert taken_over(summary, table).startswith(", over ")
@@ -156,7 +156,7 @@ def test_report_prints_part_beside_figures(
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
     with pytest.raises(typer.Exit) as end:
         Report(runs=[log], csv=tmp_path / "run.csv", png=tmp_path / "run.png").execute()
-    assert end.value.exit_code == STATUS_INCOMPLETE
+    assert end.value.exit_code == STATUS_SHORTFALL
     output = " ".join(capsys.readouterr().out.split())
     assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
     assert (
@@ -188,9 +188,9 @@ def test_flight_counts_from_its_first_u(
     late = {name: tape[name] for name in ("y", "y_m", "truth")} | {
         "u": tape["u"].where(tape.time("u") >= begin)
     }
-    assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(
-        outcome
-    )
+    flight = Tape(late, duration=2.0)
+    held = account(flight, osprey_gust)
+    assert str(judged(COMPLETED, flight, osprey_gust, held)).startswith(outcome)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
     summary = read_flight(run).summary
     assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
     assert (
-        summary["outcome"]
+        summary["outcome"]["sentence"]
         == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
     )
 
@@ -526,7 +526,7 @@ def test_fleet_says_the_share_of_the_ticks_engaged(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert half.scenario is not None
-    flown = Flown(Member("two", half.scenario), tmp_path, "completed")
+    flown = Flown(Member("two", half.scenario), tmp_path, COMPLETED)
     show_fleet("pair", [flown], {"two": FleetResult(half.summary, 0.9365)})
     assert "93.65 %, over 49 % of internals" in capsys.readouterr().out
 

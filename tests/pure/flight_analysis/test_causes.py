@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.account import account
 from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_and_report
-from flight_core.outcome import exit_status
+from flight_core.outcome import UNKNOWN, End, Outcome, ended_early
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Tape
@@ -215,12 +215,12 @@ def check(log: Path) -> None:
         summary = read_flight(log).summary
     except ParameterError:
         return
-    text = " ".join([summary["outcome"], *summary["notes"]])
+    text = " ".join([summary["outcome"]["sentence"], *summary["notes"]])
     assert "busy" not in text
     assert "never sent" not in text
     shares = [topic["share"] for topic in summary["account"]["topics"].values()]
     if any(share is not None and share < 0.9 for share in shares):
-        assert exit_status(summary["outcome"]) != 0
+        assert summary["outcome"]["status"] != 0
 
 
 def figures(summary: dict[str, Any]) -> dict[str, Any]:
@@ -265,7 +265,7 @@ def test_log_that_begins_late_is_no_flight_that_began_late(
         tmp_path / "run_0.mcap",
         damaged(numbered, "begun late", 0.75, 0.0, ""),
     )
-    outcome = read_flight(log).summary["outcome"]
+    outcome = read_flight(log).summary["outcome"]["sentence"]
     assert outcome.startswith("completed, log incomplete: ")
     assert "u 51 of 201 samples, begins at t = 1.500 of 2.000 s" in outcome
 
@@ -276,7 +276,7 @@ def test_short_hole_that_is_the_lack_is_named(
     log = write_messages(
         recorded / "run_0.mcap", tmp_path / "run_0.mcap", damaged(numbered, "hole", 0.5, 0.4, "/y")
     )
-    outcome = read_flight(log).summary["outcome"]
+    outcome = read_flight(log).summary["outcome"]["sentence"]
     assert "y 801 of 1001 samples, no sample from t = 0.998 to 1.400 s" in outcome
 
 
@@ -289,10 +289,11 @@ def test_outcome_of_another_flight_beside_a_log_is_not_believed(
     """
     half = damaged(numbered, "cut", 0.5, 0.0, "")
     log = write_messages(recorded / "run_0.mcap", tmp_path / "other" / "run_0.mcap", half)
-    content = {"summary.json": json.dumps({"outcome": "landed"}), "outcome": "landed"}[beside]
+    landed = Outcome(End.LANDED).as_json()
+    content = json.dumps({"outcome": landed} if beside == "summary.json" else landed)
     (log.parent / beside).write_text(content)
-    assert "landed" not in read_flight(log).summary["outcome"]
-    assert "landed" not in read_flight(log.parent).summary["outcome"]
+    assert "landed" not in read_flight(log).summary["outcome"]["sentence"]
+    assert "landed" not in read_flight(log.parent).summary["outcome"]["sentence"]
 
 
 @pytest.mark.parametrize("by", [0.5, 3.0, 3600.0])
@@ -313,7 +314,7 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
     )
     summary = read_flight(log).summary
     told = f"the clock of all stamps leaps forth by {by:.3f} s at t = 0.998 s"
-    assert summary["outcome"] == f"completed, log incomplete: {told}"
+    assert summary["outcome"]["sentence"] == f"completed, log incomplete: {told}"
     assert summary["notes"] == [f"{told}: later times are by the clock before the leap"]
     assert figures(summary) == figures(intact)
     result = replay(log)
@@ -339,10 +340,10 @@ def test_pause_of_all_processes_is_no_leap_of_the_clock(
         messages.append(sent._replace(number=counts[sent.topic]))
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
     summary = read_flight(log).summary
-    assert "leaps" not in summary["outcome"]
+    assert "leaps" not in summary["outcome"]["sentence"]
     assert (
         "y 401 of 1001 samples, no sample from t = 0.498 to 1.700 s, 600 were never sent"
-        in summary["outcome"]
+        in summary["outcome"]["sentence"]
     )
     assert "this host is too busy: 600 of 1001 y were never sent" in summary["notes"][0]
 
@@ -374,7 +375,8 @@ def test_simulated_flight_without_truth_lacks_it(
     messages = [sent for sent in numbered if sent.topic != "/truth"]
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
     assert (
-        read_flight(log).summary["outcome"] == "completed, log incomplete: truth 0 of 1001 samples"
+        read_flight(log).summary["outcome"]["sentence"]
+        == "completed, log incomplete: truth 0 of 1001 samples"
     )
 
 
@@ -389,7 +391,7 @@ def test_ticks_of_less_than_nine_tenths_are_no_success(
         if sent.topic not in {"/u", "/internals"} or ticks[sent.topic] % 2:
             messages.append(sent)
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
-    assert "u 101 of 201 samples; " in read_flight(log).summary["outcome"]
+    assert "u 101 of 201 samples; " in read_flight(log).summary["outcome"]["sentence"]
 
 
 @pytest.mark.parametrize(
@@ -449,9 +451,11 @@ def test_outcome_in_the_log_is_before_that_of_a_summary_beside(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     run = fly_and_report(osprey_gust.vary(flight={"duration": 0.5}), tmp_path).mcap.parent
-    (run / "summary.json").write_text(json.dumps({"outcome": "ended early: another flight"}))
-    assert read_run(run).tape.outcome == "completed"
-    assert read_flight(run).summary["outcome"] == "completed"
+    (run / "summary.json").write_text(
+        json.dumps({"outcome": ended_early("another flight").as_json()})
+    )
+    assert str(read_run(run).tape.outcome) == "completed"
+    assert read_flight(run).summary["outcome"]["sentence"] == "completed"
 
 
 @pytest.mark.parametrize("later_by", [0, NANOSECONDS])
@@ -463,11 +467,11 @@ def test_summary_of_another_flight_is_not_believed(
     log = write_messages(recorded / "run_0.mcap", run / "run_0.mcap", numbered)
     summary = read_flight(log).summary
     summary["flight"]["start_ns"] += later_by
-    ended = {"outcome": "aircraft was killed by SIGKILL"}
-    (run / "summary.json").write_text(json.dumps(summary | ended))
-    assert read_run(log).tape.outcome == "unknown"
-    told = read_flight(log).summary["outcome"]
-    assert (told == ended["outcome"]) is not bool(later_by)
+    ended = ended_early("aircraft was killed by SIGKILL")
+    (run / "summary.json").write_text(json.dumps(summary | {"outcome": ended.as_json()}))
+    assert read_run(log).tape.outcome == UNKNOWN
+    told = read_flight(log).summary["outcome"]["sentence"]
+    assert (told == str(ended)) is not bool(later_by)
     assert told.startswith("completed") is bool(later_by)
 
 

@@ -1,19 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a flight says of its fence: figures, notices, outcome and exit status."""
+"""What a flight says of its fence, its altitudes and its places: figures and notices."""
 
 import numpy as np
 import pytest
+from tests.conftest import refusing
 
-from flight_analysis.report.account import Account, account_of_json
-from flight_analysis.report.flight_outcome import final_outcome
-from flight_analysis.report.guided import Outside, orbit_missed_by, time_outside, touched_beside
-from flight_core.outcome import (
-    COMPLETED,
-    INTERRUPTED,
-    STATUS_INCOMPLETE,
-    STATUS_INTERRUPTED,
-    exit_status,
+from flight_analysis.report.guided import (
+    Outside,
+    altitude_excess,
+    orbit_missed_by,
+    time_outside,
+    touched_beside,
 )
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
@@ -36,7 +34,6 @@ SECTION = GuidanceConfig.validate_mapping(
     },
     "guidance",
 )
-LEFT = Outside(2.0, 20.0, left=True)
 
 
 def flown(*north: float, engaged: int = 0) -> Tape:
@@ -50,14 +47,14 @@ def flown(*north: float, engaged: int = 0) -> Tape:
 @pytest.mark.parametrize(
     "north, outside",
     [
-        ((0.0, 400.0, 0.0), Outside(0.0, 0.0, left=False)),
-        ((490.0, 510.0, 520.0, 490.0), LEFT),
+        ((0.0, 400.0, 0.0), Outside(0.0, 0.0)),
+        ((490.0, 510.0, 520.0, 490.0), Outside(2.0, 20.0)),
         (
             (520.0, 510.0, 490.0),
-            Outside(2.0, 20.0, left=False),
+            Outside(2.0, 20.0),
         ),  # which begins outside, and comes inside
-        ((520.0, 490.0, 500.5, 400.0), Outside(2.0, 20.0, left=True)),  # a second time
-        ((520.0, 540.0), Outside(1.0, 40.0, left=True)),  # ends outside
+        ((520.0, 490.0, 500.5, 400.0), Outside(2.0, 20.0)),  # a second time
+        ((520.0, 540.0), Outside(1.0, 40.0)),  # ends outside
     ],
 )
 def test_time_outside_of_fence(north: tuple[float, ...], outside: Outside) -> None:
@@ -65,34 +62,26 @@ def test_time_outside_of_fence(north: tuple[float, ...], outside: Outside) -> No
 
 
 def test_time_outside_counts_while_guidance_flies() -> None:
-    assert time_outside(flown(600.0, 490.0, 480.0, engaged=1), SECTION) == Outside(
-        0.0, 0.0, left=False
-    )
+    assert time_outside(flown(600.0, 490.0, 480.0, engaged=1), SECTION) == Outside(0.0, 0.0)
     assert time_outside(flown(600.0, 490.0), SECTION.model_copy(update={"fence": {}})) is None
     assert time_outside(Tape({}, 0), SECTION) is None
 
 
-def test_flight_that_left_its_fence_is_not_completed() -> None:
-    of = Account(10.0, {}, (), "", outside=LEFT)
-    outcome = final_outcome(COMPLETED, of)
-    assert outcome == "completed, outside of the fence for 2.0 s, 20 m at most"
-    assert exit_status(outcome) == STATUS_INCOMPLETE
-    assert final_outcome(outcome, of) == outcome
-    landed = final_outcome("osprey landed at t = 9 s", of)
-    assert (landed, exit_status(landed)) == (
-        "osprey landed at t = 9 s, outside of the fence for 2.0 s, 20 m at most",
-        STATUS_INCOMPLETE,
-    )
-    assert exit_status(final_outcome(INTERRUPTED, of)) == STATUS_INTERRUPTED
-    inside = of._replace(outside=LEFT._replace(left=False))
-    assert exit_status(final_outcome(COMPLETED, inside)) == 0
+def test_time_outside_of_altitudes() -> None:
+    section = SECTION.model_copy(update={"altitude_floor": -10.0, "ceiling": 25.0})
+    stamp_ns = np.arange(5) * nanoseconds(1.0)
+    altitude = np.array([[0.0], [30.0], [20.0], [-25.0], [0.0]])
+    pose = Signal(stamp_ns, ("altitude",), altitude)
+    steps = Signal(stamp_ns, ("mode",), np.zeros((5, 1)))
+    tape = Tape({"pose": pose, "guidance": steps}, 0)
+    assert altitude_excess(tape, section) == Outside(2.0, 15.0)
+    assert altitude_excess(tape, SECTION) is None
 
 
-def test_account_of_summary_has_time_outside() -> None:
-    content = Account(10.0, {}, (), "").as_json()
-    of = account_of_json({"account": content, "guidance": {"legs": [], "fence": LEFT._asdict()}})
-    assert of is not None
-    assert of.outside == LEFT
+def test_home_lies_between_the_altitudes() -> None:
+    values = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "ceiling": 25.0}
+    with refusing("guidance.home.altitude: found 60 m, expected -inf to 25 m"):
+        GuidanceConfig.validate_mapping(values | {"home": {"altitude": 60.0}}, "guidance")
 
 
 def test_notices_say_when_an_aircraft_is_outside() -> None:
@@ -126,10 +115,6 @@ def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
         )
 
     assert (off(-720.0), off(170.0), off(190.0), off(720.0, 0)) == (720.0, 0.0, 190.0, 0.0)
-    outcome = final_outcome(COMPLETED, Account(10.0, {}, (), off_orbit=720.0))
-    assert outcome == "completed, the last orbit not joined: 720 m"
-    assert exit_status(outcome) == STATUS_INCOMPLETE
-    assert final_outcome(outcome, Account(10.0, {}, ())) == COMPLETED
 
 
 def test_landing_beside_its_touch_down_zone_says_so() -> None:
@@ -141,8 +126,3 @@ def test_landing_beside_its_touch_down_zone_says_so() -> None:
     beside = touched_beside(Tape({"pose": place}, 0), section)
     assert beside == pytest.approx(4.0)
     assert touched_beside(Tape({"pose": place}, 0), SECTION) == 0.0
-    landed = "osprey landed at t = 9 s"
-    outcome = final_outcome(landed, Account(10.0, {}, (), beside=beside))
-    assert outcome == f"{landed}, outside of the touch-down zone by 4 m"
-    assert exit_status(outcome) == STATUS_INCOMPLETE
-    assert final_outcome(outcome, Account(10.0, {}, ())) == landed

@@ -25,7 +25,7 @@ from flight_analysis.report.spectra import spectra
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import COMPLETED, Outcome, ended_early
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
@@ -96,13 +96,15 @@ def titles(figure: Figure | None) -> list[str]:
     return [axis.title.text for axis in drawn(figure).select_yaxes()]
 
 
-def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
+def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: Outcome = COMPLETED) -> str:
     path = tmp_path / "report.html"
     write_page(path, [recorded("run", scenario, tape, outcome)])
     return path.read_text()
 
 
-def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> RecordedFlight:
+def recorded(
+    name: str, scenario: Scenario, tape: Tape, outcome: Outcome = COMPLETED
+) -> RecordedFlight:
     return RecordedFlight(name, scenario, tape, summarise(tape, scenario, outcome))
 
 
@@ -157,7 +159,9 @@ def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: 
 
 
 def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
-    page = page_of(tmp_path, servo, flight(), outcome="ended: <script>alert(1)</script>")
+    page = page_of(
+        tmp_path, servo, flight(), outcome=ended_early("ended: <script>alert(1)</script>")
+    )
     assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert" not in page
 

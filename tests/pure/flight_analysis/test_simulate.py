@@ -16,6 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import fly, simulate
 from flight_analysis.metrics import tracking_error
 from flight_analysis.report.run_folder import attachments_for
+from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.tape_writer import TapeWriter, write_run
@@ -100,7 +101,7 @@ def test_flight_records_one_second_at_a_time(osprey_gust: Scenario) -> None:
     """Memory of a flight does not grow with its duration: no part is longer than a second."""
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     parts: list[Mapping[str, Signal]] = []
-    assert fly(scenario, parts.append) == "completed"
+    assert fly(scenario, parts.append) == COMPLETED
     assert max(len(part["y"].stamp_ns) for part in parts) <= scenario.aircraft.rate + 1
     tape = simulate(scenario)
     for topic, signal in tape.signals.items():

@@ -12,6 +12,7 @@ from tests.conftest import invoke
 
 from flight_bringup.fleet import Fleet, Flown, read_fleet
 from flight_cli import fleet
+from flight_core.outcome import COMPLETED, Outcome
 from flight_core.parameters import ParameterError
 
 FLEET = """
@@ -95,11 +96,9 @@ def test_interrupt_of_reports_shows_what_was_flown(
     without_ros: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[Flown]:
-        return [
-            Flown(member, run, "completed") for member, run in zip(of.members, runs, strict=True)
-        ]
+        return [Flown(member, run, COMPLETED) for member, run in zip(of.members, runs, strict=True)]
 
-    def reported(run: Path, outcome: str) -> NoReturn:
+    def reported(run: Path, outcome: Outcome) -> NoReturn:
         raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt
 
     without_ros.setattr(fleet, "fly_fleet", flown)
@@ -113,6 +112,8 @@ def test_interrupt_of_reports_shows_what_was_flown(
     ]
     result = invoke(*arguments)
     assert result.exit_code == 130
-    outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}
+    outcomes = {
+        name: summary["outcome"]["sentence"] for name, summary in json.loads(result.output).items()
+    }
     assert outcomes["one"] == "never flew: no sample"
     assert outcomes["two"] == "completed, no report: rise-di report writes it"

@@ -36,6 +36,7 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenar
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.environment import PROFILE_VARIABLE
+from flight_core.outcome import COMPLETED, INTERRUPTED, ended_early, never_flew, parsed_outcome
 from flight_core.parameters import Config
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import LogAttachments
@@ -246,7 +247,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
 def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> None:
     actions, context, first, _ = case
     left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
-    assert left == (["interrupted"] if "recorder" in first else [])  # the outcome of Ctrl-C
+    assert left == ([INTERRUPTED.text()] if "recorder" in first else [])  # the outcome of Ctrl-C
     for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
         assert node.on_exit is not None
         for status in (0, 3, -9):
@@ -254,11 +255,9 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
             with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
                 node.on_exit(ProcessExited(f"{executable}-1", status), context)
             if "recorder" in first:
-                assert (
-                    next(tmp_path.glob("runs/*/outcome"))
-                    .read_text()
-                    .startswith(f"{executable}-1 ended before")
-                )
+                text = next(tmp_path.glob("runs/*/outcome")).read_text()
+                told = ended_early(f"{executable}-1 ended before the flight did")
+                assert parsed_outcome(text) == told
             context.is_shutdown = True
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
@@ -273,9 +272,8 @@ def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_pat
     with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
         require_ready.function(context)
     left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
-    assert left == (
-        [f"never flew: {first[-1]} not ready after 20 s"] if "recorder" in first else []
-    )
+    told = never_flew(f"{first[-1]} not ready after 20 s").text()
+    assert left == ([told] if "recorder" in first else [])
     publish(actions, context, f"/{first[-1]}#{PID}")
     assert require_ready.function(context) is None
 
@@ -332,9 +330,8 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     assert ends(flown)
     (leave,) = every(OpaqueFunction, flown)
     leave.function(context)
-    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(
-        encoding="utf-8"
-    ) == "completed"
+    text = (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8")
+    assert parsed_outcome(text) == COMPLETED
 
 
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:

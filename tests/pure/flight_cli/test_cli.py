@@ -66,7 +66,7 @@ def test_flight_ends_with_table_log_and_report(
 
 def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     summary = json.loads((flown[0] / "runs" / "latest" / "summary.json").read_text())
-    assert (summary["scenario"], summary["outcome"], summary["duration"]) == (
+    assert (summary["scenario"], summary["outcome"]["sentence"], summary["duration"]) == (
         "osprey_gust",
         "completed",
         4.0,

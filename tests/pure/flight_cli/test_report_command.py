@@ -15,6 +15,7 @@ from flight_analysis.report.run_folder import new_run, read_flight, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_cli.report import Report
+from flight_core.outcome import COMPLETED, ended_early
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
@@ -55,7 +56,7 @@ def test_engagement_shorter_than_sample_leaves_figures_of_flight(
         "read_run",
         lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]),
     )
-    summary = read_flight(run, "completed").summary
+    summary = read_flight(run, COMPLETED).summary
     assert summary["duration"] > 1.0
     assert summary["notes"][0].endswith("s: lost")
     assert summary["notes"][1] == "the figures are of the whole flight: no y while engaged"
@@ -92,5 +93,5 @@ def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: s
 
 
 def test_flight_without_samples_has_summary_with_same_keys(runs: list[Path]) -> None:
-    empty = empty_summary(find_scenario("osprey_gust"), "no progress")
+    empty = empty_summary(find_scenario("osprey_gust"), ended_early("no progress"))
     assert empty.keys() == json.loads((runs[0] / "summary.json").read_text()).keys()

@@ -580,7 +580,11 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(
     result = invoke("report", bag, "--png", tmp_path / "flight.png", "--json")
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output)
-    assert (summary["outcome"], summary["scenario"], summary["errors"]) == ("imported", None, {})
+    assert (summary["outcome"]["sentence"], summary["scenario"], summary["errors"]) == (
+        "imported",
+        None,
+        {},
+    )
     assert summary["duration"] == approx(DURATION, abs=2.0 / RATE)
     for key, values in (
         ("outputs", flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0]),

@@ -19,6 +19,7 @@ from tests.conftest import refusing
 from flight_analysis.report.run_folder import REPORT, SUMMARY, write_report
 from flight_cli.report import Report
 from flight_core.files import replacing, write_file
+from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 
 SOURCES = Path(__file__).resolve().parents[3] / "ros_ws" / "src"
@@ -121,7 +122,7 @@ def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, 
     """A full disk at the n-th write of a report: each file has the old or the new content, and the
     outcome survives.
     """
-    write_report(run, "completed")
+    write_report(run, COMPLETED)
     (run / REPORT).write_text("an older page")
     before = files_in(run)
     survived = 0
@@ -143,7 +144,7 @@ def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, 
                 break
         after = files_in(run)
         assert set(after) == set(before)
-        assert json.loads(after[SUMMARY])["outcome"] == "completed"
+        assert json.loads(after[SUMMARY])["outcome"]["end"] == "completed"
         assert after[REPORT] == b"an older page"
         survived += 1
     assert survived == 2  # summary and page; the scenario is written once, by the flight

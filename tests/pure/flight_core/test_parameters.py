@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign.campaign import Definition
 from flight_core.files import read_yaml, writing
+from flight_core.outcome import COMPLETED
 from flight_core.parameters import Config, ParameterError, flatten, nest
 from flight_core.rates import divide, period_ns
 from rise_di_controller import laws
@@ -281,7 +282,7 @@ EXAMPLES = sorted((REPOSITORY / "examples" / "scenarios").glob("*.yaml"))
 def test_example_scenario_flies(path: Path) -> None:
     """Two seconds show that each section is accepted by what flies it."""
     scenario = load_scenario(path).vary(flight={"duration": 2.0})
-    assert simulate(scenario).outcome == "completed"
+    assert simulate(scenario).outcome == COMPLETED
 
 
 SET_BY_THE_FLIGHT = {

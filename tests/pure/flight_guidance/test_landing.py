@@ -18,6 +18,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import landing_results, landing_touch
 from flight_core.channels import POSE
+from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance.guidance_state import Lateral
@@ -83,7 +84,7 @@ def test_landing_is_computed_again_from_the_log(across: Scenario, approach: Tape
 
 def test_figures_of_a_landing(across: Scenario, approach: Tape) -> None:
     assert landing_touch(approach, across.guidance) is None  # it did not land
-    landed = dataclasses.replace(approach, outcome="jsbsim:x landed at t = 37.00 s")
+    landed = dataclasses.replace(approach, outcome=Outcome(End.LANDED))
     touch = landing_touch(landed, across.guidance)
     assert touch is not None
     end = {name: float(approach["pose"][name][-1]) for name in approach["pose"].names}

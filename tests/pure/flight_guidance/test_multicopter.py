@@ -39,7 +39,7 @@ def flight(duration: float, aircraft: Any = None, **section: Any) -> tuple[Scena
     changes: dict[str, Any] = {"flight": {"duration": duration}, "aircraft": aircraft or {}}
     scenario = SQUARE.vary(**changes, guidance={"route": None} | section)
     tape = simulate(scenario)
-    assert tape.outcome == "completed"
+    assert str(tape.outcome) == "completed"
     return scenario, tape
 
 

@@ -30,7 +30,7 @@ from tests.ros.waiting import HostDelays
 
 from aircraft_sim.airframe import load_airframe
 from flight_core.modes import Mode
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
@@ -208,7 +208,7 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
     setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
-    assert flight.end() in {0, STATUS_INCOMPLETE}, flight.output  # incomplete: the host paused
+    assert flight.end() in {0, STATUS_SHORTFALL}, flight.output  # incomplete: the host paused
     assert "request rejected" not in flight.output
     run = tmp_path / "runs" / "latest"
     log = read_run(run)
@@ -220,7 +220,7 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
     assert not u.any()  # what is sent at an engagement: the trim
     assert len(u) > 100  # of 450
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["outcome"].startswith("completed")
+    assert summary["outcome"]["sentence"].startswith("completed")
     assert summary["engagements"] == []
     assert summary["notes"][0].startswith("never engaged")
     assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]

@@ -18,7 +18,7 @@ from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.modes import Mode
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_ros.topics import publisher_qos
 
@@ -34,7 +34,7 @@ def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dic
     output: dict[str, Any] = json.loads(process.output)
     assert output["equal"] is equal
     incomplete = output["checked"] < 0.99 * output["expected"]
-    assert status == ((STATUS_INCOMPLETE if incomplete else 0) if equal else 1), process.output
+    assert status == ((STATUS_SHORTFALL if incomplete else 0) if equal else 1), process.output
     return output
 
 

@@ -26,6 +26,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
+from flight_core.outcome import COMPLETED
 from flight_core.parameters import flatten, nest
 from flight_design.gains.gain_selection import with_feedforward
 from flight_log.tape_reader import read_run
@@ -102,7 +103,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
         busy = tmp_path / "busy"  # without the command, in the process of its caller
         assert (
             fly_over_topics(load_scenario(scenario), busy, lambda t, shown: None, lockstep=True)
-            == "completed"
+            == COMPLETED
         )
     runs = [
         busy,
@@ -181,6 +182,6 @@ def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_pat
     assert command.end() == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())
     assert re.fullmatch(
-        r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"]
+        r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"]["sentence"]
     )
     assert summary["duration"] > 1.0

@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_core.channels import UNKNOWN
+from flight_core.outcome import COMPLETED
 from flight_core.rates import nanoseconds
 from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import read_run
@@ -56,7 +57,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     lines = list[str]()
     run = tmp_path / "run"
     flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
-    assert flown == "completed"
+    assert flown == COMPLETED
     tape = simulate(chosen, learn=learner(chosen), announce=events.append)
     assert [event.stamp_ns for event in events] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
     assert events[0].change  # the airframe file, before there is a record

@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_guidance.guidance_state import Lateral
@@ -45,7 +45,7 @@ LEVEL = {"altitude": 50.0, "v_north": 25.0}
 def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
     lost_link = {"home": {"link_timeout": 1.0}, "origin": ORIGIN}
     scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH, guidance=lost_link)
-    run = fly(start, scenario, "runs", status=STATUS_INCOMPLETE)  # the route takes longer
+    run = fly(start, scenario, "runs", status=STATUS_SHORTFALL)  # the route takes longer
     recorded = read_run(run).tape
     require_equal_bits(recorded, simulate(load_scenario(scenario)))
     assert recorded["guidance"]["mode.lateral"][-1] == Lateral.ORBIT  # home
@@ -115,7 +115,7 @@ def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
     command.child("flight_guidance.main").kill()
     assert command.end() == 3
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())
-    assert summary["outcome"] == "guidance was killed by SIGKILL"
+    assert summary["outcome"]["sentence"] == "guidance was killed by SIGKILL"
 
 
 @pytest.fixture

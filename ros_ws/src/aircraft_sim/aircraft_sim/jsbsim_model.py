@@ -12,13 +12,14 @@ import numpy as np
 from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
+from aircraft_sim.ground import touch
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
 from aircraft_sim.jsbsim_commands import command_paths, engine_count, settle
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from aircraft_sim.vanes import ANGLES
 from aircraft_sim.wind_field import body_axes
-from flight_core.outcome import LANDED, FlightEnded
+from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
@@ -35,10 +36,6 @@ POSE = (
     ("aero/beta-rad", 1.0),
 )
 """Properties of the pose other than the position, with the SI value of their units."""
-
-SOFT = 7.0 * FOOT
-"""Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14
-CFR 23.473(d), 7 ft/s."""
 
 THROTTLE = list(INPUTS).index("throttle")
 
@@ -127,8 +124,7 @@ class JsbsimModel:
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, shape (m,), deviations from trim.
 
-        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground:
-        landed on the wheels with a sink of at most SOFT, else the aircraft has hit the ground.
+        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground.
         """
         step_ns = self.condition.step_ns
         model = self._actuator_model
@@ -173,22 +169,16 @@ class JsbsimModel:
 
     def _require_flight(self, t_ns: int, sink: float) -> None:
         """Raise FlightEnded on the ground, after a sink in m/s, and where an engine stopped."""
-        now = f"at t = {seconds(t_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
-            on_wheels = not any(node.get_double_value() for node in self._structure)
-            if on_wheels and sink <= SOFT:
-                raise FlightEnded(
-                    f"{self.condition.title}{LANDED}{now}, with a sink of {sink:.2f} m/s"
-                )
-            raise FlightEnded(
-                f"{self.condition.title} hit the ground {now}, with a sink of {sink:.2f} m/s"
-            )
+            is_on_wheels = not any(node.get_double_value() for node in self._structure)
+            raise touch(self.condition.title, t_ns, sink, is_on_wheels=is_on_wheels)
         if stopped := [
             str(number) for number, node in self._engines.items() if not node.get_double_value()
         ]:
             why = ", out of fuel" if self._fuel.get_double_value() < LEAST_FUEL else ""
             raise FlightEnded(
-                f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}{why}"
+                f"{self.condition.title}: engine {', '.join(stopped)} stopped at t = "
+                f"{seconds(t_ns):.2f} s{why}"
             )
 
     def y(self) -> FloatArray:

@@ -487,6 +487,11 @@ class AircraftConfig(NodeConfig):
         turbulence = self._turbulence(self.flight_condition().speed, AXES, None)
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
+    def ground(self) -> float | None:
+        """Altitude of the ground, m, as `pose`; None where no section states one."""
+        section = self.microburst if self.shear is None else self.shear
+        return None if section is None else section.ground
+
     def relative_wind(self) -> RelativeWind | None:
         """The wind that differs from place to place; None without any."""
         field = wind_field_of(self.wind, self.shear, self.microburst)

@@ -15,12 +15,13 @@ import numpy as np
 from aircraft_sim import plant, pose, sensors, truth, turbulence, vanes, wind_field
 from aircraft_sim.disturbance import AXES
 from aircraft_sim.dynamics import Forcing
+from aircraft_sim.ground import LEVEL, touch
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
 from flight_core import plausible
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
-from flight_core.outcome import LANDED, FlightEnded
+from flight_core.outcome import End, FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -268,6 +269,9 @@ class Simulator:
             self._model = StateSpaceModel(parameters)
         over_place = parameters.relative_wind()
         self._wind = parameters.wind if over_place is None else over_place.carried
+        self._title = parameters.airframe
+        self._ground = None if parameters.is_jsbsim else parameters.ground()
+        self._is_above_ground = False
         self._gusts = parameters.gusts
         self._speed = channels.speed
         self._drift_section = parameters.drift
@@ -293,6 +297,7 @@ class Simulator:
         self._number = 0
         late = nanoseconds(parameters.actuators.delay) // self.period_ns
         self._commands = deque([np.zeros(len(self.inputs))] * late)  # on the way to the actuators
+        self._require_above_ground(0)
 
     def retune(self, parameters: AircraftConfig) -> None:
         """Take faults and gusts of these parameters from now on. Raises ParameterError where one
@@ -336,7 +341,8 @@ class Simulator:
         sample, and measure.
 
         Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded
-        where the aircraft has diverged: its state, or an output beyond `flight_core.plausible`.
+        on the ground, and where the aircraft has diverged: its state, or an output beyond
+        `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)
@@ -370,18 +376,29 @@ class Simulator:
                 self._model.advance(k * self.period_ns, late, step * self.period_ns)
             except FlightEnded as ended:
                 self._number = k + step
-                raise FlightEnded(f"{ended}{self._touch(str(ended))}") from None
+                raise self._with_place(ended) from None
+        self._require_above_ground(number * self.period_ns)
 
-    def _touch(self, sentence: str) -> str:
-        """Speed across the heading and the place of a landing, for its sentence; "" of another
-        end.
-        """
-        if LANDED not in sentence:
-            return ""
+    def _require_above_ground(self, t_ns: int) -> None:
+        """Raise FlightEnded where the aircraft comes down on the ground of the scenario."""
+        if self._ground is None:
+            return
+        at = dict(zip(POSE, self.pose().tolist(), strict=True))
+        was_above = self._is_above_ground
+        self._is_above_ground = at["altitude"] > self._ground
+        if was_above and not self._is_above_ground:
+            is_level = abs(at["phi"]) < LEVEL
+            ended = touch(self._title, t_ns, -at["climb"], is_on_wheels=is_level)
+            raise self._with_place(ended)
+
+    def _with_place(self, ended: FlightEnded) -> FlightEnded:
+        """The end with the speed across the heading and the place, where it is a landing."""
+        if ended.end is not End.LANDED:
+            return ended
         at = dict(zip(POSE, self.pose().tolist(), strict=True))
         across = at["v_east"] * math.cos(at["psi"]) - at["v_north"] * math.sin(at["psi"])
         place = f"north {at['north']:.0f} m, east {at['east']:.1f} m"
-        return f", {abs(across):.1f} m/s sideways, at {place}"
+        return FlightEnded(f"{ended}, {abs(across):.1f} m/s sideways, at {place}", ended.end)
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""

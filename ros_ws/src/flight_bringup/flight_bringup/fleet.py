@@ -24,7 +24,7 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.environment import MAX_PARTICIPANTS, require_ros_environment
 from flight_core.fields import Field
 from flight_core.files import read_yaml
-from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, Outcome, never_flew
 from flight_core.parameters import Config, NonNegative, Number, ParameterError, Positive, require
 from flight_guidance.route_file import Origin, read_route
 
@@ -221,7 +221,7 @@ class _Flight:
     progress: Callable[[float, str], None]
     processes: FlightProcesses | None = None
     steps: Steps | None = None
-    outcome: str = INTERRUPTED
+    outcome: Outcome = INTERRUPTED
     stopping: threading.Thread | None = None
 
     def start(self, fleet: Fleet) -> None:
@@ -239,10 +239,10 @@ class _Flight:
                 namespace=absolute_namespace(self.member.name),
             ).__enter__()
         except ParameterError as error:
-            self.outcome = f"{NEVER_FLEW}: {error}"
+            self.outcome = never_flew(str(error))
         else:
-            if reason := self.processes.match():
-                self.end(reason)
+            if (outcome := self.processes.match()) is not None:
+                self.end(outcome)
             elif fleet.lockstep:
                 self.begin((0.0, 0.0))
 
@@ -252,10 +252,9 @@ class _Flight:
         """
         if self.processes is None or self.stopping is not None:
             return
-        if reason := self.processes.begin(
-            (start[0] + self.member.delay, start[1] + self.member.delay)
-        ):
-            self.end(reason)
+        outcome = self.processes.begin((start[0] + self.member.delay, start[1] + self.member.delay))
+        if outcome is not None:
+            self.end(outcome)
         else:
             self.steps = follow(self.processes, self.progress)
 
@@ -265,17 +264,17 @@ class _Flight:
             try:
                 next(self.steps)
             except StopIteration as end:
-                self.end(str(end.value))
+                self.end(end.value)
         return self.steps is not None
 
-    def end(self, outcome: str) -> None:
+    def end(self, outcome: Outcome) -> None:
         """Stop the processes, in another thread: a recorder takes a while to close a log, and the
         fleet flies on.
         """
         self.outcome = outcome
         self.steps = None
         self.progress(
-            self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome
+            self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, str(outcome)
         )
         if self.processes is not None and self.stopping is None:
             self.processes.outcome = outcome
@@ -294,7 +293,7 @@ class Flown:
 
     member: Member
     run: Path
-    outcome: str
+    outcome: Outcome
 
 
 def new_runs(fleet: Fleet, runs: Path) -> list[Path]:

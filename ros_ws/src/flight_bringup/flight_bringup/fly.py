@@ -32,7 +32,14 @@ from flight_bringup.processes import (
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
 from flight_core.files import writing
-from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
+from flight_core.outcome import (
+    COMPLETED,
+    INTERRUPTED,
+    Outcome,
+    ended_early,
+    log_ends_at,
+    never_flew,
+)
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.signals import handle_shutdown
@@ -55,7 +62,7 @@ three seconds."""
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
-Steps = Generator[None, None, str]
+Steps = Generator[None, None, Outcome]
 """A flight that is followed: a step looks at it once. It returns the outcome."""
 
 
@@ -83,7 +90,7 @@ def fly_over_topics(
     namespace: str = "",
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
-) -> str:
+) -> Outcome:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one
@@ -92,8 +99,8 @@ def fly_over_topics(
     `namespace`, as "/uav1". `announce` gets a line for each change of engagement and of reason, but
     not for a changed number, and for what becomes of a proposal of a learner. With `engaged_for`,
     s, the flight ends so long after its first engagement, or with it, or without one when too
-    little time is left. Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a
-    sentence that names the process that ended early.
+    little time is left. The outcome is COMPLETED, LANDED, INTERRUPTED (Ctrl-C, SIGTERM or SIGHUP),
+    or names the process that ended early.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -118,24 +125,23 @@ def fly_over_topics(
                 namespace=namespace,
             ) as processes,
         ):
-            if reason := processes.begin():
-                processes.outcome = reason
-            else:
-                processes.outcome = last(follow(processes, progress, announce, engaged_for))
+            begun = processes.begin()
+            processes.outcome = begun or last(follow(processes, progress, announce, engaged_for))
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
     except NotReadyError as error:
-        return f"{NEVER_FLEW}: {error}"
+        return never_flew(str(error))
 
 
-def last(steps: Steps) -> str:
+def last(steps: Steps) -> Outcome:
     """Follow a flight to its end. Returns the outcome."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
-            return str(end.value)
+            outcome: Outcome = end.value
+            return outcome
         time.sleep(POLL_PERIOD)
 
 
@@ -183,30 +189,30 @@ class _Span:
         self._begins = begins
         self.engaged = False  # the controller has published
 
-    def outcome(self, t: float) -> str:
-        """The outcome once the log holds the flight, or is not going to; empty before."""
+    def outcome(self, t: float) -> Outcome | None:
+        """The outcome once the log holds the flight, or is not going to; None before."""
         if (
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
             self._until = stamp - self._processes.start_time
             self._moved = t
         if t < self._duration:
-            return ""
+            return None
         if self._until >= self._duration - STAMP_ERROR:
             return COMPLETED
         if not self._flies or t < self._moved + LOG_TIMEOUT:
-            return ""
-        return ended_early(self._until, self._duration) if self._begins else COMPLETED
+            return None
+        return log_ends_at(self._until, self._duration) if self._begins else COMPLETED
 
-    def failed(self, t: float) -> str:
-        """Why the flight has not begun; empty while it may begin, and from the first u on."""
+    def failed(self, t: float) -> Outcome | None:
+        """Why the flight has not begun; None while it may begin, and from the first u on."""
         self._flies = self._flies or self._processes.is_flying()
         if self._flies or t < FIRST_U:
-            return ""
+            return None
         if self.engaged:
-            return f"{NEVER_FLEW}: u did not reach the aircraft"
+            return never_flew("u did not reach the aircraft")
         why = self._processes.last_words(CONTROLLER)
-        return f"{NEVER_FLEW}: y did not reach the controller{f' ({why})' if why else ''}"
+        return never_flew(f"y did not reach the controller{f' ({why})' if why else ''}")
 
 
 def _follow_real_time(
@@ -228,12 +234,8 @@ def _follow_real_time(
     while True:
         _announce_learned(processes, processes.start_time, announce)
         t = seconds(monitor.clock.monotonic_ns()) - processes.started
-        if outcome := span.outcome(t):
+        if outcome := span.outcome(t) or processes.ended() or span.failed(t):
             return outcome
-        if (reason := processes.ended_early()) is not None:
-            return reason
-        if reason := span.failed(t):
-            return reason
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
             if (kind := NUMBER.sub("", line)) != announced:
@@ -246,7 +248,7 @@ def _follow_real_time(
         ):
             return COMPLETED
         if engaged_at == math.inf and t > (latest := scenario.flight.duration - engaged_for) > 0.0:
-            return f"not engaged within {latest:.3g} s"
+            return ended_early(f"not engaged within {latest:.3g} s")
         if phase not in {"", "ENGAGED"}:
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:
@@ -290,8 +292,8 @@ def _follow_lockstep(
     timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
     first: tuple[float, float] | None = None  # monotonic and flight time, s
     while t < end or not processes.is_completed():
-        if (reason := processes.ended_early()) is not None:
-            return reason
+        if (outcome := processes.ended()) is not None:
+            return outcome
         now = time.monotonic()
         if (recorded := processes.monitor.recorded()) is not None:
             t = recorded
@@ -301,7 +303,7 @@ def _follow_lockstep(
             else:
                 text = f"lockstep, {(t - first[1]) / (now - first[0]):.1f} times real time"
         elif now > last_change + timeout:
-            return f"no progress for {timeout:g} s at t = {t:g} s"
+            return ended_early(f"no progress for {timeout:g} s at t = {t:g} s")
         _announce_learned(processes, 0.0, announce)
         progress(t, text)
         yield
@@ -315,7 +317,7 @@ def fly_in_process(
     progress: Progress,
     learn: Learn | None = None,
     announce: Callable[[str], None] = lambda line: None,
-) -> str:
+) -> Outcome:
     """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`.
     Returns the outcome.
 
@@ -380,7 +382,7 @@ def fly_and_report(
 
     Examples:
         >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> flight.flight.tape.outcome, flight.report.name
+        >>> str(flight.flight.tape.outcome), flight.report.name
         ('completed', 'report.html')
     """
     require(

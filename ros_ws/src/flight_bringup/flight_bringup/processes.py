@@ -35,7 +35,17 @@ from flight_bringup.graph import (
     start_lead,
 )
 from flight_core.files import dump_yaml, write_file
-from flight_core.outcome import COMPLETED, INTERRUPTED, LOST_CONTACT, NEVER_FLEW, STATUS_BAD_INPUT
+from flight_core.outcome import (
+    COMPLETED,
+    INTERRUPTED,
+    STATUS_BAD_INPUT,
+    STATUS_LANDED,
+    STATUS_LOST_CONTACT,
+    End,
+    Outcome,
+    ended_early,
+    never_flew,
+)
 from flight_core.parameters import ParameterError, nest
 from flight_core.rates import seconds
 from flight_core.scheduling import leave_real_time_priority
@@ -90,13 +100,13 @@ def handle_signals(handler: Any) -> Iterator[None]:
             signal.signal(number, previous)
 
 
-def leave_outcome(run: Path, outcome: str) -> None:
+def leave_outcome(run: Path, outcome: Outcome) -> None:
     """Leave the outcome of a flight for the recorder; `Path()` records none. A full disk costs the
     log the outcome alone.
     """
     if run.name:
         with suppress(OSError, ParameterError):
-            write_file(run / OUTCOME_FILE, outcome)
+            write_file(run / OUTCOME_FILE, outcome.text())
 
 
 class NotReadyError(ParameterError):
@@ -230,7 +240,7 @@ class FlightProcesses:
                 self._start(node)
         except BaseException as error:
             if isinstance(error, ParameterError):
-                self.outcome = f"{NEVER_FLEW}: {error}"
+                self.outcome = never_flew(str(error))
             self.stop()
             raise
         return self
@@ -238,30 +248,31 @@ class FlightProcesses:
     def _set_start(self, start: tuple[float, float]) -> None:
         self.start_time, self.started = start
 
-    def match(self) -> str:
-        """Wait until each node is ready and each input has a publisher. Returns why the flight
-        cannot begin, else "".
+    def match(self) -> Outcome | None:
+        """Wait until each node is ready and each input has a publisher. Returns the outcome of a
+        flight that cannot begin.
         """
         deadline = time.monotonic() + READY_TIMEOUT
         while self._on_start and (waiting := self._unmatched()):
-            if (reason := self.ended_early()) is not None:
-                return reason
+            if (outcome := self.ended()) is not None:
+                return outcome
             if time.monotonic() > deadline:
-                return f"{NEVER_FLEW}: {'; '.join(waiting)} after {READY_TIMEOUT:g} s"
+                return never_flew(f"{'; '.join(waiting)} after {READY_TIMEOUT:g} s")
             time.sleep(POLL_PERIOD)
-        return ""
+        return None
 
-    def begin(self, start: tuple[float, float] | None = None) -> str:
-        """Set t = 0 after `match`. Returns why the flight cannot begin, else "".
+    def begin(self, start: tuple[float, float] | None = None) -> Outcome | None:
+        """Set t = 0 after `match`. Returns the outcome of a flight that cannot begin.
 
         `start`: system time and monotonic time of t = 0, s, of several flights at once; by default
         LEAD from now.
         """
         leave_real_time_priority()  # the nodes have it
-        if not (reason := self.match()) and self._on_start:
+        outcome = self.match()
+        if outcome is None and self._on_start:
             self._set_start(start or start_instants(LEAD, self.monitor))
             self.monitor.start(self.start_time)
-        return reason
+        return outcome
 
     def _names(self, process: NodeProcess) -> list[str]:
         """Names of the nodes of a process."""
@@ -309,9 +320,10 @@ class FlightProcesses:
 
     def _wait_until_ready(self, deadline: float) -> None:
         while (waiting := self.waiting()) or not self.monitor.has_time():
-            if (reason := self.ended_early()) is not None:
+            if (outcome := self.ended()) is not None:
                 statuses = {process.popen.poll() for process in self.processes}
-                raise (ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError)(reason)
+                error = ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError
+                raise error(outcome.reason)
             if time.monotonic() > deadline:
                 late = (
                     f"timed out waiting for {', '.join(waiting)}: not ready"
@@ -323,26 +335,30 @@ class FlightProcesses:
                 )
             time.sleep(POLL_PERIOD)
 
-    def ended_early(self) -> str | None:
-        """The reason of the first process that has ended, or why simulated time has; None while all
+    def ended(self) -> Outcome | None:
+        """The outcome by the first process that has ended, or by simulated time; None while all
         run. In real time the law flies on without a learner.
 
-        On a busy host several may have ended since the last call. One that lost contact with
-        another is then not the cause.
+        On a busy host several may have ended since the last call. A landing is then the cause, and
+        a process that lost contact with another is not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
         ]
-        reasons = [reason for process in processes if (reason := _end(process)) is not None]
-        first = min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
-        return first or self.monitor.clock_ended() or None
+        ended = [process for process in processes if process.popen.poll() is not None]
+        causes = {STATUS_LANDED: 0, STATUS_LOST_CONTACT: 2}
+        ended.sort(key=lambda process: causes.get(process.popen.returncode, 1))
+        if ended:
+            return _outcome(ended[0])
+        clock = self.monitor.clock_ended()
+        return ended_early(clock) if clock else None
 
     def learner_ended(self) -> str:
         """How the learner has ended, told once; else empty."""
         for process in self.processes:
-            if process.node is LEARNER and (reason := _end(process)) is not None:
+            if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)
-                return reason
+                return _outcome(process).reason
         return ""
 
     def waiting(self) -> list[str]:
@@ -417,20 +433,19 @@ class FlightProcesses:
             self.processes = []
 
 
-def _end(process: NodeProcess) -> str | None:
-    """How a process has ended; None while it runs."""
+def _outcome(process: NodeProcess) -> Outcome:
+    """The outcome of a flight by a process that has ended."""
     name = process.node.executable
-    status = process.popen.poll()
-    if status is None:
-        return None
-    process.finish()
+    status = process.finish()
     if status < 0:
-        return f"{name} was killed by {signal.Signals(-status).name}"
+        return ended_early(f"{name} was killed by {signal.Signals(-status).name}")
     if status == 0:
-        return f"{name} was shut down"
+        return ended_early(f"{name} was shut down")
     lines = [line for line in process.lines if line.strip()] or ["no output"]
     cause = next(
         (line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1]
     )
     message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
-    return f"{name} ended with status {status}: {message}"
+    if status == STATUS_LANDED:
+        return Outcome(End.LANDED, message)
+    return ended_early(f"{name} ended with status {status}: {message}")

@@ -18,17 +18,8 @@ from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.modes import Mode
-from flight_core.outcome import (
-    COMPLETED,
-    NEVER_FLEW,
-    STATUS_ENDED_EARLY,
-    STATUS_INCOMPLETE,
-    STATUS_INTERRUPTED,
-    exit_status,
-)
+from flight_core.outcome import SEVEREST, STATUS_INTERRUPTED, never_flew
 from flight_core.parameters import ParameterError
-
-SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 
 
 def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Fleet:
@@ -64,7 +55,7 @@ def fly_fleet_file(chosen: Fleet, runs: Sequence[Path], *, as_json: bool) -> int
         print_json({name: result.summary for name, result in results.items()})
     else:
         _show(chosen.name, flown, results)
-    statuses = [exit_status(result.summary["outcome"]) for result in reported.values()]
+    statuses: list[int] = [result.summary["outcome"]["status"] for result in reported.values()]
     statuses += [STATUS_INTERRUPTED] if len(reported) < len(flown) else []
     return max(statuses, key=SEVEREST.index)
 
@@ -80,7 +71,8 @@ class _Result(NamedTuple):
 
 def _unreported(flown: Flown) -> _Result:
     """What is known of an aircraft before its report is written."""
-    outcome = f"{flown.outcome}, no report: rise-di report writes it"
+    outcome = flown.outcome.as_json()
+    outcome["sentence"] = f"{flown.outcome}, no report: rise-di report writes it"
     return _Result({"outcome": outcome, "duration": None, "ticks": None, "account": None}, None)
 
 
@@ -89,7 +81,7 @@ def _report(flown: Flown) -> _Result:
     try:
         flight = write_report(flown.run, flown.outcome).flight
     except ParameterError as error:  # before the first sample
-        outcome = f"{NEVER_FLEW}: {error}" if flown.outcome == COMPLETED else flown.outcome
+        outcome = never_flew(str(error)) if flown.outcome.status == 0 else flown.outcome
         return _Result(write_empty_summary(flown.run, flown.member.scenario, outcome), None)
     internals = flight.tape.signals.get("internals")
     return _Result(
@@ -111,7 +103,7 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
             "-" if summary["duration"] is None else f"{summary['duration']:.1f}",
             "-" if ticks is None else str(ticks["ticks"]),
             "-" if engaged is None else f"{100.0 * engaged:.4g} %{taken_over(summary, 'ticks')}",
-            summary["outcome"],
+            summary["outcome"]["sentence"],
         )
         lines.append(f"{each.member.name}: {display_path(each.run)}")
         if sentence := (summary["account"] or {}).get("busy"):

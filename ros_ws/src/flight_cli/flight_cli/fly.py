@@ -37,7 +37,7 @@ from flight_cli.words import argument, json_option, option, require_unused, sett
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
-from flight_core.outcome import exit_status
+from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import ENDINGS, read_fence_file
 from flight_guidance.route_formats import FENCES
@@ -54,9 +54,10 @@ class Fly(RouteWords):
     """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real
     time.
 
-    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with
-    an incomplete log or a leg missed or not flown, 130 interrupted; of a fleet the severest of its
-    aircraft.
+    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed or
+    landed and short of something, which the outcome names with its figure: the errors, the law
+    engaged, speed, height, fence, route, touch-down zone, log; 130 interrupted. Of a fleet it is
+    the severest of its aircraft.
     """
 
     context: typer.Context
@@ -137,8 +138,8 @@ class Fly(RouteWords):
                     namespace=namespace,
                     announce=announce,
                 )
-            if outcome == "completed":
-                progress(chosen.flight.duration, outcome)
+            if outcome.end is End.COMPLETED:
+                progress(chosen.flight.duration, str(outcome))
         raise typer.Exit(_report(chosen, run, outcome, as_json=self.as_json))
 
     def _scenario(self) -> Scenario:
@@ -217,27 +218,26 @@ class Fly(RouteWords):
         print(*self.context.with_resource(watched(*runs, fleet=fleet)), sep="\n", file=sys.stderr)
 
 
-def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> int:
+def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -> int:
     """Write and print the report of a flight. Returns the exit status."""
-    status = exit_status(outcome)
     try:
         result = write_report(run, outcome)
     except ParameterError:
-        if status == 0:
+        if outcome.status == 0:
             raise
         write_empty_summary(run, scenario, outcome)
         warn(f"error: {outcome}, before the first sample; see {display_path(run)}")
-        return status
-    outcome = result.flight.summary["outcome"]
+        return outcome.status
+    told = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
         print(
-            f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  "
+            f"outcome: {told['sentence']}\nlog:     {display_path(result.mcap)}\nreport:  "
             f"{display_path(result.report)}"
         )
-    return exit_status(outcome)
+    return int(told["status"])
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

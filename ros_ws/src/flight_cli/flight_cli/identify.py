@@ -372,7 +372,9 @@ def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _R
     """The scenario of a log, flown in this process under feedforward and observer of a model."""
     controller, origin = observed(scenario.rise_di(), scenario, model, margin)
     again = simulate(replace(scenario, controller=controller))
-    return _Reflight(origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, again.outcome)
+    return _Reflight(
+        origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, str(again.outcome)
+    )
 
 
 def _show_flights_of_model(

@@ -18,7 +18,7 @@ from flight_analysis.report.run_folder import PROVENANCE, attachments_for
 from flight_cli.output import new_table, say
 from flight_cli.words import REQUIRED, argument, option, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
-from flight_core.outcome import IMPORT
+from flight_core.outcome import End, Outcome
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
@@ -133,7 +133,7 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
         for change in flight.changes:
             writer.write_changes(change.stamp_ns, "/controller", change.values)
         writer.write(flight.tape.signals)
-        writer.add_outcome(IMPORT)
+        writer.add_outcome(Outcome(End.IMPORTED))
     if flight.lost:
         warn(f"warning: {flight.lost} ticks after a gap of the log left out")
     console = Console()

@@ -34,7 +34,7 @@ from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of
 from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
 from flight_cli.settings import parse_settings, settings_option
 from flight_cli.words import argument, json_option, option
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.tape_reader import read_run
@@ -98,7 +98,7 @@ class Replay:
             else:
                 _show(shown, notes)
         equal = result.equal() and (guided is None or guided.equal())
-        part = STATUS_INCOMPLETE if result.compared.sum() < WHOLE * shown.ticks else 0
+        part = STATUS_SHORTFALL if result.compared.sum() < WHOLE * shown.ticks else 0
         raise typer.Exit(part if equal else DIFFERS)
 
 

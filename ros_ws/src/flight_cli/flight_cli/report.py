@@ -20,7 +20,7 @@ from flight_cli.output import LATEST, STDOUT, new_table, print_json, say, show_f
 from flight_cli.repair import repair_log
 from flight_cli.words import argument, json_option, option, setting, values_of
 from flight_core.files import display_path
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import SEVEREST
 
 FILES = ("html", "output", "png", "parquet", "figure", "mat", "tables", "latex")
 
@@ -91,9 +91,9 @@ class Report:
             else:
                 _show(flights)
                 print(f"report:  {display_path(page)}")
-        accounts = [flight.summary["account"] for flight in flights]
-        if any(account and account["lacks"] for account in accounts):
-            raise typer.Exit(STATUS_INCOMPLETE)
+        statuses = [flight.summary["outcome"]["status"] for flight in flights]
+        if status := max(statuses, key=SEVEREST.index):
+            raise typer.Exit(status)
 
 
 def _show(flights: Sequence[RecordedFlight]) -> None:
@@ -102,7 +102,7 @@ def _show(flights: Sequence[RecordedFlight]) -> None:
         show_comparison(Console(), flights)
         return
     show_flight(Console(), flights[0])
-    print(f"outcome: {flights[0].summary['outcome']}")
+    print(f"outcome: {flights[0].summary['outcome']['sentence']}")
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
@@ -110,7 +110,7 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
     for k, (label, flight) in enumerate(
         zip(comparison.labels(flights), flights, strict=True), start=1
     ):
-        result = f"{flight.summary['outcome']}{taken_over(flight.summary, 'errors')}"
+        result = f"{flight.summary['outcome']['sentence']}{taken_over(flight.summary, 'errors')}"
         say(console, f"{k}: {label}, {result}")
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table(

@@ -1,53 +1,194 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Outcomes of a flight."""
+"""The outcome of a flight as a record: end, reason and shortfalls.
+
+The sentence and the exit status come from the record. Nothing is read back from a sentence.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
 
 from flight_core.text import bounded
 
-COMPLETED = "completed"
-INTERRUPTED = "interrupted"
-INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
-MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
-LOOP_LOST = "loop lost"  # after an outcome and a comma, before the inputs and outputs
-OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how long and how far
-# after an outcome, a comma and the legs of a route that were ahead at the end
-NOT_FLOWN = "not flown"
-NOT_JOINED = "the last orbit not joined"  # after an outcome and a comma, before how far away
-BESIDE = "outside of the touch-down zone"  # after a landing and a comma, before how far
-LANDED = " landed "  # in an outcome, between the aircraft and the time
-IMPORT = "imported"  # of a log that an autopilot wrote
-NEVER_FLEW = "never flew"  # before the reason
-UNKNOWN = "unknown"  # on the tape of a log
-STATUS_INTERRUPTED = 130  # exit statuses of a flight
 STATUS_BAD_INPUT = 2  # also of a node
-STATUS_ENDED_EARLY = 3  # 0 completed or landed
-# completed with a loop lost, an incomplete log, a leg missed or not flown, an orbit not joined, or
-# outside of the fence, or landed outside of the touch-down zone
-STATUS_INCOMPLETE = 4
-# before the name of the node lost: the end of a node that is not the cause
-LOST_CONTACT = "lost contact with"
+STATUS_ENDED_EARLY = 3  # also of a node
+STATUS_SHORTFALL = 4  # the flight reached its end, and falls short of something
+STATUS_LANDED = 5  # of the node of an aircraft alone, which ends with the landing
+STATUS_LOST_CONTACT = 6  # of a node alone: another node has ended, and that is the cause
+STATUS_INTERRUPTED = 130
+
+SEVEREST = (0, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
+"""Exit statuses of flights; that of several flights is the last one of theirs."""
 
 
-def ended_early(held: float, duration: float) -> str:
+class End(StrEnum):
+    """How a flight ended."""
+
+    COMPLETED = "completed"  # at its duration
+    LANDED = "landed"  # on the wheels, softly
+    ENDED_EARLY = "ended early"
+    NEVER_FLEW = "never flew"
+    INTERRUPTED = "interrupted"  # by the user
+    IMPORTED = "imported"  # a log that another program wrote
+    UNKNOWN = "unknown"
+
+
+class Aim(StrEnum):
+    """What a flight can fall short of."""
+
+    ENGAGEMENT = "engagement"  # the law flies while it is asked to
+    ERROR = "error"  # the linear loop allows the error of an output
+    STALL = "stall"  # the airspeed stays above the stall speed
+    GROUND = "ground"  # the aircraft stays above the ground
+    ALTITUDE = "altitude"  # between the least and the largest altitude
+    FENCE = "fence"  # inside
+    ROUTE = "route"  # every leg is flown
+    ORBIT = "orbit"  # the last orbit is joined
+    TOUCHDOWN = "touchdown"  # in the zone of the landing
+    GUIDANCE = "guidance"  # each step gives commands
+    LOG = "log"  # it holds the whole flight
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shortfall:
+    """A shortfall of a flight as a sentence and in figures, SI."""
+
+    aim: Aim
+    sentence: str
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a flight.
+
+    `str` is a sentence: "completed, outside of the fence for 2.0 s, 20 m at most".
+
+    Examples:
+        >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
+        >>> str(tape.outcome), tape.outcome.status
+        ('completed', 0)
+    """
+
+    end: End
+    reason: str = ""  # a sentence, where the end alone does not say it
+    shortfalls: tuple[Shortfall, ...] = ()
+
+    @property
+    def has_reached_end(self) -> bool:
+        """Whether the flight reached the duration, or landed."""
+        return self.end in {End.COMPLETED, End.LANDED}
+
+    @property
+    def status(self) -> int:
+        """The exit status: 0 for a flight without a shortfall that reached the end."""
+        if self.end is End.INTERRUPTED:
+            return STATUS_INTERRUPTED
+        if self.end in {End.ENDED_EARLY, End.NEVER_FLEW}:
+            return STATUS_ENDED_EARLY
+        return STATUS_SHORTFALL if self.shortfalls or self.end is End.UNKNOWN else 0
+
+    def __str__(self) -> str:
+        """The end, the reason and the shortfalls as a sentence."""
+        begin = self.reason or self.end.value
+        if self.end in {End.NEVER_FLEW, End.UNKNOWN} and self.reason:
+            begin = f"{self.end}: {self.reason}"
+        return ", ".join([begin, *(each.sentence for each in self.shortfalls)])
+
+    def as_json(self) -> dict[str, Any]:
+        """The record for `summary.json`, with sentence and exit status."""
+        return {
+            "end": self.end.value,
+            "reason": self.reason,
+            "shortfalls": [
+                {"aim": each.aim.value, "sentence": each.sentence, "figures": dict(each.figures)}
+                for each in self.shortfalls
+            ],
+            "sentence": str(self),
+            "status": self.status,
+        }
+
+    def record(self) -> dict[str, str]:
+        """The end and the reason, for the log: the shortfalls follow from the log itself."""
+        return {"end": self.end.value, "reason": self.reason}
+
+    def text(self) -> str:
+        """The `record` as JSON."""
+        return json.dumps(self.record())
+
+
+COMPLETED = Outcome(End.COMPLETED)
+INTERRUPTED = Outcome(End.INTERRUPTED)
+UNKNOWN = Outcome(End.UNKNOWN, "neither the run nor the log has one")
+
+
+def never_flew(reason: str) -> Outcome:
+    """The outcome of a flight without a begin."""
+    return Outcome(End.NEVER_FLEW, bounded(reason))
+
+
+def ended_early(reason: str) -> Outcome:
+    """The outcome of a flight with an end before the duration."""
+    return Outcome(End.ENDED_EARLY, bounded(reason))
+
+
+def log_ends_at(held: float, duration: float) -> Outcome:
     """The outcome of a flight of `duration` s whose log holds y, y_m and u up to the flight time
     `held`, s; -inf: none.
     """
-    if held < 0.0:
-        return f"ended early: the log does not hold y, y_m and u of {duration:g} s"
-    return f"ended early: the log holds y, y_m and u up to t = {held:.3f} of {duration:g} s"
+    part = f"up to t = {held:.3f} of" if held >= 0.0 else "of"
+    verb = "holds" if held >= 0.0 else "does not hold"
+    return ended_early(f"ended early: the log {verb} y, y_m and u {part} {duration:g} s")
 
 
-def exit_status(outcome: str) -> int:
-    """Exit status of a flight by the outcome."""
-    if outcome.startswith(f"{COMPLETED}, ") or f", {OUTSIDE}" in outcome or BESIDE in outcome:
-        return STATUS_INCOMPLETE
-    if LANDED in outcome:
-        return 0
-    return {COMPLETED: 0, INTERRUPTED: STATUS_INTERRUPTED}.get(outcome, STATUS_ENDED_EARLY)
+def read_outcome(record: object) -> Outcome:
+    """The outcome of a `record`, of a log or of `summary.json`; UNKNOWN for another object."""
+    if not isinstance(record, Mapping):
+        return UNKNOWN
+    try:
+        end = End(record["end"])
+        reason = bounded(str(record["reason"]))
+    except (KeyError, ValueError):
+        return UNKNOWN
+    return UNKNOWN if end is End.UNKNOWN else Outcome(end, reason)
+
+
+def parsed_outcome(text: str) -> Outcome:
+    """The outcome of a record in JSON; UNKNOWN for another text."""
+    try:
+        return read_outcome(json.loads(text))
+    except ValueError:
+        return UNKNOWN
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
-    """A flight cannot continue. The message is one sentence for the user, printable and bounded."""
+    """A flight ends before the duration, early or by a landing.
 
-    def __init__(self, sentence: str) -> None:
+    The message is a sentence for the user, printable and bounded.
+    """
+
+    def __init__(self, sentence: str, end: End = End.ENDED_EARLY) -> None:
         super().__init__(bounded(sentence))
+        self.end = end
+
+    @property
+    def outcome(self) -> Outcome:
+        """The outcome of the flight."""
+        return Outcome(self.end, str(self))
+
+    @property
+    def status(self) -> int:
+        """The exit status of the node."""
+        return STATUS_LANDED if self.end is End.LANDED else STATUS_ENDED_EARLY
+
+
+class LostContact(FlightEnded):
+    """A node ends after the end of another node."""
+
+    @property
+    def status(self) -> int:
+        """The exit status of the node."""
+        return STATUS_LOST_CONTACT

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.arguments import as_instance
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import COMPLETED, Outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
@@ -162,7 +162,7 @@ class Tape:
     signals: Mapping[str, Signal]
     start_ns: int = 0
     notes: tuple[str, ...] = ()
-    outcome: str = COMPLETED
+    outcome: Outcome = COMPLETED
     scenario: object = None
     recording: Mapping[str, Recording] = field(default_factory=dict)
     duration: float | None = None

@@ -209,10 +209,14 @@ class GuidanceConfig(NodeConfig):
                 f"{self.rate:g} Hz",
                 f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
             )
-        lowest, highest = self._altitudes()
+        lowest, highest = self.altitudes()
         require(
             lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
         )
+        if self.home.altitude is not None:
+            is_between = lowest <= self.home.altitude <= highest
+            band = f"{lowest:g} to {highest:g} m, of altitude_floor and ceiling"
+            require(is_between, "home.altitude", f"{self.home.altitude:g} m", band)
         if climbs:
             self._check_multicopter()
         else:
@@ -321,7 +325,7 @@ class GuidanceConfig(NodeConfig):
     def _largest_speed(self) -> float:
         return self.speed_limit or protection.FASTEST * self.speed
 
-    def _altitudes(self) -> tuple[float, float]:
+    def altitudes(self) -> tuple[float, float]:
         """Least and largest altitude, m."""
         return (
             -math.inf if self.altitude_floor is None else self.altitude_floor,
@@ -416,7 +420,7 @@ class GuidanceConfig(NodeConfig):
                 floor / protection.FLOOR,
                 self.least_radius(),
                 self._largest_speed(),
-                *self._altitudes(),
+                *self.altitudes(),
             ),
             slew=tuple(slew[name] for name in self.outputs),
             turn_lag=max(2.0 / yaw - lead, 0.0),
@@ -468,7 +472,7 @@ class GuidanceConfig(NodeConfig):
                 0.0,
                 0.0,
                 self._largest_speed(),
-                *self._altitudes(),
+                *self.altitudes(),
             ),
             slew=tuple(frequency[name] * rates[name] for name in self.outputs),
             channels=MULTICOPTER,
@@ -497,7 +501,7 @@ class GuidanceConfig(NodeConfig):
             route = self._airplane_route(waypoints)
         else:
             no_limits = (0.0,) * 4  # of roll, climb, sink and wind
-            bounds = (self._largest_speed(), *self._altitudes())
+            bounds = (self._largest_speed(), *self.altitudes())
             can = Performance(self.speed, 0.0, self.bank, *no_limits, *bounds)
             braking = self._gains(self.drag).braking
             route = route_through(waypoints, self.radius, braking, can)
@@ -520,7 +524,7 @@ class GuidanceConfig(NodeConfig):
             sink,
             self.wind,
             fastest,
-            *self._altitudes(),
+            *self.altitudes(),
         )
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         # an empty route is refused below

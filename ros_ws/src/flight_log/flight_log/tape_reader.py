@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import is_folder, parse_yaml, read_file
-from flight_core.outcome import UNKNOWN
+from flight_core.outcome import read_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.scenario_file import A_SCENARIO
@@ -203,7 +203,7 @@ def _tape(
         *(recording_note(name, clock, start_ns) for name, clock in recording.items()),
         *conflicts,
     ]
-    outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
+    outcome = read_outcome(log.metadata.get(OUTCOME))
     spans = _spans((name, topics[name].spans) for name in filled)
     processes = flight_processes(spans, ready_times(log.lines), aircraft)
     return Tape(

@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from flight_core.files import writing
+from flight_core.outcome import Outcome
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_log.bag import OUTCOME, BagChannel, BagWriter, LogAttachments
@@ -95,9 +96,9 @@ class TapeWriter:
         channel = self._channels[topic]
         self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, data)
 
-    def add_outcome(self, outcome: str) -> None:
+    def add_outcome(self, outcome: Outcome) -> None:
         """Store the outcome of the flight in the log."""
-        self._bag.add_metadata(OUTCOME, {"outcome": outcome})
+        self._bag.add_metadata(OUTCOME, outcome.record())
 
     def _write(self, signals: Mapping[str, Signal]) -> None:
         for topic in signals:

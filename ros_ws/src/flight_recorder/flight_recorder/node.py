@@ -20,6 +20,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
 from flight_core.files import dump_yaml, is_file, link_latest, read_file, writing
+from flight_core.outcome import UNKNOWN, Outcome, parsed_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
@@ -344,8 +345,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
                     "speed": f"{self.simulated.speed():.3g}",
                 }
                 self._bag.add_metadata(SIMULATED_TIME, values)
-            if outcome := self._told_outcome():
-                self._bag.add_metadata(OUTCOME, {"outcome": outcome})
+            if (outcome := self._told_outcome()) is not UNKNOWN:
+                self._bag.add_metadata(OUTCOME, outcome.record())
             self._bag.close()
         except OSError as error:
             return f"; {self._bag.path.name} is truncated: it cannot be written ({error.strerror})"
@@ -367,19 +368,17 @@ class RecorderNode(FlightNode[RecorderConfig]):
             }
             self._bag.add_metadata(SILENCES, texts)
 
-    def _told_outcome(self) -> str:
-        """The outcome that the flight left for the log; empty without one."""
+    def _told_outcome(self) -> Outcome:
+        """The outcome that the flight left for the log; UNKNOWN without one."""
         file = self._bag.directory / OUTCOME_FILE
+        if not is_file(file):
+            return UNKNOWN
         try:
-            outcome = (
-                read_file(file, OUTCOME_FILE, "a text").decode(errors="replace")
-                if is_file(file)
-                else ""
-            )
-            file.unlink(missing_ok=True)
+            text = read_file(file, OUTCOME_FILE, "an outcome").decode(errors="replace")
+            file.unlink()
         except (OSError, ParameterError):
-            return ""
-        return bounded(outcome.strip())
+            return UNKNOWN
+        return parsed_outcome(text)
 
     # A topic may appear late, and with any QoS
 

@@ -18,7 +18,12 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from flight_core.outcome import STATUS_BAD_INPUT, STATUS_ENDED_EARLY, FlightEnded
+from flight_core.outcome import (
+    STATUS_BAD_INPUT,
+    STATUS_ENDED_EARLY,
+    End,
+    FlightEnded,
+)
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.scheduling import disable_timer_slack, request_short_slices
@@ -74,9 +79,9 @@ def run(
     """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP. The exit status is
     then 0.
 
-    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an
-    unexpected exception. The `early_participant` of flight_ros.startup is destroyed once the nodes
-    exist.
+    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 5 for a
+    landing, 6 where another node has ended, 1 for an unexpected exception. The `early_participant`
+    of flight_ros.startup is destroyed once the nodes exist.
 
     Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep
     there are no ticks: a node advances when its input has arrived. The executor serves parameters
@@ -132,8 +137,9 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(STATUS_BAD_INPUT)
     except FlightEnded as error:
-        node.get_logger().fatal(str(error))
-        sys.exit(STATUS_ENDED_EARLY)
+        log = node.get_logger()
+        (log.info if error.end is End.LANDED else log.fatal)(str(error))
+        sys.exit(error.status)
     except ClockRestarted as restart:
         node.get_logger().error(f"{restart}; this node begins again")
         return False

@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from flight_core.outcome import LOST_CONTACT, FlightEnded
+from flight_core.outcome import LostContact
 from flight_core.parameters import NodeConfig, ParameterError, flatten, require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -409,7 +409,7 @@ class FlightNode(Node, Generic[P]):
             self.simulated.require_one_simulation()
         if self.peers is not None and (role := self.peers.lost()):
             self.peers.report(role)
-            raise FlightEnded(f"{LOST_CONTACT} {role}")
+            raise LostContact(f"lost contact with {role}")
 
     def finish(self) -> None:
         """End the node. In lockstep, wait until its last messages have arrived."""

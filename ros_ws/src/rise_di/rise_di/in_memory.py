@@ -9,7 +9,7 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate as fly_in_memory
 from flight_analysis.report.account import account
-from flight_analysis.report.flight_outcome import final_outcome
+from flight_analysis.report.shortfalls import judged
 from flight_core.tape import Tape
 from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
@@ -37,18 +37,17 @@ def simulate(
         announce: Takes the events of the learning.
 
     Returns:
-        The tape: signals of shape (N, k), SI and radians. `outcome` is that of `rise-di fly`: the
-        reason of an early end, or "completed", with a lost loop, a missed leg and the time outside
-        of the fence.
+        The tape: signals of shape (N, k), SI and radians. `outcome` is that of `rise-di fly`: how
+        the flight ended, and what it falls short of.
 
     Raises:
         ParameterError: `scenario` is no Scenario, or learns and `learn` is None.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> tape.outcome, tape["y"]["q"].shape
+        >>> str(tape.outcome), tape["y"]["q"].shape
         ('completed', (51,))
     """
     tape = fly_in_memory(scenario, progress, guide, control, learn, announce)
-    judged = account(tape, scenario, tape.outcome)
-    return replace(tape, outcome=final_outcome(tape.outcome, judged))
+    held = account(tape, scenario, tape.outcome)
+    return replace(tape, outcome=judged(tape.outcome, tape, scenario, held))

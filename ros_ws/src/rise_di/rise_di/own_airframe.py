@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import End
 from flight_core.parameters import require
 from flight_core.tape import Tape
 from flight_design.gains import first_flight, gain_yaml
@@ -193,7 +193,7 @@ def _flying(
         tape = simulate(flown)
         used = _used(flown, tape)
         scenario = text(files[0], section)
-        if tape.outcome == COMPLETED and max(used.values()) <= CLEAR:
+        if tape.outcome.end is End.COMPLETED and max(used.values()) <= CLEAR:
             return scenario, ""
         hardest = max(used, key=lambda key: used[key])
         if size == SIZES[-1]:
@@ -236,7 +236,7 @@ def _shortfall(flown: Scenario, tape: Tape, hardest: str) -> str:
     if {units[most], input_unit} == {"rad"}:
         each = f"a degree of {most} asks {asked[most]:.3g} degrees of {hardest}"
         size = f"{np.degrees(reached[most]):.2g} degrees"
-    ended = "" if tape.outcome == COMPLETED else f", and ends: {tape.outcome}"
+    ended = "" if tape.outcome.end is End.COMPLETED else f", and ends: {tape.outcome}"
     return (
         f"The first flight has {hardest} at {100.0 * _used(flown, tape)[hardest]:.0f} % of its end "
         f"stop{ended}: {cause} ask for it; {each}, and {most} reaches {size}."

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flight_analysis.report.account import account
-from flight_analysis.report.flight_outcome import final_outcome
+from flight_analysis.report.shortfalls import judged
 from flight_core.arguments import as_number
 from flight_core.installation import require_package
 from flight_core.modes import Mode
@@ -176,7 +176,8 @@ def fly_plant(
 
     `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
     Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
-    flight early, with the reason in `outcome` of the tape, which also tells of a lost loop.
+    flight early, with the reason in `outcome` of the tape, which also tells of errors that the
+    linear loop of y_dot = Omega u does not allow.
 
     Args:
         plant: plant(t, u, dt) -> y: t, dt in s, u (p,), y (m,), SI, deviations from trim.
@@ -195,7 +196,7 @@ def fly_plant(
         >>> def still(t, u, dt):
         ...     return np.zeros(4)
         >>> tape = rise_di.fly_plant(still, scenario.controller, scenario.reference_model, 0.1)
-        >>> tape.outcome
+        >>> str(tape.outcome)
         'completed'
     """
     loop = Loop(controller)
@@ -218,7 +219,7 @@ def fly_plant(
                 plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured
             )
         except FlightEnded as error:
-            outcome = str(error)
+            outcome = error.outcome
             break
         y_m = select(loop.outputs, config.outputs, reference.sample(k * samples))
         u = loop.step(seconds(t_ns), y, y_m)
@@ -229,7 +230,8 @@ def fly_plant(
             rows[topic].append((t_ns, value))
     signals = {topic: _signal(names, rows[topic]) for topic, names in channels.items()}
     tape = Tape(signals, outcome=outcome)
-    return replace(tape, outcome=final_outcome(outcome, account(tape, None, outcome)))
+    held = account(tape, None, outcome)
+    return replace(tape, outcome=judged(outcome, tape, None, held, loop.config))
 
 
 def _reference_model(

@@ -22,7 +22,7 @@ from tests.ros.flight_bringup.test_lockstep import ROUGH, both_cores_busy, scena
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run
 
@@ -93,7 +93,7 @@ def fly_with_a_fault(
         read_run(folder / "latest")
     else:
         stop(victim, random.uniform(0.02, LONGEST_STOP))
-        assert command.end() == STATUS_INCOMPLETE, command.output  # the route takes longer
+        assert command.end() == STATUS_SHORTFALL, command.output  # the route takes longer
         assert outcome(folder) == "completed, legs 0 to 6 not flown"
         require_equal_bits(read_run(folder / "latest").tape, expected)
     assert "Traceback" not in command.output

@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.stations import (
     Station,
     Topics,
 )
-from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
+from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded, Outcome, ended_early
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.tape import Signal, Tape
@@ -101,7 +101,7 @@ def fly(
     control: Callable[[ControllerConfig], Controller] = Controller,
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
-) -> str:
+) -> Outcome:
     """Fly a scenario and return the outcome. `record` takes the samples once per simulated second
     and at the end.
 
@@ -145,8 +145,8 @@ def fly(
     except KeyboardInterrupt:
         outcome = INTERRUPTED
     except FlightEnded as error:
-        outcome = str(error)
+        outcome = error.outcome
     except ChannelError as error:  # commands or noise overflow
-        outcome = f"ended at t = {seconds(loop.t_ns):.2f} s: {error}"
+        outcome = ended_early(f"ended at t = {seconds(loop.t_ns):.2f} s: {error}")
     record(topics.pop_signals())
     return outcome

@@ -10,16 +10,6 @@ from typing import Any, NamedTuple
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import TRUE_ERROR, best_error
-from flight_analysis.report.guided import (
-    FlownLeg,
-    Outside,
-    flown_legs,
-    orbit_missed_by,
-    time_outside,
-    touched_beside,
-    unflown_legs,
-)
-from flight_analysis.report.loop_lost import lost_parts
 from flight_analysis.report.sample_counts import (
     GUIDED,
     LEAST,
@@ -30,11 +20,7 @@ from flight_analysis.report.sample_counts import (
     TopicAccount,
     topic_accounts,
 )
-from flight_core.outcome import (
-    COMPLETED,
-    LANDED,
-    UNKNOWN,
-)
+from flight_core.outcome import COMPLETED, End, Outcome
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
@@ -43,7 +29,6 @@ SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
-APART = ("legs", "outside")  # in the section `guidance` of a summary
 
 
 class ProcessAccount(NamedTuple):
@@ -65,26 +50,17 @@ class Commands(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for
-    the outcome.
-    """
+    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing."""
 
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
     lacks: tuple[str, ...]
     busy: str = ""  # the sentence on a host that left out samples and ticks
     unguided: bool = False  # the controller was engaged, and guidance took no step
-    legs: tuple[FlownLeg, ...] = ()  # of the route, in order
-    # numbers of the legs that were ahead when the flight ended, in order
-    unflown: tuple[int, ...] = ()
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
     # s, flight time of the first u of a flight that flew less than half of its time
     late: float | None = None
-    outside: Outside | None = None  # of the fence; None without one
-    off_orbit: float = 0.0  # m from the last orbit at the end; 0 of an orbit that is joined
-    beside: float = 0.0  # m from the touch-down zone, of a landing; 0 inside
-    loop_lost: tuple[str, ...] = ()  # inputs between their limits, and errors that grow
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -103,8 +79,8 @@ class Account(NamedTuple):
         return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
-        """The account for `summary.json`, which has the legs in `guidance`."""
-        content = {name: value for name, value in self._asdict().items() if name not in APART}
+        """The account for `summary.json`."""
+        content = self._asdict()
         content["topics"] = {
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
         }
@@ -148,7 +124,7 @@ def planned_end_ns(tape: Tape) -> int | None:
 
 
 def account(
-    tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, simulated: bool = True
+    tape: Tape, scenario: Scenario | None, outcome: Outcome = COMPLETED, *, simulated: bool = True
 ) -> Account:
     """The account of a flight: from t = 0 to the planned end where the log knows both, else from
     the first sample of a topic to the last sample of any.
@@ -174,22 +150,19 @@ def account(
         for name, topic in topics.items()
         if topic.expected is not None and not topic.holds(topic.expected - topic.unsent)
     ]
-    section = None if scenario is None else scenario.guidance
-    legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
-    unflown = unflown_legs(tape, section) if legs and section is not None else ()
-    off_orbit = orbit_missed_by(tape, section) if legs and section is not None else 0.0
     parts = lost_log_parts(tape.notes, planned=planned_ns is not None)
     return Account(
-        end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided,
-        tuple(legs), tuple(unflown),
-        _processes(tape), late=first if first is not None and first > end / 2.0 else None,
-        outside=time_outside(tape, section), off_orbit=off_orbit,
-        beside=touched_beside(tape, section) if LANDED in outcome and section is not None else 0.0,
-        loop_lost=lost_parts(tape),
-    )  # fmt: skip
+        end=end,
+        topics=topics,
+        lacks=(*parts, *lacks, *_absent(tape, scenario)),
+        busy=_too_busy(busy),
+        unguided=unguided,
+        processes=_processes(tape),
+        late=first if first is not None and first > end / 2.0 else None,
+    )
 
 
-def _span(tape: Tape, planned_ns: int | None, outcome: str, *, simulated: bool) -> Span:
+def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
     """The part of the flight that the account is over."""
     lasts = [
         int(signal.stamp_ns.max())
@@ -198,7 +171,7 @@ def _span(tape: Tape, planned_ns: int | None, outcome: str, *, simulated: bool) 
     ]
     if planned_ns is None or not simulated:
         return Span(max(lasts, default=tape.start_ns), from_start=False, simulated=simulated)
-    if outcome.startswith((COMPLETED, UNKNOWN)):
+    if outcome.end in {End.COMPLETED, End.UNKNOWN}:
         return Span(planned_ns, from_start=True, simulated=True)
     return Span(max(lasts, default=tape.start_ns), from_start=True, simulated=True)
 
@@ -324,7 +297,6 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     if content is None:
         return None
     fields_of = itemgetter(*TopicAccount._fields)
-    guided = summary["guidance"] or {}
     values: dict[str, Any] = content | {
         "topics": {
             name: TopicAccount(*fields_of(topic)) for name, topic in content["topics"].items()
@@ -334,8 +306,6 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
             for name, process in content.get("processes", {}).items()
         },
         "commands": content.get("commands") and Commands(**content["commands"]),
-        "legs": [FlownLeg(**leg) for leg in guided.get("legs", ())],
-        "outside": guided.get("fence") and Outside(**guided["fence"]),
     }
     lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
     return Account(**(values | lists))

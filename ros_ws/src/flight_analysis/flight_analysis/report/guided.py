@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times, settling_time
-from flight_core.outcome import LANDED
-from flight_core.tape import Tape
+from flight_core.outcome import End
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
 from flight_guidance.guidance_state import (
@@ -233,7 +234,7 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
     """The figures of a landing; None without a section `landing`, and of a flight that did not
     land.
     """
-    if section is None or section.landing is None or LANDED not in tape.outcome:
+    if section is None or section.landing is None or tape.outcome.end is not End.LANDED:
         return None
     landing = section.landing_on(section.plan(section.waypoints()))
     if landing is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
@@ -261,11 +262,10 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
 
 
 class Outside(NamedTuple):
-    """The time outside of the fence, while guidance flew."""
+    """The time outside of limits, while guidance flew."""
 
     outside_s: float
-    farthest_m: float  # from the fence, m; 0 inside
-    left: bool  # whether the aircraft was outside after it had been inside, or at the end
+    farthest_m: float  # from the limits, m; 0 inside
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
@@ -273,24 +273,40 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     or without a pose then.
     """
     fence = None if section is None else section.fence_zones()
-    if (
-        fence is None
-        or "pose" not in tape
-        or "guidance" not in tape
-        or not len(tape["guidance"].stamp_ns)
-    ):
+    pose = _guided_pose(tape)
+    if fence is None or pose is None:
         return None
-    begun = tape["pose"].stamp_ns >= tape["guidance"].stamp_ns[0]
-    t = tape.time("pose")[begun]
-    if not len(t):
+    return _outside(tape, pose, clearance(fence.zones, pose["north"], pose["east"]))
+
+
+def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
+    """Time above the ceiling and below the altitude floor by `pose`, as of the first step of
+    guidance; None without limits, or without a pose then.
+    """
+    pose = _guided_pose(tape)
+    if section is None or (section.ceiling is None and section.altitude_floor is None):
         return None
-    inside = clearance(fence.zones, tape["pose"]["north"][begun], tape["pose"]["east"][begun])
-    is_outside = inside < 0.0
-    lasted = float(np.sum(np.diff(t)[is_outside[:-1]]))
-    after_inside = is_outside & (np.maximum.accumulate(inside) >= 0.0)
-    return Outside(
-        lasted, max(float(-np.min(inside)), 0.0), bool(after_inside.any() or is_outside[-1])
-    )
+    if pose is None:
+        return None
+    lowest, highest = section.altitudes()
+    altitude = pose["altitude"]
+    return _outside(tape, pose, np.minimum(altitude - lowest, highest - altitude))
+
+
+def _guided_pose(tape: Tape) -> Signal | None:
+    """`pose` as of the first step of guidance; None without either."""
+    if "pose" not in tape or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
+        return None
+    pose = tape["pose"]
+    begun = pose.stamp_ns >= tape["guidance"].stamp_ns[0]
+    return Signal(pose.stamp_ns[begun], pose.names, pose.values[begun]) if begun.any() else None
+
+
+def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
+    """The time with a negative distance from the limits, and the largest; `inside`: (N,), m."""
+    t = (pose.stamp_ns - tape.start_ns) / NANOSECONDS
+    lasted = float(np.sum(np.diff(t)[inside[:-1] < 0.0]))
+    return Outside(lasted, max(float(-np.min(inside)), 0.0))
 
 
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
@@ -421,12 +437,14 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     log = tape["guidance"]
     limited = log.group("limited")
     outside = time_outside(tape, section)
+    altitude = altitude_excess(tape, section)
     touch = landing_touch(tape, section)
     return {
         "landing": None if touch is None else touch._asdict(),
         "segments": [_segment_figures(segment) for segment in segments(tape)],
         "legs": [leg._asdict() for leg in flown_legs(tape)],
         "fence": None if outside is None else outside._asdict(),
+        "altitude": None if altitude is None else altitude._asdict(),
         "wind": _mean_wind(tape),
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),

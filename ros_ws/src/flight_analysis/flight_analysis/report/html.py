@@ -38,7 +38,6 @@ from flight_analysis.report.summary import (
 )
 from flight_analysis.report.summary_rows import INPUT_COLUMNS
 from flight_core.files import replacing
-from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
@@ -52,6 +51,7 @@ class Line(NamedTuple):
 
     text: str
     outcome: str = ""
+    is_success: bool = False
     label: str = ""
     colour: str = ""
 
@@ -157,7 +157,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     description = filter(None, [_description(flight, scenario), command_results(flight.summary)])
     return Page(
         f"Flight {flight.name}",
-        [Line(f"{'; '.join(description)}.", flight.summary["outcome"])],
+        [_outcome_line(f"{'; '.join(description)}.", flight)],
         [
             TableGroup(
                 [
@@ -177,6 +177,12 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     )
 
 
+def _outcome_line(text: str, flight: RecordedFlight) -> Line:
+    """A line with the outcome of a flight."""
+    outcome = flight.summary["outcome"]
+    return Line(text, outcome["sentence"], is_success=outcome["status"] == 0)
+
+
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context = comparison.plot_context(flights)
     colours = comparison.colours(flights)
@@ -188,7 +194,8 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     lines = []
     for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
-        lines.append(Line(text, flight.summary["outcome"], label, colour))
+        line = _outcome_line(text, flight)
+        lines.append(line._replace(label=label, colour=colour))
     palette = list(colours.values())
     legend = ". ".join(
         dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND])
@@ -365,7 +372,6 @@ def _parts(page: Page) -> Iterator[str]:
     environment.filters |= {"script_json": script_json, "ratio": format_ratio, "css": Markup}
     return environment.get_template("page.html.jinja").generate(
         page=page,
-        completed=COMPLETED,
         dark=plotting.DARK | figures.DARK | comparison.DARK,
         library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file

@@ -196,7 +196,10 @@ def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
         structure[topics[topic]] = {"stamp_ns": signal.stamp_ns.astype(np.int64), "t": t, **columns}
         original[topics[topic]] = {permitted: name for name, permitted in names.items()}
     units = {name: unit.unit for name, unit in flight.units.items()}
-    notes: dict[str, Any] = {"name": flight.name, "outcome": str(flight.summary["outcome"])}
+    notes: dict[str, Any] = {
+        "name": flight.name,
+        "outcome": str(flight.summary["outcome"]["sentence"]),
+    }
     notes |= {"scenario": flight.summary["scenario"] or ""}
     free = matlab_names(("info",), used_names=structure)
     notes |= {

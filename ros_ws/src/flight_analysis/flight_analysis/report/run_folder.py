@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.scenario import (
     scenario_yaml,
 )
 from flight_analysis.report.account import Account, account
-from flight_analysis.report.flight_outcome import flown, outcome_of_log
+from flight_analysis.report.flight_outcome import NEVER_ENGAGED, flown, outcome_of_log
 from flight_analysis.report.summary import (
     RecordedFlight,
     empty_summary,
@@ -31,12 +31,12 @@ from flight_analysis.report.summary import (
 )
 from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
-from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
+from flight_core.outcome import COMPLETED, End, Outcome, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
-from flight_core.text import bounded, printable
+from flight_core.text import printable
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import FLIGHT, provenance
@@ -165,7 +165,7 @@ def read_accounted(
 
 def read_flight(
     run: Path,
-    outcome: str | None = None,
+    outcome: Outcome | None = None,
     namespace: str | None = None,
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
@@ -178,7 +178,7 @@ def read_flight(
     return _flight(read_run(run, namespace, scenario, remaps), run, outcome)
 
 
-def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
+def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> RecordedFlight:
     recorded.require()
     folder = _folder(run)
     name = printable(run.resolve().name if run.is_dir() else run.stem)
@@ -201,7 +201,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     engagements = recorded.engagements
     outcome = outcome or _previous_outcome(recorded, folder, scenario)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
-        outcome = f"{NEVER_FLEW}: the controller never engaged"
+        outcome = NEVER_ENGAGED
     tape = flown(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged = _engaged(tape, engagements or [])
@@ -300,7 +300,7 @@ def _write_scenario(recorded: RecordedRun, path: Path) -> None:
 
 def write_report(
     run: Path,
-    outcome: str | None = None,
+    outcome: Outcome | None = None,
     output: Path | None = None,
     namespace: str | None = None,
     scenario: FilePath | None = None,
@@ -329,7 +329,7 @@ def write_report(
     return FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
 
 
-def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> dict[str, Any]:
+def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
     """Write summary.json of a flight with an end before the first sample. The log does not change.
     Raises ParameterError.
     """
@@ -353,28 +353,24 @@ def _identity(recorded: RecordedRun) -> dict[str, Any]:
     return {"start_ns": recorded.tape.start_ns, "started": started}
 
 
-def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> str:
+def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
     """The outcome in the log, else in the summary of this flight, else the outcome that a launch
     left beside a log with the name of the folder.
 
     The samples in the log tell the outcome of nodes started by hand.
     """
     tape = recorded.tape
-    if tape.outcome != UNKNOWN:
-        return tape.outcome
-    if folder is not None:
+    outcome = tape.outcome
+    if outcome.end is End.UNKNOWN and folder is not None:
         with suppress(OSError, ValueError, TypeError, KeyError):
             summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-            before = printable(str(summary["outcome"]))
-            if summary["flight"] == _identity(recorded) and not before.startswith(UNKNOWN):
-                return before
-    if folder is not None and (folder / f"{folder.name}_0.mcap").is_file():
+            if summary["flight"] == _identity(recorded):
+                outcome = read_outcome(summary["outcome"])
+    has_folder = folder is not None and (folder / f"{folder.name}_0.mcap").is_file()
+    if outcome.end is End.UNKNOWN and folder is not None and has_folder:
         with suppress(ParameterError):
-            if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(
-                errors="replace"
-            ):
-                return bounded(outcome.strip())
-    return (
-        outcome_of_log(tape, scenario, simulated=recorded.engagements is None)
-        or f"{UNKNOWN}: neither the run nor the log has one"
-    )
+            content = read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "an outcome")
+            outcome = parsed_outcome(content.decode(errors="replace"))
+    if outcome.end is End.UNKNOWN:
+        outcome = outcome_of_log(tape, scenario, simulated=recorded.engagements is None)
+    return outcome

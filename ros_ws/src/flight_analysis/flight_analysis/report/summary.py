@@ -41,9 +41,9 @@ from flight_analysis.report.display_units import (
     display_units,
     format_seconds,
 )
-from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.sample_counts import WHOLE, ends_last
+from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.timing import (
     AgeMetrics,
     LatencyMetrics,
@@ -52,8 +52,9 @@ from flight_analysis.report.timing import (
     latency_metrics,
     tick_metrics,
 )
+from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
-from flight_core.outcome import IMPORT
+from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape, refusal_note
@@ -126,7 +127,7 @@ class RecordedFlight(NamedTuple):
 def summarise(
     tape: Tape,
     scenario: Scenario | None = None,
-    outcome: str | None = None,
+    outcome: Outcome | None = None,
     flight_account: Account | None = None,
 ) -> dict[str, Any]:
     """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains
@@ -147,7 +148,7 @@ def summarise(
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> rise_di.summarise(tape)["outcome"]
+        >>> rise_di.summarise(tape)["outcome"]["sentence"]
         'completed'
     """
     scenario = _flown_scenario(tape, scenario)
@@ -163,7 +164,7 @@ def summarise(
     if tape.start_ns > SINCE_EPOCH_NS and not ends_last(tape, "internals"):  # in real time
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
     busy = flight_account.busy
-    summary = empty_summary(scenario, final_outcome(outcome, flight_account)) | {
+    summary = empty_summary(scenario, judged(outcome, tape, scenario, flight_account)) | {
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
         "errors": _errors(tape, events),
@@ -182,6 +183,7 @@ def summarise(
             *([busy] if busy else []),
             *late_u(scenario, age),
             *(note for note in tape.notes if note != busy),
+            *saturation_notes(tape),
             *mode_notes(tape, flight_account.over(*FIGURES["ticks"])),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),
@@ -231,7 +233,7 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
             name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()
         }
     summary = (
-        empty_summary(None, IMPORT)
+        empty_summary(None, Outcome(End.IMPORTED))
         | deviations
         | {"duration": flight_account.end, "account": flight_account.as_json()}
     )
@@ -434,11 +436,11 @@ def vane_notes(tape: Tape) -> list[str]:
     return notes
 
 
-def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
+def empty_summary(scenario: Scenario | None, outcome: Outcome) -> dict[str, Any]:
     """The summary of a flight with an end before the first sample."""
     return {
         "scenario": None if scenario is None else scenario.name,
-        "outcome": outcome,
+        "outcome": outcome.as_json(),
         "flight": None,
         "duration": None,
         "error": None,

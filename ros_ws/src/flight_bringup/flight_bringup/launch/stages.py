@@ -43,7 +43,16 @@ from flight_bringup.processes import (
     end_with_parent,
     leave_outcome,
 )
-from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
+from flight_core.outcome import (
+    COMPLETED,
+    INTERRUPTED,
+    STATUS_LANDED,
+    End,
+    Outcome,
+    ended_early,
+    log_ends_at,
+    never_flew,
+)
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
@@ -238,18 +247,24 @@ def rosbag2(
     )
 
 
-def fail_on_exit(event: ProcessExited, context: LaunchContext, run: Path) -> None:
-    """End the launch with exit status 1 when a process ends before the flight, with the outcome in
-    the folder `run`.
+def fail_on_exit(
+    event: ProcessExited, context: LaunchContext, run: Path
+) -> Sequence[Action] | None:
+    """End the launch when a process ends before the flight, with the outcome in the folder `run`:
+    of a landing with exit status 0, else with 1.
     """
-    if not context.is_shutdown:
-        end_with(run, f"{event.process_name} ended before the flight did")
+    if context.is_shutdown:
+        return None
+    if event.returncode == STATUS_LANDED:
+        return complete(run, "the aircraft has landed", Outcome(End.LANDED))
+    end_with(run, ended_early(f"{event.process_name} ended before the flight did"))
+    return None
 
 
-def end_with(run: Path, outcome: str) -> None:
+def end_with(run: Path, outcome: Outcome) -> None:
     """End the launch with exit status 1, with the outcome in the folder `run`."""
     leave_outcome(run, outcome)
-    raise RuntimeError(outcome)
+    raise RuntimeError(str(outcome))
 
 
 def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
@@ -308,7 +323,7 @@ def start_in_stages(
     def require_ready(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in waiting)
-            end_with(run, f"{NEVER_FLEW}: {names} not ready after {READY_TIMEOUT:g} s")
+            end_with(run, never_flew(f"{names} not ready after {READY_TIMEOUT:g} s"))
 
     handlers = [
         on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
@@ -390,18 +405,18 @@ class _Begin:
         if self._waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in self._waiting)
             reason = "not ready, or with an input without a publisher, after"
-            end_with(self._run, f"{NEVER_FLEW}: {names} {reason} {READY_TIMEOUT:g} s")
+            end_with(self._run, never_flew(f"{names} {reason} {READY_TIMEOUT:g} s"))
 
     def _require_flight(self, context: LaunchContext) -> None:
         if not self._flies and not context.is_shutdown:
             reason = "y did not reach the controller, or u did not reach the aircraft"
             lines = "the lines of the nodes say what they wait for"
-            end_with(self._run, f"{NEVER_FLEW}: {reason}; {lines}")
+            end_with(self._run, never_flew(f"{reason}; {lines}"))
 
     def _give_up(self, context: LaunchContext) -> None:
         if not context.is_shutdown:
-            flown = (self._held_ns - self._start_ns) / NANOSECONDS
-            end_with(self._run, ended_early(flown, self._duration))
+            held = (self._held_ns - self._start_ns) / NANOSECONDS
+            end_with(self._run, log_ends_at(held, self._duration))
 
 
 def _after(period: float, function: Callable[[LaunchContext], list[Action] | None]) -> TimerAction:
@@ -463,11 +478,13 @@ def _complete_at(
     return RegisterEventHandler(flown)
 
 
-def complete(run: Path, reason: str = "flight completed") -> list[Action]:
-    """The actions at the end of a flight of full duration. The recorder closes the log with the
-    outcome.
+def complete(
+    run: Path, reason: str = "flight completed", outcome: Outcome = COMPLETED
+) -> list[Action]:
+    """The actions at the end of a flight that reached its end. The recorder closes the log with
+    the outcome.
     """
-    leave = OpaqueFunction(function=lambda context: leave_outcome(run, COMPLETED))
+    leave = OpaqueFunction(function=lambda context: leave_outcome(run, outcome))
     return [
         leave,
         LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"),

@@ -169,4 +169,4 @@ def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
     }
     shares = {name: kinds["magnitude"] for name, kinds in saturation_shares(tape).items()}
     at_stop = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
-    return ManoeuvreResult(tape.outcome, rms, largest, at_stop)
+    return ManoeuvreResult(str(tape.outcome), rms, largest, at_stop)

@@ -137,7 +137,7 @@ class IdentifiedAircraft(NamedTuple):
         its command.
         """
         for title, flight in self.flights.items():
-            if flight.outcome != COMPLETED:
+            if flight.outcome != str(COMPLETED):
                 return f"{title}: {flight.outcome}"
         too_large = [
             name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]

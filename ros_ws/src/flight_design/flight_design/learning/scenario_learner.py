@@ -57,7 +57,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_learn", duration=0.1)
-        >>> rise_di.simulate(scenario, learn=rise_di.learner(scenario)).outcome
+        >>> str(rise_di.simulate(scenario, learn=rise_di.learner(scenario)).outcome)
         'completed'
     """
     controller = scenario.controller

@@ -1,0 +1,195 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a completed or landed flight has to show, and the shortfalls.
+
+A flight succeeds where
+
+- the law was engaged in ENGAGED of the active ticks,
+- the error of each output is allowed by the linear loop (`tracking`),
+- the airspeed stayed above the stall speed, and the aircraft above the ground and between the
+  altitudes of guidance,
+- the aircraft stayed inside the fence, flew every leg of the route and joined the last orbit,
+- a landing ended in the touch-down zone,
+- and the log holds the whole flight.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from aircraft_sim.params import AircraftConfig
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import mask_spans
+from flight_analysis.report.account import Account
+from flight_analysis.report.guided import (
+    altitude_excess,
+    flown_legs,
+    orbit_missed_by,
+    time_outside,
+    touched_beside,
+    unflown_legs,
+)
+from flight_analysis.report.tracking import tracking_shortfalls
+from flight_core.modes import Mode
+from flight_core.outcome import Aim, End, Outcome, Shortfall, never_flew
+from flight_core.tape import Tape
+from flight_guidance.params import GuidanceConfig
+from rise_di_controller.params import ControllerConfig
+
+ENGAGED = 0.9
+"""Least share of the active ticks with the law engaged: with u held or at trim for longer, no
+figure is of the law."""
+
+
+def judged(
+    outcome: Outcome,
+    tape: Tape,
+    scenario: Scenario | None,
+    account: Account,
+    controller: ControllerConfig | None = None,
+) -> Outcome:
+    """The outcome of a flight with the shortfalls. An early end has none.
+
+    `controller`: of a flight without a scenario; None: the errors are not judged.
+    """
+    if outcome.end is End.COMPLETED and account.late is not None:
+        return never_flew(f"the first u came at t = {account.late:.3f} of {account.end:.3f} s")
+    if outcome.end is End.COMPLETED and account.unguided:
+        return never_flew(
+            "guidance took no step; see the ages of pose and y against guidance.max_age"
+        )
+    if not outcome.has_reached_end and outcome.end is not End.UNKNOWN:
+        return replace(outcome, shortfalls=())
+    aircraft: AircraftConfig | None = None
+    section: GuidanceConfig | None = None
+    if scenario is not None:
+        controller = scenario.controller
+        aircraft = scenario.aircraft
+        section = scenario.guidance
+    shortfalls = _engagement(tape)
+    if controller is not None:
+        shortfalls += tracking_shortfalls(tape, controller, aircraft)
+    shortfalls += _height(tape, aircraft, section)
+    if section is not None:
+        shortfalls += _guided(tape, section, has_landed=outcome.end is End.LANDED)
+    if account.lacks:
+        sentence = f"log incomplete: {'; '.join(account.lacks)}"
+        shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
+    return replace(outcome, shortfalls=tuple(shortfalls))
+
+
+def _engagement(tape: Tape) -> list[Shortfall]:
+    """The share of the active ticks with the law engaged."""
+    if "internals" not in tape or "mode" not in tape["internals"].names:
+        return []
+    mode = tape["internals"]["mode"]
+    asked = mode[mode != Mode.INACTIVE]
+    if not len(asked):
+        return []
+    share = float(np.mean(asked == Mode.ENGAGED))
+    if share >= ENGAGED:
+        return []
+    sentence = f"the law engaged in {100.0 * share:.0f} % of the ticks"
+    return [Shortfall(aim=Aim.ENGAGEMENT, sentence=sentence, figures={"share": share})]
+
+
+def _height(
+    tape: Tape, aircraft: AircraftConfig | None, section: GuidanceConfig | None
+) -> list[Shortfall]:
+    """The time below the ground of the scenario, by `pose`."""
+    ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
+    if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):
+        landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None
+        ground = None if landing is None else landing.ground
+    if ground is None or "pose" not in tape or len(tape["pose"].stamp_ns) < 2:
+        return []
+    height = tape["pose"]["altitude"] - ground
+    below_s = float(np.sum(np.diff(tape.time("pose"))[height[:-1] < 0.0]))
+    if not below_s:
+        return []
+    deepest = -float(np.min(height))
+    sentence = f"below the ground for {below_s:.1f} s, {deepest:.1f} m at most"
+    figures = {"below_s": below_s, "deepest_m": deepest}
+    return [Shortfall(aim=Aim.GROUND, sentence=sentence, figures=figures)]
+
+
+def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
+    """The shortfalls of a guided flight."""
+    shortfalls = [*_stall(tape, section)]
+    altitude = altitude_excess(tape, section)
+    if altitude is not None and altitude.outside_s:
+        sentence = (
+            f"outside of the altitudes of guidance for {altitude.outside_s:.1f} s, "
+            f"{altitude.farthest_m:.0f} m at most"
+        )
+        figures = altitude._asdict()
+        shortfalls.append(Shortfall(aim=Aim.ALTITUDE, sentence=sentence, figures=figures))
+    outing = time_outside(tape, section)
+    if outing is not None and outing.outside_s:
+        sentence = (
+            f"outside of the fence for {outing.outside_s:.1f} s, {outing.farthest_m:.0f} m at most"
+        )
+        shortfalls.append(Shortfall(aim=Aim.FENCE, sentence=sentence, figures=outing._asdict()))
+    if "guidance" in tape and len(tape["guidance"].stamp_ns):
+        shortfalls += _route(tape, section, has_landed=has_landed)
+    beside = touched_beside(tape, section) if has_landed else 0.0
+    if beside:
+        sentence = f"outside of the touch-down zone by {beside:.0f} m"
+        figures = {"beside_m": beside}
+        shortfalls.append(Shortfall(aim=Aim.TOUCHDOWN, sentence=sentence, figures=figures))
+    return shortfalls
+
+
+def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
+    """The time below the stall speed; the flare of a landing is left out."""
+    if section.stall_speed is None or "guidance" not in tape or section.drag is not None:
+        return []
+    log = tape["guidance"]
+    if "y.V" not in log.names:
+        return []
+    V = section.speed + log["y.V"]
+    is_stalled = section.stall_speed > V
+    if section.landing is not None:
+        landing = section.landing_on(section.plan(section.waypoints()))
+        if landing is not None:
+            is_stalled &= log["pose.altitude"] > landing.ground + landing.flare
+    spans = mask_spans(tape.time("guidance"), is_stalled)
+    lasted = math.fsum(stop - start for start, stop in spans)
+    if not lasted:
+        return []
+    least = float(np.min(V[is_stalled]))
+    sentence = (
+        f"V down to {least:.1f} m/s, below the stall speed of {section.stall_speed:g} m/s for "
+        f"{lasted:.1f} s"
+    )
+    figures = {"least": least, "stall_speed": section.stall_speed, "below_s": lasted}
+    return [Shortfall(aim=Aim.STALL, sentence=sentence, figures=figures)]
+
+
+def _route(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
+    """The legs missed and not flown, and the last orbit not joined."""
+    shortfalls = []
+    for leg in flown_legs(tape):
+        if leg.missed:
+            sentence = f"missed leg {leg.leg} by {leg.missed:.0f} m"
+            figures = {"leg": leg.leg, "missed_m": leg.missed}
+            shortfalls.append(Shortfall(aim=Aim.ROUTE, sentence=sentence, figures=figures))
+    unflown = list(unflown_legs(tape, section))
+    if has_landed:
+        # the legs after a landing are those of a go-around
+        landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None
+        unflown = [leg for leg in unflown if landing is None or leg < landing.leg]
+    if unflown:
+        first = unflown[0]
+        last = unflown[-1]
+        legs = f"leg {last}" if first == last else f"legs {first} to {last}"
+        figures = {"first": first, "last": last}
+        sentence = f"{legs} not flown"
+        shortfalls.append(Shortfall(aim=Aim.ROUTE, sentence=sentence, figures=figures))
+    distance = 0.0 if has_landed else orbit_missed_by(tape, section)
+    if distance:
+        sentence = f"the last orbit not joined: {distance:.0f} m"
+        figures = {"distance_m": distance}
+        shortfalls.append(Shortfall(aim=Aim.ORBIT, sentence=sentence, figures=figures))
+    return shortfalls

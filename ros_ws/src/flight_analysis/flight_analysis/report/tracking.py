@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a flight tracks the reference as the linear loop does.
+
+The rms error over WINDOW, and over END at the end, may be
+
+    FACTOR rms(e of the linear loop) + floor
+
+by `linear_flight.error_pair`. The floor is
+
+- HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
+  error;
+- SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag;
+- the least errors of a divergence, 0.1 rad/s and 1 m/s, where the wind is unknown.
+
+A controller keeps a learned model below the least errors (`rise_di_controller.divergence`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim.params import AircraftConfig
+from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
+from flight_core.outcome import Aim, Shortfall
+from flight_core.rates import seconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from rise_di_controller.divergence import HARMLESS, LEAST, LEAST_RATE, WINDOW, period
+from rise_di_controller.internals import Saturation
+from rise_di_controller.params import ControllerConfig
+
+FACTOR = 2.0
+"""Of the error of the linear loop: an input of half the effect doubles the error. Healthy flights
+have at most 1.3."""
+
+END = 1.0
+"""s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
+
+SPEED_PART = 0.05
+"""Of the trim speed: guidance keeps V by the climb beyond (`flight_guidance.protection`)."""
+
+SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
+SIDE = 0.1  # of the ticks, on either side
+
+
+class Excess(NamedTuple):
+    """The rms error of an output over a part of a flight, beyond what is allowed, SI."""
+
+    output: str
+    start: float  # s
+    stop: float  # s
+    rms: float
+    allowed: float
+
+
+def tracking_shortfalls(
+    tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None
+) -> list[Shortfall]:
+    """The outputs with a larger error than allowed, with the worst part of the flight."""
+    if not {"y", "y_m"} <= set(tape.signals):
+        return []
+    pair = error_pair(tape, controller, aircraft)
+    if pair is None:
+        return []
+    speed = 0.0 if aircraft is None else aircraft.channels().speed
+    units = {} if aircraft is None else aircraft.channels().outputs
+    shortfalls = []
+    for i, name in enumerate(pair.names):
+        unit = units.get(name, "")
+        worst = _worst(pair, i, _floor(pair, i, speed, unit))
+        if worst is not None:
+            shortfalls.append(_shortfall(worst, pair, i, unit))
+    return shortfalls
+
+
+def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
+    """The floor of an output, SI; `speed`: V0, m/s; `unit`: of the output."""
+    smallest = LEAST[AIRSPEED] if unit == "m/s" else LEAST.get(pair.names[i], LEAST_RATE)
+    if pair.knowledge.has_wind:
+        smallest = HARMLESS * smallest
+    if pair.names[i] == AIRSPEED and not pair.knowledge.has_model:
+        smallest = max(smallest, SPEED_PART * speed)
+    return smallest + FACTOR * float(pair.noise[i])
+
+
+def _worst(pair: ErrorPair, i: int, floor: float) -> Excess | None:
+    """The part of a flight with the largest error over the allowed error; None within."""
+    excesses = [_largest_excess(pair, i, floor, WINDOW), _largest_excess(pair, i, floor, END)]
+    beyond = [excess for excess in excesses if excess is not None and excess.rms > excess.allowed]
+    return max(beyond, key=lambda excess: excess.rms / excess.allowed, default=None)
+
+
+def _largest_excess(pair: ErrorPair, i: int, floor: float, length: float) -> Excess | None:
+    """The part of a length, s, with the largest rms error over the allowed error; of END the last
+    part. A shorter flight is a single part. None without a part without a gap.
+    """
+    t = pair.t
+    if len(t) < 2:
+        return None
+    count = min(round(length / (t[1] - t[0])), len(t))
+    is_whole = _sums(pair.is_flown.astype(np.float64), count) == count
+    starts = np.flatnonzero(is_whole)
+    starts = starts[-1:] if length == END else starts
+    if not len(starts):
+        return None
+    rms = np.sqrt(np.maximum(_sums(pair.e[:, i] ** 2, count), 0.0) / count)[starts]
+    linear = np.sqrt(np.maximum(_sums(pair.linear[:, i] ** 2, count), 0.0) / count)[starts]
+    allowed = FACTOR * linear + floor
+    k = int(np.argmax(rms / allowed))
+    return Excess(
+        output=pair.names[i],
+        start=float(t[starts[k]]),
+        stop=float(t[starts[k] + count - 1]),
+        rms=float(rms[k]),
+        allowed=float(allowed[k]),
+    )
+
+
+def _sums(values: FloatArray, count: int) -> FloatArray:
+    """Sums over each `count` values in a row."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray(total[count:] - total[:-count])
+
+
+def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: str) -> Shortfall:
+    """The shortfall of an excess, with the period of a limit cycle."""
+    sentence = (
+        f"{excess.output} off by {excess.rms:.2g} {unit} rms from t = {excess.start:.1f} to "
+        f"{excess.stop:.1f} s, {excess.allowed:.2g} allowed"
+    )
+    rows = (pair.t >= excess.start) & (pair.t <= excess.stop)
+    samples = period(pair.e[rows, i])
+    if samples:
+        sentence += f", a cycle of {samples * (pair.t[1] - pair.t[0]):.2g} s"
+    return Shortfall(aim=Aim.ERROR, sentence=sentence, figures=excess._asdict())
+
+
+def saturation_notes(tape: Tape) -> list[str]:
+    """Sentences on inputs that went from limit to limit in SATURATED of the ticks of WINDOW, with
+    SIDE or more on either side.
+
+    A climb at full throttle stays on one side. A limit of the rate does not count: noise reaches
+    the rate of a slow engine to either side.
+    """
+    if "internals" not in tape:
+        return []
+    limited = tape["internals"].group("limited")
+    u = tape["internals"].group("u")
+    u_free = tape["internals"].group("u_free")
+    notes = []
+    for name in sorted({*limited.names} & {*u.names} & {*u_free.names}, key=limited.names.index):
+        at_limit = limited[name] == Saturation.MAGNITUDE
+        share_above = _windowed(limited, at_limit & (u_free[name] > u[name]))
+        share_below = _windowed(limited, at_limit & (u_free[name] < u[name]))
+        alternates = np.minimum(share_above, share_below) >= SIDE
+        worst = np.where(alternates, share_above + share_below, 0.0).max(initial=0.0)
+        if worst >= SATURATED:
+            notes.append(
+                f"{name} went from limit to limit in {100.0 * worst:.0f} % of {WINDOW:g} s: it has "
+                "no effect, or too little"
+            )
+    return notes
+
+
+def _windowed(signal: Signal, values: NDArray[np.generic]) -> FloatArray:
+    """Means over each whole WINDOW of samples."""
+    steps = np.diff(signal.stamp_ns)
+    count = round(WINDOW / seconds(int(np.median(steps)))) if len(steps) else 1
+    return _sums(values.astype(np.float64), count) / count if len(values) >= count else np.zeros(0)

@@ -1,0 +1,286 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight succeeds where it shows what is asked for: faults are injected, and 0 is given only for
+errors as those of the flight without the fault.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from tests.closed_loop import calm_osprey
+
+import rise_di
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.metrics import best_error
+from flight_analysis.report.account import Account
+from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.tracking import saturation_notes
+from flight_core.modes import Mode
+from flight_core.outcome import COMPLETED, Aim, End, Outcome
+from flight_core.rates import seconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray, StampedVector
+from rise_di_controller.controller import Controller
+
+T = 20.0  # s
+FAULT = 5.0  # s
+WHOLE = Account(end=T, topics={}, lacks=())
+LEAST = {"V": 0.2}  # m/s, an error that no user sees
+LEAST_RATE = 0.02  # rad/s, the same: 1 deg/s
+
+
+@cache
+def servo() -> Scenario:
+    """osprey_servo at 100 Hz: commands, gusts and noise."""
+    return find_scenario("osprey_servo").vary(
+        flight={"duration": T},
+        aircraft={"rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0},
+    )
+
+
+@cache
+def healthy() -> Tape:
+    return rise_di.simulate(servo())
+
+
+def with_faults(scenario: Scenario, *faults: str) -> Scenario:
+    actuators = scenario.aircraft.actuators.model_dump() | {"faults": list(faults)}
+    return scenario.vary(aircraft={"actuators": actuators})
+
+
+def worst_rms(tape: Tape) -> dict[str, float]:
+    """Largest rms error over 10 s, by output."""
+    _, error = best_error(tape)
+    count = round(10.0 / float(np.median(np.diff(error.stamp_ns))) * 1e9)
+    worst = {}
+    for name in error.names:
+        total = np.concatenate([[0.0], np.cumsum(error[name] ** 2)])
+        worst[name] = float(np.sqrt((total[count:] - total[:-count]).max() / count))
+    return worst
+
+
+def times_healthy(tape: Tape) -> float:
+    """Largest error over that of the flight without a fault, of the outputs that a user sees."""
+    beside = worst_rms(healthy())
+    ratios = []
+    for name, rms in worst_rms(tape).items():
+        ratios.append(rms / (beside[name] + LEAST.get(name, LEAST_RATE) / 2.0))
+    return max(ratios)
+
+
+def test_healthy_flight_is_completed() -> None:
+    assert healthy().outcome == COMPLETED
+
+
+EFFECTORS = ("elevator", "thrust", "aileron", "rudder")
+KINDS = (
+    *("stuck 5", "lost 5", "hard_over 5 lower", "hard_over 5 upper"),
+    *("weak 5 0.7", "weak 5 0.3", "weak 5 -1", "slow 5 0.3", "loose 5 0.05"),
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("effector", EFFECTORS)
+def test_effector_fault_is_told_by_its_error(effector: str, kind: str) -> None:
+    """Between 1.5 and 3 times the error of a healthy flight either is right."""
+    if effector == "thrust":
+        kind = kind.replace("lost", "failed")  # the word of an engine
+    tape = rise_di.simulate(with_faults(servo(), f"{effector} {kind}"))
+    times = times_healthy(tape)
+    if tape.outcome.status == 0:
+        assert times < 3.0
+    else:
+        assert times > 1.5
+        assert tape.outcome.end is not End.COMPLETED or tape.outcome.shortfalls[0].figures
+
+
+def test_effector_without_a_task_may_be_stuck() -> None:
+    """Without commands, gusts and noise of p and r the aileron has nothing to do."""
+    calm = servo().vary(
+        reference_model={"pulses": {}}, aircraft={"gusts": {}, "sensors": {"noise": [0.0] * 4}}
+    )
+    assert rise_di.simulate(with_faults(calm, "aileron stuck 5")).outcome == COMPLETED
+
+
+def test_engine_that_fails_on_another_simulator_is_told() -> None:
+    """Without a model of the aircraft the airspeed may be off by 5 % of the trim speed."""
+    c172p = find_scenario("jsbsim_c172p", duration=40.0)
+    (shortfall,) = rise_di.simulate(with_faults(c172p, "throttle failed 5")).outcome.shortfalls
+    assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "V")
+    assert rise_di.simulate(c172p).outcome == COMPLETED
+
+
+Sample = Callable[[float, StampedVector], StampedVector | None]
+
+
+def value(change: Callable[[FloatArray], FloatArray]) -> Sample:
+    """A fault of the values of y from FAULT on."""
+
+    def sample(t: float, y: StampedVector) -> StampedVector:
+        return y._replace(value=change(y.value.copy())) if t >= FAULT else y
+
+    return sample
+
+
+def stamp(by: float) -> Sample:
+    """A step of the clock of y, s, at FAULT."""
+
+    def sample(t: float, y: StampedVector) -> StampedVector:
+        return y._replace(stamp_ns=y.stamp_ns + round(by * 1e9)) if t >= FAULT else y
+
+    return sample
+
+
+def not_a_number(y: FloatArray) -> FloatArray:
+    y[0] = np.nan
+    return y
+
+
+def swapped(y: FloatArray) -> FloatArray:
+    """V and p, r and q, each in place of the other."""
+    return y[[3, 2, 1, 0]]
+
+
+SENSORS: dict[str, Sample] = {
+    "q is not a number": value(not_a_number),
+    "channels swapped": value(swapped),
+    "q with the other sign": value(lambda y: y * [-1.0, 1.0, 1.0, 1.0]),
+    "q off by 0.3 rad/s": value(lambda y: y + np.array([0.3, 0.0, 0.0, 0.0])),
+    "V off by 5 m/s": value(lambda y: y + np.array([0.0, 5.0, 0.0, 0.0])),
+    "stamps 1 s ahead": stamp(1.0),
+    "stamps 1 s late": stamp(-1.0),
+    "no y": lambda t, y: y if t < FAULT else None,
+}
+
+
+@pytest.mark.parametrize("fault", SENSORS.values(), ids=SENSORS)
+def test_fault_of_y_is_told(fault: Sample) -> None:
+    class Faulty(Controller):
+        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+            changed = fault(seconds(now_ns), sample)
+            return "" if changed is None else super().take_y(changed, now_ns)
+
+    outcome = rise_di.simulate(servo(), control=Faulty).outcome
+    aims = {shortfall.aim for shortfall in outcome.shortfalls}
+    assert outcome.end is not End.COMPLETED or aims & {Aim.ENGAGEMENT, Aim.ERROR}
+    assert outcome.status in {3, 4}
+
+
+def test_bounds_of_y_that_keep_the_law_from_flying_are_told() -> None:
+    """Y beyond its bounds most of the time: the aircraft flies in trim."""
+    narrow = servo().vary(controller={"y_max": [0.004, 0.004, 0.004, 0.08]})
+    outcome = rise_di.simulate(narrow).outcome
+    assert Aim.ENGAGEMENT in {shortfall.aim for shortfall in outcome.shortfalls}
+    assert outcome.status == 4
+
+
+def test_law_that_was_not_asked_to_fly_is_no_shortfall() -> None:
+    """A dry run behind an autopilot: the controller is inactive."""
+    ticks = Signal(np.arange(3, dtype=np.int64), ("mode",), np.full((3, 1), float(Mode.INACTIVE)))
+    tape = replace(healthy(), signals=dict(healthy().signals) | {"internals": ticks})
+    assert judged(COMPLETED, tape, servo(), WHOLE) == COMPLETED
+
+
+def test_late_loop_is_told_with_its_cycle() -> None:
+    """U late by 80 ms beyond the margin of 47 ms: the rates of the servos bound the oscillation."""
+    late = servo().vary(aircraft={"actuators": {"delay": 0.08}})
+    assert rise_di.margins(late).delay < 0.08
+    outcome = rise_di.simulate(late).outcome
+    assert outcome.status == 4
+    assert "a cycle of " in str(outcome)
+
+
+@pytest.mark.parametrize("speed", [14.0, 20.0])
+def test_stronger_microburst_has_no_better_status(speed: float) -> None:
+    """Beyond what the thrust can hold: V is off by 5 m/s, or the aircraft is on the ground."""
+    burst = find_scenario("osprey_microburst")
+    section = burst.aircraft.microburst
+    assert section is not None
+    strong = section.model_dump() | {"speed": speed}
+    flown = rise_di.simulate(burst.vary(aircraft={"microburst": strong}))
+    assert flown.outcome.status in {3, 4}
+
+
+def test_landing_does_not_swallow_what_else_was_short() -> None:
+    """A touch on the first leg, in a log of half of the flight, far from the zone."""
+    route = {
+        "north": [0.0, 1500.0, 3000.0, 4500.0, 6000.0],
+        "east": [0.0, 300.0, 300.0, 300.0, 300.0],
+        "altitude": [0.0, 0.0, -60.0, 0.0, 0.0],
+    }
+    box = {"north": [2900.0, 3100.0, 3100.0, 2900.0], "east": [290.0, 290.0, 310.0, 310.0]}
+    scenario = calm_osprey(5.0, route=route, landing={"waypoint": 2}, touchdown=box)
+    tape = rise_di.simulate(scenario)
+    half = WHOLE._replace(lacks=("u 250 of 501 samples",))
+    outcome = judged(Outcome(End.LANDED, "osprey landed at t = 5 s"), tape, scenario, half)
+    aims = [shortfall.aim for shortfall in outcome.shortfalls]
+    assert aims == [Aim.ROUTE, Aim.TOUCHDOWN, Aim.LOG]
+    assert outcome.status == 4
+    assert str(outcome).startswith(
+        "osprey landed at t = 5 s, leg 0 not flown, outside of the touch"
+    )
+
+
+def test_flight_below_its_ground_is_told() -> None:
+    """A landing whose aircraft has no ground flies on."""
+    route = {
+        "north": [0.0, 800.0, 1500.0, 2500.0],
+        "east": [0.0, 0.0, 0.0, 0.0],
+        "altitude": [0.0, -40.0, 0.0, 0.0],
+    }
+    through = calm_osprey(42.0, route=route, landing={"waypoint": 1})
+    outcome = rise_di.simulate(through).outcome
+    (below,) = [each for each in outcome.shortfalls if each.aim is Aim.GROUND]
+    assert below.figures["below_s"] > 1.0
+    shear = {"law": "power", "ground": -40.0, "reference": 20.0, "exponent": 0.14}
+    with_ground = through.vary(aircraft={"shear": shear})
+    assert rise_di.simulate(with_ground).outcome.end is End.LANDED
+
+
+STAMPS = np.arange(4000, dtype=np.int64) * 10_000_000  # 40 s at 100 Hz
+TIME = STAMPS / 1e9
+
+
+def of_input(u_free: FloatArray) -> Tape:
+    """A flight whose controller limited an input to 1."""
+    u = np.clip(u_free, -1.0, 1.0)
+    names = ("limited.rudder", "u_free.rudder", "u.rudder")
+    values = np.stack([(u != u_free).astype(float), u_free, u], axis=1)
+    return Tape({"internals": Signal(STAMPS, names, values)})
+
+
+def test_input_from_limit_to_limit_is_a_note() -> None:
+    """A sine of twice the limit is beyond it in two thirds of the time."""
+    (note,) = saturation_notes(of_input(2.0 * np.sin(7.0 * TIME)))
+    assert note.startswith("rudder went from limit to limit in 67 % of 10 s")
+
+
+@pytest.mark.parametrize(
+    "u_free",
+    [
+        pytest.param(np.full(4000, 2.0), id="a climb at full throttle"),
+        pytest.param(1.1 * np.sin(7.0 * TIME), id="a sine just beyond the limits"),
+        pytest.param(np.where(TIME < 4.0, 2.0 * np.sin(7.0 * TIME), 0.0), id="four seconds"),
+    ],
+)
+def test_saturation_of_a_sound_loop_is_no_note(u_free: FloatArray) -> None:
+    assert saturation_notes(of_input(u_free)) == []
+
+
+def test_plant_that_the_law_loses_is_told() -> None:
+    """A plant of a user whose first input acts the other way round."""
+    scenario = find_scenario("osprey_servo")
+    x = np.zeros(4)
+
+    def plant(t: float, u: FloatArray, dt: float) -> FloatArray:
+        effect = np.array([-1.0, 1.0, 1.0, 1.0]) / np.array(scenario.controller.input_scale)
+        x[:] = np.clip(x + dt * (effect * u + 0.01), -3.0, 3.0)
+        return x.copy()
+
+    lost = rise_di.fly_plant(plant, scenario.controller, scenario.reference_model, 15.0)
+    assert lost.outcome.status != 0
