@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import rclpy
 import rclpy.publisher
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
@@ -490,6 +491,19 @@ def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
         if reports
         else ("", {})
     )
+
+
+@contextmanager
+def clients_of(world: World) -> Iterator[None]:
+    """The clients of commands that are made in the block have the endpoints of the world."""
+
+    def create(name: str, **values: Any) -> Any:
+        made = type("ClientNode", (InWorld, Node), {"world": world, "log": Log()})
+        return made(name, **values)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rclpy, "create_node", create)
+        yield
 
 
 @contextmanager

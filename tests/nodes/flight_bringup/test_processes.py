@@ -106,6 +106,20 @@ def test_process_that_ends_named_with_fatal_line_not_last_one(
         start_stage(osprey_gust, tmp_path / "run")
 
 
+def test_cause_named_that_is_before_a_long_traceback(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """A traceback of the stack has 25 lines and more: it must not push its own cause out."""
+    fatal = "[FATAL] [1.0] [controller]: unexpected exception, the node ends: ValueError: broken"
+    lines = [fatal, "Traceback (most recent call last):", *(f"  frame {k}" for k in range(100))]
+    only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(1)\n")
+    cause = (
+        "controller ended with status 1: unexpected exception, the node ends: ValueError: broken"
+    )
+    with refusing(f"^{cause}$"):
+        start_stage(osprey_gust, tmp_path / "run")
+
+
 def test_flight_without_matched_nodes_never_begins(
     osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

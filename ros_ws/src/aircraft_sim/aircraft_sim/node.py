@@ -22,7 +22,7 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import NO_CHANNELS, Decoder, instant, stamp_of
+from flight_ros.messages import NO_CHANNELS, Decoder, instant
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
@@ -146,8 +146,9 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _ahead_of_log(self) -> bool:
         if not self.parameters.recorded:
             return False
-        for received in self._recorded_subscription.take():
-            self._recorded_ns = stamp_of(received.message)
+        subscription = self._recorded_subscription
+        for stamp_ns in self.refusals.stamps(subscription, subscription.take()):
+            self._recorded_ns = stamp_ns
         return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
 
     def awaited_topic(self) -> str:

@@ -107,14 +107,15 @@ def _airspeed_of_pressure(pressure: Any) -> float:
 
 
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a quaternion with members w, x, y, z, or with four elements in this order, as
-    PX4 publishes it.
+    """(w, x, y, z), of length 1, of a quaternion with members w, x, y, z, or with four elements in
+    this order, as PX4 publishes it.
     """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
-    quaternion = float(w), float(x), float(y), float(z)
-    if not 0.0 < math.hypot(*quaternion) < math.inf:
+    w, x, y, z = float(w), float(x), float(y), float(z)
+    # squares of the components could underflow, or overflow
+    if not 0.0 < (length := math.hypot(w, x, y, z)) < math.inf:
         raise ValueError("a quaternion of length 0, infinity or NaN has no angles")
-    return quaternion
+    return w / length, x / length, y / length, z / length
 
 
 def _roll(field: Any) -> float:
@@ -128,7 +129,7 @@ def _roll(field: Any) -> float:
 def _pitch(field: Any) -> float:
     """Pitch angle of a quaternion, rad, in -pi/2..pi/2."""
     w, x, y, z = _quaternion(field)
-    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z) / (w * w + x * x + y * y + z * z))))
+    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))
 
 
 def _yaw(field: Any) -> float:
@@ -168,14 +169,14 @@ def _turned(message: Any, path: str, attitude: str) -> float:
     """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the
     world.
 
-    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q
-    = (w, r).
+    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) with q =
+    (w, r), |q| = 1.
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
     w, *r = _quaternion(get_field(message, attitude))
     across = np.cross(r, v)
-    turned = v + 2.0 * (w * across + np.cross(r, across)) / (w * w + np.dot(r, r))
+    turned = v + 2.0 * (w * across + np.cross(r, across))
     return float(turned["xyz".index(axis)])
 
 

@@ -5,11 +5,11 @@
 from collections.abc import Callable
 
 import rclpy
-from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 
 from flight_core.text import bounded
 from flight_ros.client import SERVICE_TIMEOUT, Client
+from flight_ros.messages import NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 
@@ -100,8 +100,8 @@ class EngagementClient(Client):
         self._node.destroy_client(client)
 
     def _received_u(self) -> list[tuple[float, ...]]:
-        for received in self._u_subscription.take():
-            self._u.append(tuple(deserialize_message(received.message, U.type).position))
+        samples = self._decoded(self._u_subscription, NamedDecoder().decode)
+        self._u += [tuple(sample.channels.values()) for sample in samples]
         return self._u
 
     def _received_phases(self) -> list[tuple[str, str]]:

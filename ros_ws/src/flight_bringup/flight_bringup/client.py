@@ -17,7 +17,6 @@ import psutil
 from flight_bringup.flightgear import packet
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.files import write_file, writing
-from flight_core.vectors import ChannelError
 from flight_guidance.route_file import Origin
 from flight_ros.client import Client
 from flight_ros.clocks import ClockOfPeer, PeerClocks
@@ -85,13 +84,9 @@ class FlightGearClient(Client):
 
     def _take(self) -> bool:
         """Take the newest pose. Returns whether one has come."""
-        came = False
-        for received in self._pose.take():
-            with suppress(ChannelError):
-                if channels := self._decoder.decode(received.message).channels:
-                    self._newest = channels
-                    came = True
-        return came
+        poses = [sample.channels for sample in self._decoded(self._pose, self._decoder.decode)]
+        self._newest = next(filter(None, reversed(poses)), self._newest)
+        return any(poses)
 
 
 def domain_ports() -> tuple[int, int]:
@@ -105,7 +100,7 @@ class NetworkClient(Client):
     def __init__(self, own_host: str, peers: Sequence[str]) -> None:
         super().__init__("network", rosout=False)
         self._instances = {_instance(address): address for address in peers if address != own_host}
-        self._clocks = PeerClocks(self._node, _instance(own_host))
+        self._clocks = PeerClocks(self._node, _instance(own_host), self._refused)
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
         """Exchange until every host is received and receives, at most `timeout` s.

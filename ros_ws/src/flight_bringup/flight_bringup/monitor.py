@@ -9,7 +9,7 @@ from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.text import bounded
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import FloatArray
 from flight_ros import reports
 from flight_ros.client import Client
 from flight_ros.messages import Decoder, instant, stamp_of
@@ -52,7 +52,7 @@ class FlightMonitor(Client):
     ) -> None:
         super().__init__("monitor", namespace)
         self.by_clock = use_sim_time
-        self._simulated = SimulatedTime(self._node) if use_sim_time else None
+        self._simulated = SimulatedTime(self._node, self._refused) if use_sim_time else None
         self.clock: HostTime = self._simulated or time  # of the flight
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
@@ -123,11 +123,7 @@ class FlightMonitor(Client):
     def newest(self) -> tuple[str, FloatArray] | None:
         """Mode and e of the controller's newest sample since the last call, None without one."""
         status = None
-        for received in self._internals.take() if self._internals is not None else ():
-            try:
-                sample = self._decoder.decode(received.message)
-            except ChannelError:
-                continue
+        for sample in self._decoded(self._internals, self._decoder.decode):
             if sample is not None:
                 status = MODES.get(sample.value[0], "?"), sample.value[1:]
         return status
@@ -144,16 +140,17 @@ class FlightMonitor(Client):
         """What became of proposals of a learner since the last call: instants by the clock of the
         stamps, s, and sentences.
         """
-        received = () if self._learning is None else self._learning.take()
-        decoded = [reports.decode(message.message) for message in received]
-        return [(seconds(report.stamp_ns), bounded(report.sentence)) for report in decoded]
+        return [
+            (seconds(report.stamp_ns), bounded(report.sentence))
+            for report in self._decoded(self._learning, reports.decode)
+        ]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a
         change.
         """
-        messages = self._recorded.take()
-        return seconds(stamp_of(messages[-1].message)) if messages else None
+        stamps = self._decoded(self._recorded, stamp_of)
+        return seconds(stamps[-1]) if stamps else None
 
     def require_free_domain(self) -> None:
         """Raise ParameterError where the namespace already has an aircraft or a reference model in

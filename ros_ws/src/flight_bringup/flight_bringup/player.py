@@ -13,6 +13,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import ChannelError
 from flight_ros.client import Client
 from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
@@ -108,7 +109,10 @@ class Player(Client):
 
 
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
-    since_ns = stamp_of(data) - first_ns
+    try:
+        since_ns = stamp_of(data) - first_ns
+    except ChannelError:  # too short for a stamp: sent as it is in the log
+        return data
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
     STAMP.pack_into(message, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))

@@ -109,12 +109,18 @@ def leave_outcome(run: Path, outcome: Outcome) -> None:
             write_file(run / OUTCOME_FILE, outcome.text())
 
 
+# begins the line in which a node says why it ends
+CAUSE = re.compile(r"\[FATAL\]|error: ")
+
+
 class NotReadyError(ParameterError):
     """A node is not ready in time, or has ended before, and not by bad input."""
 
 
 class NodeProcess:
-    """One node as a process. Its output goes to a file; `lines` holds the last lines."""
+    """One node as a process. The output goes to a file; `lines` holds the last lines, `cause` the
+    line with the reason of the end, also before a long traceback.
+    """
 
     def __init__(
         self,
@@ -126,6 +132,7 @@ class NodeProcess:
     ) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
+        self.cause = ""
         # -P: a package in the working folder must not replace a package of the stack
         module = ["-P", "-m", node.module]
         command = [*end_with_parent(), sys.executable, *module]
@@ -167,6 +174,8 @@ class NodeProcess:
             return
         for line in self.popen.stdout:
             self.lines.append(line.rstrip())
+            if CAUSE.match(line):
+                self.cause = line.rstrip()
             with suppress(OSError):  # a full disk must not block the pipe, and with it the node
                 self._log.write(line)
                 self._log.flush()
@@ -442,9 +451,7 @@ def _outcome(process: NodeProcess) -> Outcome:
     if status == 0:
         return ended_early(f"{name} was shut down")
     lines = [line for line in process.lines if line.strip()] or ["no output"]
-    cause = next(
-        (line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1]
-    )
+    cause = process.cause or lines[-1]
     message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
     if status == STATUS_LANDED:
         return Outcome(End.LANDED, message)

@@ -4,7 +4,6 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from typing import NoReturn
 
 import numpy as np
@@ -15,7 +14,6 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from flight_core.parameters import ParameterError
-from flight_core.vectors import ChannelError
 from flight_guidance.guidance_state import TARGETS
 from flight_guidance.odometry import MAP
 from flight_ros.client import Client
@@ -148,11 +146,7 @@ class GuidanceClient(Client):
 
     def _received(self) -> list[dict[str, float]]:
         """The channels of the samples of `guidance` since the last call."""
-        samples = []
-        for received in self._guidance.take():
-            with suppress(ChannelError):
-                samples.append(self._decoder.decode(received.message).channels)
-        return samples
+        return [sample.channels for sample in self._decoded(self._guidance, self._decoder.decode)]
 
 
 class TargetClient(GuidanceClient):

@@ -39,7 +39,7 @@ from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderConfig
 from flight_ros.endpoints import type_name
 from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
-from flight_ros.messages import instant, sender_of, stamp_of
+from flight_ros.messages import instant, sender_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import HostTime, Tick
@@ -253,19 +253,19 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """Write the received messages. In lockstep publish the stamp of the newest sample of
         `truth` in the bag.
         """
-        recorded = b""
         if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
             return
+        stamps: list[int] = []
         for topic in self._topics:
             received = topic.subscription.take()
-            if received:
-                self._hear(topic, received)
-            if received and topic.subscription.topic is TRUTH and self.parameters.lockstep:
-                recorded = instant(stamp_of(received[-1].message))
             if not self._ended:
                 self._write_or_end(partial(self._append, topic, received))
-        if recorded:
-            self._publish_recorded(recorded)
+            if received:
+                self._hear(topic, received)
+            if topic.subscription.topic is TRUTH and self.parameters.lockstep:
+                stamps += self.refusals.stamps(topic.subscription, received)
+        if stamps:
+            self._publish_recorded(instant(stamps[-1]))
 
     def _hear(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         """Note the time of the newest message of a topic."""
@@ -274,8 +274,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         topic.first_ns = topic.first_ns or now_ns
         topic.heard_ns = now_ns
         topic.sent_ns = last.sent_ns
-        if topic.subscription.topic in LOOP:
-            topic.stamp_ns = stamp_of(last.message)
+        if topic.subscription.topic in LOOP and not self.parameters.lockstep:
+            for stamp_ns in self.refusals.stamps(topic.subscription, received):
+                topic.stamp_ns = stamp_ns
         if topic.silent_ns:
             silent_ns = now_ns - topic.silent_ns
             topic.silent_ns = 0

@@ -5,7 +5,7 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import rclpy
 from rclpy.exceptions import NameValidationException
@@ -14,6 +14,10 @@ from rclpy.signals import SignalHandlerOptions
 from flight_core.parameters import ParameterError
 from flight_ros import transport
 from flight_ros.rclpy_private import ARGUMENT_ERRORS
+from flight_ros.receiver import Refusals
+from flight_ros.subscriptions import PolledSubscription
+
+T = TypeVar("T")
 
 SERVICE_TIMEOUT = 10.0  # s
 DISCOVERY_TIMEOUT = 3.0  # s, until an aircraft of this namespace is known where others are
@@ -58,9 +62,11 @@ class Client:
                 key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
                 raise ParameterError(f"{key}: {' '.join(str(error).split())}") from None
             self._node = node
+            self._refused = Refusals(node)
             self._cancelled = threading.Event()
         else:
             self._node = parent._node
+            self._refused = parent._refused
             self._cancelled = parent._cancelled
 
     def __enter__(self) -> Self:
@@ -73,6 +79,15 @@ class Client:
     def _shut_down(self) -> None:
         if self._started:
             rclpy.try_shutdown()
+
+    def _decoded(
+        self, subscription: PolledSubscription | None, decode: Callable[[bytes], T]
+    ) -> list[T]:
+        """The messages since the last call; none without a subscription."""
+        if subscription is None:
+            return []
+        pairs = self._refused.decoded(subscription, subscription.take(), decode)
+        return [message for message, _ in pairs]
 
     def _spin_until(
         self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT

@@ -29,8 +29,8 @@ from rclpy.node import Node
 
 from flight_core.rates import NANOSECONDS
 from flight_core.text import bounded
-from flight_core.vectors import ChannelError
-from flight_ros.messages import Encoder, NamedDecoder, require_size
+from flight_ros.messages import Encoder, NamedDecoder
+from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import CLOCKS, offered
 
@@ -126,7 +126,8 @@ class Peers:
 class PeerClocks:
     """Measures the clocks of the other nodes over `clocks`."""
 
-    def __init__(self, node: Node, instance: str) -> None:
+    def __init__(self, node: Node, instance: str, refusals: Refusals) -> None:
+        self._refusals = refusals
         self._peers = Peers(instance, number_of_host())
         self._instance = instance
         self._told: dict[str, float] = {}
@@ -139,12 +140,9 @@ class PeerClocks:
         time of the node.
         """
         self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
-        for received in self._subscription.take():
-            try:
-                require_size(received.message)
-                sample = self._decoder.decode(received.message)
-            except ChannelError:
-                continue
+        for sample, received in self._refusals.decoded(
+            self._subscription, self._subscription.take(), self._decoder.decode
+        ):
             self._peers.receive(
                 sample.sender, sample.stamp_ns, received.received_ns - ahead_ns, sample.channels
             )

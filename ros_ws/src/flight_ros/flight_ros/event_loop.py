@@ -143,8 +143,12 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
     except ClockRestarted as restart:
         node.get_logger().error(f"{restart}; this node begins again")
         return False
-    except Exception:
-        node.get_logger().fatal(f"unexpected exception, the node ends: {traceback.format_exc()}")
+    except Exception as error:
+        # the first line alone names the exception: a traceback has many
+        cause = bounded(" ".join("".join(traceback.format_exception_only(error)).split()))
+        node.get_logger().fatal(
+            f"unexpected exception, the node ends: {cause}\n{traceback.format_exc()}"
+        )
         sys.exit(1)
     else:
         return True

@@ -24,7 +24,7 @@ from flight_core.text import bounded
 from flight_ros.clocks import PeerClocks
 from flight_ros.endpoints import EndpointMonitor
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import Encoder, stamp_of
+from flight_ros.messages import Encoder
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.rclpy_private import refuse_foreign_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
@@ -77,13 +77,15 @@ class FlightNode(Node, Generic[P]):
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
+        self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
         simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
-        self.simulated = SimulatedTime(self) if simulated else None
+        self.simulated = SimulatedTime(self, self.refusals) if simulated else None
         self.host: HostTime = self.simulated or time  # the time of the ticks
         self.clocks = (
-            None if simulated or self.parameters.lockstep else PeerClocks(self, self.instance)
+            None
+            if simulated or self.parameters.lockstep
+            else PeerClocks(self, self.instance, self.refusals)
         )
-        self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
@@ -313,16 +315,11 @@ class FlightNode(Node, Generic[P]):
 
     def _received_start_ns(self) -> int | None:
         """The instant on the topic `start`, ns. An old instant is of an earlier flight."""
-        messages = () if self._start_subscription is None else self._start_subscription.take()
-        instants = (stamp_of(received.message) for received in messages)
-        return next(
-            (
-                stamp_ns
-                for stamp_ns in instants
-                if stamp_ns > self.host.time_ns() - MAX_START_AGE_NS
-            ),
-            None,
-        )
+        if self._start_subscription is None:
+            return None
+        instants = self.refusals.stamps(self._start_subscription, self._start_subscription.take())
+        oldest_ns = self.host.time_ns() - MAX_START_AGE_NS
+        return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 
     def match(self) -> None:
         """Real time: publish once when every input has a publisher."""

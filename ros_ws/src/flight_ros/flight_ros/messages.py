@@ -190,9 +190,15 @@ def sender_of(raw: bytes) -> str | None:
 
 
 def stamp_of(raw: bytes) -> int:
-    """The stamp of a message that begins with it, ns."""
-    seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
-    return int(seconds) * NANOSECONDS + int(nanoseconds)
+    """The stamp at the begin of a message, ns. Raises ChannelError, reason "malformed"."""
+    order = BYTE_ORDERS.get(raw[:2])
+    if order is None or len(raw) < LENGTH_PLACE:
+        raise ChannelError(
+            "malformed", f"a message of {len(raw)} bytes, expected a stamp in plain CDR"
+        )
+    place = STAMP_PLACE + STAMP.size // 2
+    seconds = int.from_bytes(raw[STAMP_PLACE:place], order, signed=True)
+    return seconds * NANOSECONDS + int.from_bytes(raw[place:LENGTH_PLACE], order)
 
 
 def instant(stamp_ns: int) -> bytes:

@@ -6,7 +6,7 @@ logged.
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -15,8 +15,8 @@ from rclpy.node import Node
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, require_not_future, require_not_old
-from flight_ros.messages import MAX_SIZE, require_size, sender_of
-from flight_ros.subscriptions import PolledSubscription
+from flight_ros.messages import MAX_SIZE, require_size, sender_of, stamp_of
+from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.throttle import Throttle
 from flight_ros.topics import Topic
 
@@ -42,6 +42,7 @@ class Sample(Protocol):
 
 
 S = TypeVar("S", bound=Sample)
+T = TypeVar("T")
 
 
 class Source(Protocol):
@@ -80,6 +81,27 @@ class Refusals:
             self._node.get_logger().error(f"{subscription.name}: sample refused: {sentence}")
         else:
             self._node.get_logger().warning(f"{subscription.name}: sample refused: {sentence}")
+
+    def decoded(
+        self,
+        source: Source,
+        messages: Iterable[ReceivedMessage],
+        decode: Callable[[bytes], T],
+    ) -> list[tuple[T, ReceivedMessage]]:
+        """Decoded messages with their metadata. A message is refused where `decode` raises
+        ChannelError.
+        """
+        pairs = []
+        for received in messages:
+            try:
+                pairs.append((decode(received.message), received))
+            except ChannelError as error:
+                self.add(source, error.reason, str(error))
+        return pairs
+
+    def stamps(self, source: Source, messages: Iterable[ReceivedMessage]) -> list[int]:
+        """The stamps at the begin of messages, ns. A message without a stamp is refused."""
+        return [stamp_ns for stamp_ns, _ in self.decoded(source, messages, stamp_of)]
 
     def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
         """The last refusal of a topic since an instant of the monotonic clock, with age and count;

@@ -14,6 +14,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
+from flight_ros.messages import require_size
 from flight_ros.rclpy_private import DeserializationError
 
 MAX_REPORT_SIZE = 65_536  # bytes; a model of eight states with its observer has 10,000
@@ -45,7 +46,8 @@ def encode(report: Report, name: str) -> bytes:
 
 
 def decode(raw: bytes) -> Report:
-    """The report of a message. Raises ChannelError, reason "malformed"."""
+    """The report of a message. Raises ChannelError, reason "size" or "malformed"."""
+    require_size(raw, MAX_REPORT_SIZE)
     try:
         message = deserialize_message(raw, DiagnosticArray)
         (status,) = message.status

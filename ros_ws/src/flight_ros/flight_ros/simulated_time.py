@@ -13,8 +13,9 @@ from bisect import bisect_right
 from rclpy.node import Node
 
 from flight_core.rates import NANOSECONDS, seconds
-from flight_ros.messages import LENGTH_PLACE, stamp_of
+from flight_ros.messages import stamp_of
 from flight_ros.rclpy_private import WaitSet
+from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
 
@@ -32,7 +33,8 @@ class ClockRestarted(Exception):  # noqa: N818 - an event of the simulator
 class SimulatedTime:
     """The newest instant of /clock, as a `HostTime`."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, refusals: Refusals) -> None:
+        self._refusals = refusals
         self.subscription = PolledSubscription(node, SIMULATED_CLOCK, NEWEST_SAMPLES, raw=True)
         self._context = node.context
         self._wait_set: WaitSet | None = None
@@ -103,10 +105,10 @@ class SimulatedTime:
             )
 
     def _take(self) -> None:
-        for received in self.subscription.take():
-            if len(received.message) < LENGTH_PLACE or self._jump_ns:
-                continue
-            instant_ns = stamp_of(received.message)
+        messages = self.subscription.take()
+        for instant_ns, received in self._refusals.decoded(self.subscription, messages, stamp_of):
+            if self._jump_ns:
+                return
             received_ns = received.received_ns or time.time_ns()
             if not self._instants_ns:
                 self._first = instant_ns, received_ns

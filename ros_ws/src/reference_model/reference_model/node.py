@@ -12,7 +12,7 @@ from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import Decoder, stamp_of
+from flight_ros.messages import Decoder
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelConfig
@@ -111,12 +111,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self.get_logger().info(f"commands from {self._u_m.name} replace the profile")
 
     def advance(self) -> bool:
-        self._clock_ns = max(
-            [
-                self._clock_ns,
-                *(stamp_of(received.message) for received in self._clock_subscription.take()),
-            ]
-        )
+        subscription = self._clock_subscription
+        stamps = self.refusals.stamps(subscription, subscription.take())
+        self._clock_ns = max([self._clock_ns, *stamps])
         advanced = False
         while True:
             if self._next is None and self._commands_known():
