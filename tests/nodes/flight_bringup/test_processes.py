@@ -224,3 +224,40 @@ def test_process_that_closes_log_has_time_for_it(
     until(lambda: "up" in process.lines, "the process is up")
     flight.stop()
     assert "closed" in process.lines
+
+
+IGNORES_THE_END = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+def test_processes_that_had_to_be_killed_are_counted_and_named(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only_stage.write_text(IGNORES_THE_END)
+    (tmp_path / "ends").mkdir()
+    (tmp_path / "ends" / "main.py").write_text(
+        "print('up', flush=True)\nimport time\ntime.sleep(600)"
+    )
+    monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.5)
+    lines: list[str] = []
+    flight = FlightProcesses(
+        osprey_gust,
+        tmp_path,
+        SILENT_MONITOR,
+        lockstep=False,
+        one_process=False,
+        announce=lines.append,
+    )
+    for node in (NodeSpec("fake", "aircraft"), NodeSpec("ends", "guidance")):
+        log = tmp_path / f"{node.executable}.log"
+        flight.processes.append(processes.NodeProcess(node, osprey_gust.path, {}, log))
+    for process in flight.processes:
+        until(lambda process=process: "up" in process.lines, "the process is up")  # type: ignore[misc]  # bound in the loop
+    flight.stop()
+    assert lines == ["1 of 2 processes did not end and had to be killed: aircraft"]
+    flight.stop()
+    assert len(lines) == 1

@@ -237,6 +237,7 @@ class _Flight:
                 lockstep=fleet.lockstep,
                 one_process=fleet.composed,
                 namespace=absolute_namespace(self.member.name),
+                announce=self._announce,
             ).__enter__()
         except ParameterError as error:
             self.outcome = never_flew(str(error))
@@ -280,6 +281,9 @@ class _Flight:
             self.processes.outcome = outcome
             self.stopping = threading.Thread(target=self.processes.stop)
             self.stopping.start()
+
+    def _announce(self, line: str) -> None:
+        self.progress(self.member.scenario.flight.duration, f"{self.outcome}; {line}")
 
     def join(self) -> None:
         """Wait until the processes have stopped."""

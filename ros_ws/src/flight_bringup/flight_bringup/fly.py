@@ -97,10 +97,10 @@ def fly_over_topics(
     process. With `use_sim_time` the nodes and the flight are by /clock.
     `autopilot` flies in the aircraft's place, in real time only. All nodes are in the
     `namespace`, as "/uav1". `announce` gets a line for each change of engagement and of reason, but
-    not for a changed number, and for what becomes of a proposal of a learner. With `engaged_for`,
-    s, the flight ends so long after its first engagement, or with it, or without one when too
-    little time is left. The outcome is COMPLETED, LANDED, INTERRUPTED (Ctrl-C, SIGTERM or SIGHUP),
-    or names the process that ended early.
+    not for a changed number, for what becomes of a proposal of a learner, and for processes that
+    had to be killed. With `engaged_for`, s, the flight ends so long after its first engagement, or
+    with it, or without one when too little time is left. The outcome is COMPLETED, LANDED,
+    INTERRUPTED (Ctrl-C, SIGTERM or SIGHUP), or names the process that ended early.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -123,6 +123,7 @@ def fly_over_topics(
                 one_process=one_process,
                 autopilot=autopilot,
                 namespace=namespace,
+                announce=announce,
             ) as processes,
         ):
             begun = processes.begin()

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -196,7 +196,7 @@ class FlightProcesses:
 
     `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the
     bridge starts in the aircraft's place. A flight in real time with an aircraft has its t = 0 from
-    `begin`, once `match` has seen it ready.
+    `begin`, once `match` has seen it ready. `announce` gets a line on processes that were killed.
     """
 
     def __init__(
@@ -209,7 +209,9 @@ class FlightProcesses:
         one_process: bool,
         autopilot: Autopilot | None = None,
         namespace: str = "",
+        announce: Callable[[str], None] = lambda line: None,
     ) -> None:
+        self._announce = announce
         self.scenario = scenario
         self._run = run
         self.monitor = monitor
@@ -426,6 +428,7 @@ class FlightProcesses:
                 for process in self.processes
                 if process.node not in last | first
             }
+            killed: list[str] = []
             for timeouts in (first, middle, last):
                 deadline = time.monotonic() + max(timeouts.values(), default=0.0)
                 group = [process for process in self.processes if process.node in timeouts]
@@ -438,7 +441,11 @@ class FlightProcesses:
                         process.popen.wait(max(deadline - time.monotonic(), 0.2))
                     except subprocess.TimeoutExpired:
                         process.popen.kill()
+                        killed.append(process.node.executable)
                     process.finish()
+            if killed:
+                count = f"{len(killed)} of {len(self.processes)} processes"
+                self._announce(f"{count} did not end and had to be killed: {', '.join(killed)}")
             self.processes = []
 
 

@@ -18,12 +18,8 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from flight_core.outcome import (
-    STATUS_BAD_INPUT,
-    STATUS_ENDED_EARLY,
-    End,
-    FlightEnded,
-)
+from flight_core.deadline import Deadline
+from flight_core.outcome import STATUS_BAD_INPUT, STATUS_ENDED_EARLY, End, FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.scheduling import disable_timer_slack, request_short_slices
@@ -57,6 +53,13 @@ LONGEST_PAUSE_NS = NANOSECONDS
 
 REPORT_TIME_NS = NANOSECONDS // 2  # in which the reports of a second are done
 
+STATUS_UNEXPECTED = 1  # exit status after an unexpected exception
+
+TEARDOWN_TIME = 1.5
+"""s, at most, of the middleware at the end of a node, which needs 0.2 s. Fast DDS 2.14 can wait for
+ever there, with the interpreter held, where other participants end at the same time
+(eProsima/Fast-DDS, issue 6513). The other nodes then notice the end by the lease, 2 s."""
+
 START_POLL_PERIOD = 0.005  # s, of a node that waits for t = 0
 
 IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
@@ -89,13 +92,12 @@ def run(
     """
     stop = _Stop()
     handle_shutdown(stop.request)
-    try:
-        while not _run_to_end(_make_nodes(make_nodes, early_participant), stop):
-            early_participant = None
-            gc.unfreeze()
-            gc.collect()  # the services of the old nodes end with their objects
-    finally:
-        rclpy.try_shutdown()
+    while (status := _run_to_end(_make_nodes(make_nodes, early_participant), stop)) is None:
+        early_participant = None
+        gc.unfreeze()
+        gc.collect()  # the services of the old nodes end with their objects
+    rclpy.try_shutdown()
+    sys.exit(status)
 
 
 def _make_nodes(
@@ -114,15 +116,18 @@ def _make_nodes(
         print(
             f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr
         )
-        sys.exit(STATUS_ENDED_EARLY if isinstance(error, FlightEnded) else STATUS_BAD_INPUT)
+        status = STATUS_ENDED_EARLY if isinstance(error, FlightEnded) else STATUS_BAD_INPUT
+        Deadline(TEARDOWN_TIME, status)
+        sys.exit(status)
     return nodes
 
 
-def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
-    """Whether the nodes ended for good; otherwise nodes with the same parameters are to begin
+def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
+    """Run nodes. Returns the exit status; None where nodes with the same parameters are to begin
     again.
     """
     node = nodes[0]
+    status: int | None = 0
     try:
         if sockets := transport.open_to_network():
             node.get_logger().error(
@@ -135,27 +140,30 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
             _run_real_time(nodes, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(STATUS_BAD_INPUT)
+        status = STATUS_BAD_INPUT
     except FlightEnded as error:
         log = node.get_logger()
         (log.info if error.end is End.LANDED else log.fatal)(str(error))
-        sys.exit(error.status)
+        status = error.status
     except ClockRestarted as restart:
         node.get_logger().error(f"{restart}; this node begins again")
-        return False
+        status = None
     except Exception as error:
         # the first line alone names the exception: a traceback has many
         cause = bounded(" ".join("".join(traceback.format_exception_only(error)).split()))
         node.get_logger().fatal(
             f"unexpected exception, the node ends: {cause}\n{traceback.format_exc()}"
         )
-        sys.exit(1)
-    else:
-        return True
-    finally:
-        for node in nodes:
-            node.finish()
-            node.destroy_node()
+        status = STATUS_UNEXPECTED
+    for node in nodes:
+        node.finish()
+    # the log is closed, and u is not sent any more: what is left is the middleware's
+    deadline = Deadline(TEARDOWN_TIME, STATUS_ENDED_EARLY if status is None else status)
+    for node in nodes:
+        node.destroy_node()
+    if status is None:
+        deadline.cancel()
+    return status
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:

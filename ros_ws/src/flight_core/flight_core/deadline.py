@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A deadline for the end of a process, also while a call into a library holds the interpreter.
+
+Neither a Python thread nor a signal handler of Python runs during such a call, and the default
+action of a signal loses the exit status. So a timer of the kernel starts a thread of the C library
+(POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
+"""
+
+import ctypes
+import faulthandler
+import os
+import sys
+import time
+from contextlib import suppress
+from typing import Self
+
+from flight_core.rates import NANOSECONDS
+
+SIGEV_THREAD = 2  # linux/bits/sigevent-consts.h
+SIGEVENT_SIZE = 64  # bytes, of struct sigevent
+TOLD_AT = 0.9  # of the deadline: the stacks then go to stderr
+
+
+class _SignalEvent(ctypes.Structure):
+    """struct sigevent with the members of SIGEV_THREAD."""
+
+    _fields_ = (
+        ("value", ctypes.c_ssize_t),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("padding", ctypes.c_char * (SIGEVENT_SIZE - 32)),
+    )
+
+
+class _TimerTimes(ctypes.Structure):
+    """struct itimerspec: period and first expiry, s and ns."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_long) for name in ("period_s", "period_ns", "first_s", "first_ns")
+    )
+
+
+class Deadline:
+    """Ends the process with an exit status after `duration` s, unless it is cancelled.
+
+    As a context manager it is cancelled at the end of the block. Python's own clean-up is left
+    out: what must reach a file is closed before.
+    """
+
+    def __init__(self, duration: float, status: int) -> None:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            with suppress(OSError):  # the reader may have ended
+                stream.flush()
+        library = ctypes.CDLL(None, use_errno=True)
+        if not hasattr(library, "timer_create"):  # before glibc 2.34
+            library = ctypes.CDLL("librt.so.1", use_errno=True)
+        leave = ctypes.cast(ctypes.CDLL(None)._exit, ctypes.c_void_p)
+        event = _SignalEvent(value=status, notify=SIGEV_THREAD, function=leave)
+        self._timer = ctypes.c_void_p()
+        self._delete = library.timer_delete
+        _require(
+            library.timer_create(
+                time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(self._timer)
+            )
+        )
+        seconds, nanoseconds = divmod(round(duration * NANOSECONDS), NANOSECONDS)
+        first = _TimerTimes(first_s=seconds, first_ns=nanoseconds)
+        _require(library.timer_settime(self._timer, 0, ctypes.byref(first), None))
+        if sys.stderr is not None:
+            faulthandler.dump_traceback_later(TOLD_AT * duration)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Let the process go on."""
+        faulthandler.cancel_dump_traceback_later()
+        _require(self._delete(self._timer))
+
+
+def _require(result: int) -> None:
+    """Raise OSError after a call of the C library that has failed."""
+    if result != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
