@@ -62,6 +62,7 @@ class RosNode:
     def __init__(self) -> None:
         self.subscriptions: dict[str, Callable[[Any], None]] = {}
         self.published: list[tuple[str, bytes]] = []
+        self.publishers: dict[str, int] = {}  # of other processes, by topic
 
     def create_subscription(
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any
@@ -72,6 +73,15 @@ class RosNode:
     def create_publisher(self, kind: type, topic: str, qos: Any) -> Any:
         """A publisher that keeps the messages with the topic."""
         return SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
+
+    def resolve_topic_name(self, topic: str) -> str:
+        """A full name, which is itself."""
+        assert topic.startswith("/")
+        return topic
+
+    def count_publishers(self, topic: str) -> int:
+        """The publishers of other processes."""
+        return self.publishers.get(topic, 0)
 
     def create_timer(self, period: float, callback: Callable[[], None]) -> None:
         """Accept a timer, which never fires here."""

@@ -18,6 +18,7 @@ from flight_bringup import processes
 from flight_bringup.graph import NodeSpec
 from flight_bringup.processes import FlightProcesses, NotReadyError
 from flight_core.outcome import ended_early, never_flew
+from flight_core.parameters import ParameterError
 
 # in place of a FlightMonitor
 SILENT_MONITOR: Any = SimpleNamespace(
@@ -28,6 +29,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
     clock=time,
     by_clock=False,
     clock_ended=lambda: "",
+    require_free_domain=lambda: None,
 )
 
 
@@ -155,6 +157,25 @@ def test_flight_by_a_clock_that_never_comes_is_told_so(
         FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False),
     ):
         pass
+
+
+def test_no_node_starts_beside_another_flight(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """A controller would engage on the y of the other flight before it is refused."""
+    only_stage.write_text("import time\ntime.sleep(60)\n")
+
+    def refuse() -> None:
+        raise ParameterError("found 1 publishers of /y already")
+
+    monitor: Any = SimpleNamespace(**vars(SILENT_MONITOR))
+    monitor.require_free_domain = refuse
+    with (
+        refusing("^found 1 publishers of /y already$"),
+        FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False),
+    ):
+        pass
+    assert not (tmp_path / "log").exists(), "a log a node that has started"
 
 
 LOSES_CONTACT = (

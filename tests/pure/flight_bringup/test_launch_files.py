@@ -87,9 +87,27 @@ def described(name: str) -> Sequence[Any]:
 
 
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
-    """The actions of a launch with arguments, and its context. `pushed` is the namespace of a
-    launch file that includes it.
+    """The actions of a launch with arguments once the domain is known, and its context. `pushed` is
+    the namespace of a launch file that includes it.
     """
+    actions, context = begun(name, pushed, **given)
+    assert not nodes(actions)  # none before the domain is known
+    return discovered(actions, context), context
+
+
+def discovered(actions: Sequence[Any], context: LaunchContext) -> list[Any]:
+    """The actions with those that follow half a second later, when other flights are known."""
+    follow = list(actions)
+    for timer in every(TimerAction, actions):
+        assert timer.period == 0.5
+        (look,) = every(OpaqueFunction, timer.actions)
+        follow.remove(timer)
+        follow += look.function(context) or ()
+    return follow
+
+
+def begun(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
+    """The first actions of a launch, and its context."""
     entities = described(name)
     declared = {
         argument.name: argument.default_value
@@ -276,6 +294,43 @@ def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_pat
     assert left == ([told] if "recorder" in first else [])
     publish(actions, context, f"/{first[-1]}#{PID}")
     assert require_ready.function(context) is None
+
+
+TAKEN: tuple[tuple[str, dict[str, str], str], ...] = (
+    ("fly", {}, "/y"),
+    ("fly", {"recorder": "rosbag2"}, "/y_m"),
+    ("fly", {"namespace": "uav1"}, "/uav1/y"),
+    ("bridge", {"map": "ardupilot"}, "/y"),
+    ("bridge", {"map": "ardupilot", "recorder": "rosbag2", "namespace": "uav1"}, "/uav1/y_m"),
+    ("replay", {}, "/y"),
+    ("replay", {"reference_model": "true", "topics": "y"}, "/y_m"),
+)
+
+
+@pytest.mark.parametrize("name, given, topic", TAKEN)
+def test_another_flight_in_the_domain_ends_launch_before_any_node_starts(
+    name: str, given: dict[str, str], topic: str, short: Path, tmp_path: Path
+) -> None:
+    log = {"run": str(short)} if name == "replay" else {}
+    actions, context = begun(name, **given, **log, runs=tmp_path / "runs")
+    context.ros_node.publishers[topic] = 1
+    assert not every(Node, actions)
+    assert not every(ExecuteProcess, actions)
+    sentence = f"never flew: ROS_DOMAIN_ID .*: found 1 publishers of {topic} already"
+    with pytest.raises(RuntimeError, match=sentence):
+        discovered(actions, context)
+
+
+def test_launch_flies_beside_another_namespace_and_plays_beside_a_reference_model_of_ones_own(
+    short: Path, tmp_path: Path
+) -> None:
+    for name, given in (
+        ("fly", {"namespace": "uav1"}),
+        ("replay", {"run": str(short), "topics": "/y"}),
+    ):
+        actions, context = begun(name, **given, runs=tmp_path)
+        context.ros_node.publishers["/y_m"] = 1
+        assert nodes(discovered(actions, context))
 
 
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitor of a flight: what `rise-di fly` sees of the nodes."""
 
-import os
 import time
 
 from flight_core.modes import Mode
-from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.text import bounded
 from flight_core.vectors import FloatArray
 from flight_ros import reports
 from flight_ros.client import Client
+from flight_ros.endpoints import require_no_publishers
 from flight_ros.messages import Decoder, instant, stamp_of
 from flight_ros.simulated_time import ClockRestarted, SimulatedTime
 from flight_ros.subscriptions import PolledSubscription
@@ -33,6 +32,13 @@ from flight_ros.topics import (
     offered,
 )
 
+# s, until the publishers of another flight on this host are known, twice the measured 0.25 s
+DISCOVERY_TIME = 0.5
+LOOP_INPUTS = (Y.name, Y_M.name)  # of which a controller makes u
+FREE_DOMAIN = (
+    "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own: --namespace"
+)
+
 MODES = {float(mode): mode.name for mode in Mode}
 
 
@@ -51,6 +57,7 @@ class FlightMonitor(Client):
         namespace: str = "",
     ) -> None:
         super().__init__("monitor", namespace)
+        self._created = time.monotonic()
         self.by_clock = use_sim_time
         self._simulated = SimulatedTime(self._node, self._refused) if use_sim_time else None
         self.clock: HostTime = self._simulated or time  # of the flight
@@ -154,16 +161,7 @@ class FlightMonitor(Client):
 
     def require_free_domain(self) -> None:
         """Raise ParameterError where the namespace already has an aircraft or a reference model in
-        this domain.
+        this domain. Waits until the publishers are known, DISCOVERY_TIME after the start.
         """
-        for topic in (Y, Y_M):
-            count = self._node.count_publishers(topic.name)
-            domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            publishers = (
-                f"{count} publishers of {self._node.resolve_topic_name(topic.name)} already"
-            )
-            expected = (
-                "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace "
-                "of its own: --namespace"
-            )
-            require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, expected)
+        remaining = self._created + DISCOVERY_TIME - time.monotonic()
+        require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

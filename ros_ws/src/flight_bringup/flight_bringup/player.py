@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Player: publishes the messages of a log again, with their timing."""
 
-import os
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib import import_module
@@ -11,16 +10,18 @@ from typing import Any
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 from flight_ros.client import Client
+from flight_ros.endpoints import require_no_publishers
 from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant, stamp_of
 from flight_ros.topics import CLOCK, LOCKSTEP
 
 DISCOVERY_TIME = 1.0  # s, to discover other publishers
+EXPECTED = "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
 MATCHING_TIME = 0.5  # s, to discover the subscribers
 CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
 CLOCK_NAME = f"/{CLOCK.name}"  # as simulated time has it
@@ -41,9 +42,8 @@ class Player(Client):
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
         super().__init__("player", rosout=False)
         try:
-            self._require_no_publishers(
-                [topic for topic in (*types, CLOCK_NAME) if topic not in shared]
-            )
+            topics = [topic for topic in (*types, CLOCK_NAME) if topic not in shared]
+            require_no_publishers(self._node, topics, EXPECTED, DISCOVERY_TIME)
             self._publishers = {
                 topic: self._node.create_publisher(kind, topic, LOCKSTEP)
                 for topic, kind in kinds.items()
@@ -53,23 +53,6 @@ class Player(Client):
         except BaseException:
             self.__exit__()
             raise
-
-    def _require_no_publishers(self, topics: list[str]) -> None:
-        end_ns = time.monotonic_ns() + nanoseconds(DISCOVERY_TIME)
-        domain = os.environ.get("ROS_DOMAIN_ID", "0")
-        while time.monotonic_ns() < end_ns:
-            for topic in topics:
-                count = self._node.count_publishers(topic)
-                expected = (
-                    "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
-                )
-                require(
-                    count == 0,
-                    f"ROS_DOMAIN_ID {domain}",
-                    f"{count} publishers of {topic} already",
-                    expected,
-                )
-            time.sleep(IDLE_POLL_PERIOD)
 
     def play(
         self,

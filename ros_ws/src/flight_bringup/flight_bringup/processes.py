@@ -61,8 +61,6 @@ CLOSE_TIMEOUT = 30.0
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
 NO_CLOCK = "/clock: no message of a simulator"
-# s, until the publishers of another flight on this host are known, twice the measured 0.25 s
-DISCOVERY_TIME = 0.5
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
 BEFORE_END = 0.8  # of the duration: a short flight ends with the bridge's reason, too
 FIRST_U = 5.0  # s, from t = 0 to the first u that the aircraft takes
@@ -237,13 +235,13 @@ class FlightProcesses:
 
     def __enter__(self) -> Self:
         try:
+            # before any node: a controller would engage on the y and y_m of another flight
+            self.monitor.require_free_domain()
             begin = time.monotonic()
             for node in self._first:
                 self._start(node)
             self._wait_until_ready(begin + READY_TIMEOUT)
-            if not self._first:  # whose start gives the monitor the time to discover another flight
-                time.sleep(DISCOVERY_TIME)
-            self.monitor.require_free_domain()
+            self.monitor.require_free_domain()  # another flight may have begun meanwhile
             if not self._on_start:
                 lead = start_lead(time.monotonic() - begin)
                 self._set_start(start_instants(lead, self.monitor))

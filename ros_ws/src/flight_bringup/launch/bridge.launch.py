@@ -113,10 +113,13 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     page = watch_page(context, run) if recorded else []
     first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
-    actions = page + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
+    beside: list[Action] = []
     if recorder == "rosbag2":
         overrides = parameter_overrides(
             RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot
         )
-        actions.append(rosbag2(context, scenario, overrides))
-    return actions
+        beside.append(rosbag2(context, scenario, overrides))
+    stages = start_in_stages(
+        context, run, {spec: node(spec) for spec in first}, follow, beside=beside
+    )
+    return page + stages

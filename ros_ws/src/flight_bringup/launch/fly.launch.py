@@ -130,10 +130,11 @@ def _fly(context: LaunchContext) -> list[Action]:
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
-    actions = watch_page(context, run) + start_in_stages(
-        context, run, {spec: node(spec) for spec in first}, follow
-    )
+    beside: list[Action] = []
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
-        actions.append(rosbag2(context, scenario, overrides))
-    return actions
+        beside.append(rosbag2(context, scenario, overrides))
+    stages = start_in_stages(
+        context, run, {spec: node(spec) for spec in first}, follow, beside=beside
+    )
+    return watch_page(context, run) + stages

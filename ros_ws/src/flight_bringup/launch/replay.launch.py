@@ -44,6 +44,7 @@ from flight_bringup.launch.stages import (
 )
 from flight_bringup.player import unsendable
 from flight_core.parameters import require
+from flight_core.topics import published_by
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
@@ -135,7 +136,12 @@ def _play(context: LaunchContext) -> list[Action]:
         )
         first_stage[spec] = flight_node(spec, scenario, overrides, run)
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
-    return start_in_stages(context, run, first_stage, lambda lead, start_time: second_stage)
+    played = {topic.rpartition("/")[2] for topic in topics.split(",")}
+    for spec in nodes:
+        played.update(published_by(spec.executable))
+    return start_in_stages(
+        context, run, first_stage, lambda lead, start_time: second_stage, publishes=played
+    )
 
 
 def _player(context: LaunchContext, topics: str, run: Path, *, recorded: bool) -> ExecuteProcess:

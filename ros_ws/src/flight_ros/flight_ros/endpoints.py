@@ -4,24 +4,46 @@
 (QoS).
 """
 
-from collections.abc import Sequence
+import os
+import time
+from collections.abc import Iterable, Sequence
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 
+from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.text import bounded
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
 
+DISCOVERY_POLL_PERIOD = 0.02  # s
 LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
 
 
 def type_name(message: type) -> str:
     """Name of a message class in the ROS graph, e.g. sensor_msgs/msg/JointState."""
     return f"{message.__module__.split('.')[0]}/msg/{message.__name__}"
+
+
+def require_no_publishers(
+    node: Node, topics: Iterable[str], expected: str, duration: float = 0.0
+) -> None:
+    """Raise ParameterError where a topic has a publisher already. `duration`, s: to discover the
+    publishers.
+    """
+    end = time.monotonic() + duration
+    names = [node.resolve_topic_name(topic) for topic in topics]
+    domain = f"ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}"
+    while True:
+        for name in names:
+            count = node.count_publishers(name)
+            require(count == 0, domain, f"{count} publishers of {name} already", expected)
+        if time.monotonic() >= end:
+            return
+        time.sleep(DISCOVERY_POLL_PERIOD)
 
 
 def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:

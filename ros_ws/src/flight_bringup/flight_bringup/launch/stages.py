@@ -8,11 +8,11 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import psutil
 from diagnostic_msgs.msg import KeyValue
@@ -36,6 +36,7 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instant, start_lead
+from flight_bringup.monitor import DISCOVERY_TIME, FREE_DOMAIN, LOOP_INPUTS
 from flight_bringup.processes import (
     FIRST_U,
     LOG_TIMEOUT,
@@ -53,10 +54,12 @@ from flight_core.outcome import (
     log_ends_at,
     never_flew,
 )
+from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
 from flight_ros import transport
+from flight_ros.endpoints import require_no_publishers
 from flight_ros.messages import instant
 from flight_ros.topics import (
     FLIGHT,
@@ -258,10 +261,9 @@ def fail_on_exit(
     if event.returncode == STATUS_LANDED:
         return complete(run, "the aircraft has landed", Outcome(End.LANDED))
     end_with(run, ended_early(f"{event.process_name} ended before the flight did"))
-    return None
 
 
-def end_with(run: Path, outcome: Outcome) -> None:
+def end_with(run: Path, outcome: Outcome) -> NoReturn:
     """End the launch with exit status 1, with the outcome in the folder `run`."""
     leave_outcome(run, outcome)
     raise RuntimeError(str(outcome))
@@ -303,16 +305,20 @@ def start_in_stages(
     run: Path,
     first: Mapping[NodeSpec, Node],
     second: Callable[[float, float], Sequence[Action]],
+    *,
+    beside: Sequence[Action] = (),
+    publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the
-    actions of `second`.
+    """Start the first stage of a flight into the folder `run`, and `beside`. Once the nodes are
+    ready, run the actions of `second`.
 
     The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that
-    is not ready after READY_TIMEOUT ends the launch with exit status 1.
+    is not ready after READY_TIMEOUT ends the launch with exit status 1, and so does another flight:
+    a publisher of a topic among `publishes`, before any node starts.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
-    begin = time.monotonic()
+    begin = time.monotonic() + DISCOVERY_TIME
     waiting = dict.fromkeys(first)  # in order
 
     def ready(spec: NodeSpec) -> Sequence[Action]:
@@ -325,14 +331,20 @@ def start_in_stages(
             names = ", ".join(spec.executable for spec in waiting)
             end_with(run, never_flew(f"{names} not ready after {READY_TIMEOUT:g} s"))
 
+    def start(context: LaunchContext) -> list[Action]:
+        if context.is_shutdown:
+            return []
+        topics = [f"{_namespace(context)}/{topic}" for topic in LOOP_INPUTS if topic in publishes]
+        try:
+            require_no_publishers(get_ros_node(context), topics, FREE_DOMAIN)
+        except ParameterError as error:
+            end_with(run, never_flew(str(error)))
+        return [*first.values(), *beside, _after(READY_TIMEOUT, require_ready)]
+
     handlers = [
         on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
     ]
-    return [
-        *handlers,
-        *first.values(),
-        _after(READY_TIMEOUT, require_ready),
-    ]
+    return [*handlers, _after(DISCOVERY_TIME, start)]
 
 
 def begin_when_matched(
