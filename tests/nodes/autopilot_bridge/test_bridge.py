@@ -254,7 +254,12 @@ def test_pilot_override_releases_at_once_and_blocks_an_engagement_while_it_is_ac
 def test_surface_without_effect_by_the_probe_of_the_controller_releases(setup: Setup) -> None:
     setup.start()
     setup.engaged()
-    setup.world.send("/effects", dict(zip(INPUTS, (0.9, 0.1, 0.9, UNKNOWN), strict=True)))
+    effects = dict(zip(INPUTS, (0.9, 0.1, 0.9, UNKNOWN), strict=True))
+    setup.world.send("/effects", effects, "/rogue#1")
+    setup.run(0.5)
+    assert setup.bridge.refusals.counts["effects: sender"] == 1
+    assert not [line for line in setup.bridge.log.lines if "-> RELEASE" in line]
+    setup.world.send("/effects", effects)
     setup.until_logged(f"ENGAGED -> RELEASE: {INPUTS[1]} does not answer the probe")
 
 

@@ -21,7 +21,7 @@ from tests.nodes.world import OUTPUTS, World, diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.channels import POSE
+from flight_core.channels import POSE, UNKNOWN
 from flight_core.modes import Mode as ControllerMode
 from flight_guidance.guidance_state import Lateral, Vertical
 from flight_guidance.node import GuidanceNode
@@ -155,15 +155,57 @@ def test_target_without_channels_keeps_link_and_silence_leads_home(tmp_path: Pat
         assert flight.logged("no message of an operator for 1 s: home")
 
 
-def test_learned_authority_limits_commands_and_a_bad_one_is_refused(flight: Flight) -> None:
+@pytest.fixture
+def learning(tmp_path: Path) -> Iterator[Flight]:
+    """Guidance of a flight that learns, which has engaged."""
+    file = calm(tmp_path / "calm.yaml", authority_rate=10.0)
+    with world_of("--params-file", str(file)) as world:
+        made = Flight(world)
+        made.run()
+        yield made
+
+
+def test_learned_authority_limits_commands_and_a_bad_one_is_refused(learning: Flight) -> None:
+    learning.world.send("/authority", dict.fromkeys(AUTHORITY, 0.0), "/controller#1")
+    learning.run()
+    assert learning.last("authority.p") == 0.0
+    assert learning.logged("from now on no roll rate: p has no input with an effect")
+    learning.world.send("/authority", dict.fromkeys(AUTHORITY, -1.0), "/controller#1")
+    learning.run()
+    assert learning.refused("authority: bounds") == 1
+    assert learning.last("authority.p") == 0.0
+
+
+def test_authority_is_the_controllers_alone(learning: Flight) -> None:
+    """Also before the controller has sent one, and of another process of its name."""
+
+    def send(p: float, publisher: str) -> None:
+        learning.world.send("/authority", dict.fromkeys(AUTHORITY, p), publisher)
+        learning.run()
+
+    for sender in ("/rogue#1", "/controller#2", "/controller", ""):
+        send(0.0, sender)
+        assert learning.last("authority.p") == UNKNOWN, sender
+    assert learning.refused("authority: sender") == 4
+    send(0.0, "/controller#1")
+    assert learning.last("authority.p") == 0.0
+
+
+def test_authority_that_stops_is_void(learning: Flight) -> None:
+    """Three periods of 0.1 s and the age limit of 0.2 s, from the stamp on."""
+    learning.world.send("/authority", dict.fromkeys(AUTHORITY, 0.0), "/controller#1")
+    learning.run(0.45)
+    assert learning.last("authority.p") == 0.0
+    learning.run(0.15)
+    assert learning.last("authority.p") == UNKNOWN
+    assert learning.logged("authority: none for 0.5 s: its limits are void")
+
+
+def test_flight_that_does_not_learn_takes_no_authority(flight: Flight) -> None:
+    assert "/authority" not in {each.topic_name for each in flight.world.subscriptions}
     flight.world.send("/authority", dict.fromkeys(AUTHORITY, 0.0), "/controller#1")
-    flight.run()
-    assert flight.last("authority.p") == 0.0
-    assert flight.logged("from now on no roll rate: p has no input with an effect")
-    flight.world.send("/authority", dict.fromkeys(AUTHORITY, -1.0), "/controller#1")
-    flight.run()
-    assert flight.refused("authority: bounds") == 1
-    assert flight.last("authority.p") == 0.0
+    flight.run(1.0)
+    assert flight.last("authority.p") == UNKNOWN
 
 
 def test_modes_of_second_controller_refused(flight: Flight) -> None:

@@ -6,11 +6,15 @@ import socket
 
 import psutil
 import pytest
+from builtin_interfaces.msg import Time
 from sensor_msgs.msg import JointState
 from tests.nodes.aircraft_sim.test_aircraft import MAX_AGE, flying
+from tests.nodes.world import world_of
 
 from aircraft_sim.node import AircraftNode
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_ros.messages import instant
+from flight_ros.topics import STATE
 from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
 
 
@@ -58,3 +62,18 @@ def test_replayed_u_refused_by_stamp(osprey_gust: Scenario) -> None:
         flight.world.run(0.1, lambda: publisher.publish(recorded))
         assert restarted.refusals.counts["u: old"] > 10
         assert not any("receiving u from" in line for line in restarted.log.lines)
+
+
+def test_start_that_nodes_of_two_names_publish_is_told(osprey_gust: Scenario) -> None:
+    """The message does not name its publisher; a node that was started again has one name."""
+    arguments = ("--params-file", str(osprey_gust.path), "-p", "start_time:=-1.0")
+    with world_of(*arguments) as world:
+        aircraft = world.make(AircraftNode)
+        starts = [world.publisher(Time, "/start", STATE, "/monitor") for _ in range(2)]
+        starts[0].publish(instant(world.clock.time_ns()))
+        assert aircraft.start_ns() == world.clock.time_ns()
+        assert not aircraft.log.lines
+        world.publisher(Time, "/start", STATE, "/rogue").publish(instant(world.clock.time_ns()))
+        assert aircraft.start_ns() == world.clock.time_ns()
+        told = "[ERROR] /start: published by /monitor, /rogue, expected one node"
+        assert aircraft.log.lines == [told]

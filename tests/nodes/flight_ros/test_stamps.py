@@ -98,6 +98,8 @@ def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
 def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_path: Path) -> None:
     overrides = parameter_overrides(spec, SCENARIO, tmp_path, 0.0, lockstep=lockstep)
     overrides = {**overrides, "sensors.delay": DELAY} if spec is AIRCRAFT else overrides
+    learns = {"authority_rate": 10.0} if spec is GUIDANCE else {}
+    overrides = {**overrides, **learns}
     parameters = (
         word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")
     )

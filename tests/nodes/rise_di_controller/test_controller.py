@@ -23,7 +23,7 @@ from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, stamp_ns,
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds
-from flight_ros.messages import to_message
+from flight_ros.messages import Encoder, to_message
 from rise_di_controller.node import ControllerNode
 
 PERIOD, MAX_AGE = 0.01, 0.1  # s, of the ticks, and of y and y_m, as in the default scenario
@@ -124,6 +124,51 @@ def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
 def flight(osprey_gust: Scenario) -> Iterator[Flight]:
     with flying(osprey_gust) as made:
         yield made
+
+
+def test_forged_y_in_the_name_of_the_aircraft_is_held_and_told_until_it_ends(
+    flight: Flight,
+) -> None:
+    """Either y may be the forged one. A name of its own is refused alone, and the law flies on."""
+    flight.engage()
+    rogue = flight.world.publisher(JointState, "/y", node="/rogue")
+    encoder = Encoder(OUTPUTS, "/peer#1")
+    errors = flight.node.log.lines
+
+    def forge() -> None:
+        flight.send()
+        rogue.publish(encoder.encode(flight.world.clock.time_ns(), np.full(4, 0.03)))
+
+    begin = len(flight.at())
+    flight.world.run(1.0, forge)
+    modes = flight.column("mode", begin)
+    assert set(modes[flight.at(begin) > flight.at(begin)[0] + nanoseconds(0.15)]) <= {
+        Mode.HOLD,
+        Mode.RAMP,
+        Mode.TRIM,
+    }
+    told = "[ERROR] /y: sample refused: two publishers send under the name /peer#1: none is taken"
+    assert told in errors
+    assert "[ERROR] /y: published by /peer, /rogue, expected one node" in errors
+    assert "two publishers send under the name" in diagnostics(flight.world, "/controller")[0]
+    rogue.leave()
+    flight.run(0.9)
+    assert flight.mode != Mode.ENGAGED, "a second after the last witness at the earliest"
+    flight.run(0.4)
+    assert flight.mode == Mode.ENGAGED
+
+
+def test_relay_of_old_samples_stops_nothing(flight: Flight) -> None:
+    flight.engage()
+    relay = flight.world.publisher(JointState, "/y", node="/relay")
+    old = flight.world.sent["/y"][0][1]
+
+    def both() -> None:
+        flight.send()
+        relay.publish(old)
+
+    flight.world.run(1.0, both)
+    assert flight.mode == Mode.ENGAGED
 
 
 def test_engages_bumpless_from_zero(flight: Flight) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.modes import Mode
-from flight_core.publisher_lock import PublisherLock
+from flight_core.publisher_lock import SHARED_NS, PublisherLock
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, StampedVector
 from rise_di_controller.controller import Controller
@@ -44,6 +44,56 @@ def test_restarted_node_takes_over_earlier() -> None:
     lock.check("/foreign", TAKEOVER + 1)
     assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
     assert not lock.timed_out(MAX_AGE, MAX_AGE)
+
+
+def refused(lock: PublisherLock, now_ns: int, sequence: int, sender: str = "/aircraft#1") -> bool:
+    """Whether a message is refused as one of two publishers under a name; a valid one is taken."""
+    lock.check(sender, now_ns)
+    try:
+        lock.require_alone(sender, sequence, now_ns)
+    except ChannelError as error:
+        return error.reason == "sender" and f"under the name {sender}: none" in str(error)
+    lock.refresh(sender, now_ns)
+    return False
+
+
+def test_two_publishers_under_one_name_are_both_refused_until_one_is_left() -> None:
+    """Either may be the forged one, so y or u times out, and the failsafe begins."""
+    lock = locked(("/aircraft#1", 0))
+    assert not any(refused(lock, 10 * k, sequence=1000 + k) for k in range(10))
+    own, forged = 2000, 1
+    step = MAX_AGE // 10
+    for now_ns in range(100, 100 + 50 * step, step):
+        assert refused(lock, now_ns, forged), "the first forged message, too"
+        assert refused(lock, now_ns, own)
+        own += 1
+        forged += 1
+    last_ns = now_ns
+    assert refused(lock, last_ns + SHARED_NS - 1, own)
+    assert not refused(lock, last_ns + SHARED_NS, own + 1)
+
+
+def test_forged_message_with_a_larger_number_is_told_by_the_next_true_one() -> None:
+    lock = locked(("/aircraft#1", 0))
+    assert not refused(lock, 10, 50)
+    assert not refused(lock, 20, 9_000_000)
+    assert refused(lock, 30, 51)
+
+
+def test_publisher_that_begins_again_under_its_name_is_one() -> None:
+    """An aircraft of one's own has no process in its name. It was silent meanwhile."""
+    lock = locked(("/aircraft#1", 0))
+    assert not refused(lock, 10, 50)
+    assert not refused(lock, 11 + MAX_AGE, 1)
+    assert not refused(lock, 12 + MAX_AGE, 2)
+
+
+def test_restarted_node_and_a_middleware_without_numbers_share_no_name() -> None:
+    lock = locked(("/aircraft#1", 0))
+    assert not refused(lock, 10, 50)
+    assert not refused(lock, 11 + MAX_AGE, 1, "/aircraft#2")
+    assert not refused(lock, 12 + MAX_AGE, 2, "/aircraft#2")
+    assert not any(refused(lock, 13 + MAX_AGE + k, 0, "/aircraft#2") for k in range(3))
 
 
 def test_overrun_of_receiver_is_no_silence_of_publisher() -> None:

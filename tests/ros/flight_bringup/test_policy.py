@@ -110,6 +110,8 @@ def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
     for spec, name in FURTHER.values():
         scenario = find_scenario(name)
         overrides = parameter_overrides(spec, scenario, run, ON_START, lockstep=lockstep)
+        if spec is GUIDANCE:  # of a flight that learns, too
+            overrides = {**overrides, "authority_rate": 10.0}
         words = (
             word
             for key, value in overrides.items()

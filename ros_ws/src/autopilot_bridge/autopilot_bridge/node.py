@@ -45,9 +45,10 @@ from autopilot_bridge.outgoing import (
 from autopilot_bridge.params import BridgeConfig, load_map
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
+from flight_core.publisher_lock import require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded, sentences
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
@@ -103,7 +104,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._effects = self.receive(
             EFFECTS,
             decode,
-            self._bridge.take_effects,
+            self._take_effects,
             max_age_ns=self._bridge.max_u_age_ns,
             lock=None,
         )
@@ -238,6 +239,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
+
+    def _take_effects(self, sample: StampedVector, now_ns: int) -> None:
+        """Take the effects by the probe of the controller whose u flies."""
+        controller = self._bridge.u_lock.publisher
+        if controller is None:
+            return  # nothing flies yet
+        require_sender(sample.sender, controller)
+        self._bridge.take_effects(sample, now_ns)
 
     def _pause_ns(self) -> int:
         """Time since the tick before began, also that of a suspended host, in which the clock of

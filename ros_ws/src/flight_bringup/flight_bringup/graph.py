@@ -243,6 +243,9 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
             name: list(value) if isinstance(value, tuple) else value
             for name, value in scenario.guidance.by_rule()
         }
+        # without a learner no controller publishes `authority`, so that guidance must take none
+        authority_rate = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
+        overrides[GUIDANCE]["authority_rate"] = authority_rate
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
     return overrides
@@ -273,8 +276,7 @@ def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
         CONTROLLER: y_rate,
     }
     if guidance is not None:
-        authority_rate = scenario.learns() * control_rate / AUTHORITY_TICKS
-        rates[GUIDANCE] = {**y_rate, "authority_rate": authority_rate}
+        rates[GUIDANCE] = y_rate
         rates[REFERENCE_MODEL] = {"u_m_rate": guidance.rate}
     return rates
 

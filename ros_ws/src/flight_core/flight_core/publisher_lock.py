@@ -8,9 +8,19 @@ A message names the publisher in `frame_id`, e.g. "/controller#4711".
 
 from collections.abc import Callable
 
+from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
+SHARED_NS = NANOSECONDS
+"""A name counts as shared for this long after the last witness: longer than the age limits of y and
+u, so the failsafe begins."""
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
+
+
+def require_sender(sender: str, expected: str) -> None:
+    """Raise ChannelError, reason "sender", for a sample of an unexpected publisher."""
+    if sender != expected:
+        raise ChannelError(SENDER, f"{sender} ignored: expected {expected}")
 
 
 class PublisherLock:
@@ -21,6 +31,9 @@ class PublisherLock:
     receiving node do not count: the first sample after an overrun may come from a different
     publisher.
 
+    The middleware numbers the messages of a publisher. Numbers that go back tell of two publishers
+    under the name. Neither is admitted, because either may be forged.
+
     `timeouts_ns` returns two ages of the last sample, above which a publisher has timed out: for
     the same node in a new process, and for a different node.
     """
@@ -30,6 +43,8 @@ class PublisherLock:
         self.publisher: str | None = None
         self._received_ns = 0
         self._overrun_ns = 0  # since the last sample
+        self._sequence = 0  # of the last message of the locked publisher; 0 is unknown
+        self._went_back_ns: int | None = None  # when the sequence last went back
 
     def age_ns(self, now_ns: int) -> int:
         """Time since the last sample of the locked publisher."""
@@ -69,7 +84,32 @@ class PublisherLock:
     def refresh(self, sender: str, now_ns: int) -> bool:
         """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""
         changed = sender != self.publisher
+        if changed:
+            self._sequence = 0
+            self._went_back_ns = None
         self.publisher = sender
         self._received_ns = now_ns
         self._overrun_ns = 0
         return changed
+
+    def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
+        """Raise ChannelError, reason "sender", for a sample of the locked name where the sequence
+        went back in the last SHARED_NS: two publishers send under the name.
+
+        `sequence`: the number of the message by the middleware; 0 is unknown. After a timeout a
+        lower number is of a restarted publisher. Called with samples of a valid stamp and content:
+        a replay stops nothing.
+        """
+        if sender != self.publisher:
+            return
+        is_shared = self._went_back_ns is not None and 0 <= now_ns - self._went_back_ns < SHARED_NS
+        if sequence > 0:
+            went_back = sequence <= self._sequence
+            self._sequence = sequence
+            if went_back and (is_shared or self.holds(sender, now_ns)):
+                self._went_back_ns = now_ns
+                is_shared = True
+        if is_shared:
+            raise ChannelError(
+                SENDER, f"two publishers send under the name {sender}: none is taken"
+            )

@@ -22,8 +22,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from flight_core import channels
 from flight_core.modes import Mode as ControllerMode
 from flight_core.parameters import ParameterError, require
-from flight_core.publisher_lock import PublisherLock
-from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
+from flight_core.publisher_lock import PublisherLock, require_sender
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector, select
 from flight_guidance import path
 from flight_guidance.guidance import Guidance, GuidanceOutput
@@ -68,6 +68,8 @@ TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs")
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as tf2_ros has it
 MAX_TARGETS = 16  # messages of target a tick; later messages wait, so that a storm delays no u_m
 MAX_ROUTE_SIZE = 65_536  # bytes, 900 waypoints: decoding takes 0.14 ms a waypoint
+CONTROLLER = "controller"  # the node of `internals` and `authority`
+FEWEST_AUTHORITIES = 3  # periods: one sample may be late, and one lost
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
@@ -110,16 +112,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._allowed = True
         self._mode = Mode.OFF
         self._waits = ""
-        self._authority = self.receive(
-            AUTHORITY,
-            Decoder(AUTHORITY_CHANNELS).decode,
-            self._take_authority,
-            max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
-            lock=None if self.parameters.lockstep else PublisherLock(self._timeouts_ns),
-            qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
-        )
+        self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
-        self._authority_ns = -1
+        self._authority_ns = -1  # stamp of the last one; -1: none, or void
         self._has_authority = True
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
@@ -177,8 +172,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._y.subscription, self._pose.subscription
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        for receiver in (self._internals, self._authority, self._y, self._pose):
+        for receiver in (self._internals, self._y, self._pose):
             receiver.poll(now_ns)
+        self._poll_authority(now_ns)
         if (output := self._step(now_ns, tick.number * self.period_ns())) is not None:
             self._publish(output, now_ns)
 
@@ -198,7 +194,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return advanced
 
     def awaited_topic(self) -> str:
-        if not self._has_authority:
+        if self._authority is not None and not self._has_authority:
             return self._authority.name
         return (self._pose if self._inputs.has_y else self._y).name
 
@@ -206,10 +202,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         """Lockstep: whether the last `authority` from before a step has arrived, of a controller
         that learns.
         """
-        if not (rate := self.parameters.authority_rate) or not now_ns:
+        if self._authority is None or not now_ns:
             return True
         self._authority.poll(now_ns)
-        period = period_ns(rate, "authority_rate")
+        period = self._authority_period_ns
         last_ns = (now_ns - 1) // period * period
         self._has_authority = self._authority_ns >= last_ns
         return self._has_authority
@@ -311,7 +307,50 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.take_route(route)
                 self._guidance.keep_link()
 
+    def _receive_authority(self) -> Receiver[StampedVector] | None:
+        """The receiver of `authority`; None in a flight without a learner, where an unexpected
+        publisher alone would send.
+        """
+        rate = self.parameters.authority_rate
+        self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
+        if not rate:
+            return None
+        return self.receive(
+            AUTHORITY,
+            Decoder(AUTHORITY_CHANNELS).decode,
+            self._take_authority,
+            max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
+            lock=None,  # that of `internals`: of the controller that flies
+            qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
+        )
+
+    def _controller(self) -> str | None:
+        """The controller that flies; None before its first sample."""
+        if self.parameters.lockstep:  # which has no process in its name
+            return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
+        return None if self._internals.lock is None else self._internals.lock.publisher
+
+    def _poll_authority(self, now_ns: int) -> None:
+        """Real time: take `authority`. The last sample is void after FEWEST_AUTHORITIES periods and
+        the age limit.
+        """
+        if self._authority is None:
+            return
+        self._authority.poll(now_ns)
+        longest_ns = FEWEST_AUTHORITIES * self._authority_period_ns + self._max_age_ns()
+        if 0 <= self._authority_ns < now_ns - longest_ns:
+            self._authority_ns = -1
+            self._authorities.clear()
+            self._guidance.take_authority(dict.fromkeys(AUTHORITY_CHANNELS, channels.UNKNOWN))
+            self.get_logger().warning(
+                f"{AUTHORITY.name}: none for {seconds(longest_ns):.2g} s: its limits are void"
+            )
+
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
+        controller = self._controller()
+        if controller is None:
+            return  # nothing flies yet, and the next sample says the same
+        require_sender(sample.sender, controller)
         if np.any(sample.value < 0.0):
             raise ChannelError(
                 "bounds",

@@ -86,7 +86,7 @@ class GuidanceConfig(NodeConfig):
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
     authority_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: rate of `authority`, Hz; 0: none"
+        default=0.0, ge=0, le=1000, description="rate of `authority`, Hz; 0: of no learner"
     )
     outputs: Names = Field(default=RATES_AND_SPEED, description="the commands u_m in any order")
     natural_frequency: Positives = Field(

@@ -18,8 +18,11 @@ from flight_core.rates import NANOSECONDS
 from flight_core.text import bounded
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
+from flight_ros.topics import CLOCK, RECORDED, START, Y
 
 DISCOVERY_POLL_PERIOD = 0.02  # s
+# y, and the topics whose messages name no publisher
+OF_ONE_NODE = (Y, START, RECORDED, CLOCK)
 LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
 
 
@@ -78,9 +81,22 @@ class EndpointMonitor:
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
 
+    def unexpected(self, subscription: PolledSubscription) -> str:
+        """A sentence where nodes of several names publish a topic of a single node; else empty. A
+        restarted node keeps the name.
+        """
+        if subscription.topic not in OF_ONE_NODE:
+            return ""
+        peers = self._node.get_publishers_info_by_topic(subscription.name)
+        names = sorted({f"{peer.node_namespace.rstrip('/')}/{peer.node_name}" for peer in peers})
+        return f"published by {', '.join(names)}, expected one node" if len(names) > 1 else ""
+
     def check_publishers(self, subscription: PolledSubscription) -> None:
-        """Log an error for each publisher that does not match a subscription of the node."""
-        self._log(subscription.name, self.mismatches(subscription))
+        """Log an error for each publisher that does not match a subscription of the node, and for
+        unexpected nodes.
+        """
+        sentences = [*self.mismatches(subscription), self.unexpected(subscription)]
+        self._log(subscription.name, sentences)
 
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber of a topic that does not match a publisher of the

@@ -317,7 +317,9 @@ class FlightNode(Node, Generic[P]):
         """The instant on the topic `start`, ns. An old instant is of an earlier flight."""
         if self._start_subscription is None:
             return None
-        instants = self.refusals.stamps(self._start_subscription, self._start_subscription.take())
+        if messages := self._start_subscription.take():
+            self.endpoints.check_publishers(self._start_subscription)
+        instants = self.refusals.stamps(self._start_subscription, messages)
         oldest_ns = self.host.time_ns() - MAX_START_AGE_NS
         return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 

@@ -170,12 +170,14 @@ class Receiver(Generic[S]):
         valid.
         """
         return [
-            self.take_message(received.message, now_ns)
+            self.take_message(received.message, now_ns, received.sequence)
             for received in self.subscription.take(limit)
         ]
 
-    def take_message(self, raw: bytes, now_ns: int) -> bool:
-        """Check and take a message. Returns whether the message was valid."""
+    def take_message(self, raw: bytes, now_ns: int, sequence: int = 0) -> bool:
+        """Check and take a message. Returns whether the message was valid. `sequence`: as of
+        `PublisherLock.require_alone`.
+        """
         try:
             require_size(raw, self._max_size)
             if self.lock is not None:
@@ -189,7 +191,7 @@ class Receiver(Generic[S]):
                 ):
                     require_size(raw, GROWTH * self._longest)
             if (sample := self._decode(raw)) is not None:
-                self._accept(sample, now_ns)
+                self._accept(sample, now_ns, sequence)
                 self._longest = max(self._longest, len(raw))
         except ChannelError as error:
             self._refusals.add(self.subscription, error.reason, str(error))
@@ -238,7 +240,7 @@ class Receiver(Generic[S]):
         except ChannelError as error:
             self._refusals.add(self.subscription, error.reason, str(error))
 
-    def _accept(self, sample: S, now_ns: int) -> None:
+    def _accept(self, sample: S, now_ns: int, sequence: int = 0) -> None:
         if self.lock is not None:
             self.lock.check(sample.sender, now_ns)
         if self._max_age_ns is not None:
@@ -250,6 +252,8 @@ class Receiver(Generic[S]):
                 raise ChannelError(
                     error.reason, f"{error}{self._refusals.clock_of(sample.sender)}"
                 ) from None
+        if self.lock is not None:
+            self.lock.require_alone(sample.sender, sequence, now_ns)
         self._take(sample, now_ns)
         self._stamps_ns.append(sample.stamp_ns)
         if self.lock is not None:
