@@ -31,7 +31,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Tape
 from flight_log.flight_processes import controller_starts
-from flight_log.named_vectors import stamp_of
+from flight_log.named_vectors import Samples, encoded, stamp_of
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.slow
@@ -392,6 +392,40 @@ def test_ticks_of_less_than_nine_tenths_are_no_success(
             messages.append(sent)
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
     assert "u 101 of 201 samples; " in read_flight(log).summary["outcome"]["sentence"]
+
+
+def test_ticks_of_another_controller_do_not_count_among_those_of_the_flight(
+    recorded: Path, tmp_path: Path
+) -> None:
+    """A second controller sends forty of its ticks from t = 1 s on. The nodes refuse them."""
+    tape = read_run(recorded).tape
+    nodes = dict.fromkeys(("u", "internals"), "/controller#7") | {"y_m": "/reference_model#8"}
+    messages = []
+    for name in ("y", "y_m", "truth", "u", "internals"):
+        own = tape[name]
+        parts = [
+            Samples(own.names, own.stamp_ns + EPOCH, own.values, nodes.get(name, "/aircraft#9"))
+        ]
+        if name in {"u", "internals"}:
+            later_ns = own.stamp_ns[:40] + EPOCH + NANOSECONDS + 1_000_000
+            parts.append(Samples(own.names, later_ns, own.values[:40], "/controller#10"))
+        for part in parts:
+            rows = zip(part.stamp_ns.tolist(), encoded(part), strict=True)
+            messages += [
+                Sent(f"/{name}", stamp_ns + 1_000_000, number, row.tobytes())
+                for number, (stamp_ns, row) in enumerate(rows, 1)
+            ]
+    messages.sort(key=lambda sent: sent.log_ns)
+    log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
+    summary = read_flight(log).summary
+    assert summary["outcome"] == "completed"
+    u = summary["account"]["topics"]["u"]
+    assert (u["found"], u["expected"], u["repeated"]) == (201, 201, 0)
+    assert summary["ticks"]["ticks"] == 201
+    assert "u: samples of /controller#10, /controller#7: the figures are" in summary["notes"][0]
+    result = replay(log)
+    assert result.equal()
+    assert len(result.number) == 201
 
 
 @pytest.mark.parametrize(

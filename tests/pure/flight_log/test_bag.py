@@ -560,10 +560,13 @@ def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
                 bag.write(channel, 1, 1, 1, data.tobytes())
     bag.close()
     both = (
-        "y: samples of /aircraft#1, /aircraft#2: the figures are of all, the nodes refuse "
-        "all but one"
+        "y: samples of /aircraft#1, /aircraft#2: the figures are of the first, and of the next "
+        "once that is silent, as the nodes admit them"
     )
-    assert read_run(tmp_path / "run").tape.notes == (both,)
+    tape = read_run(tmp_path / "run").tape
+    assert tape.notes == (both,)
+    assert len(tape["y"].stamp_ns) == 10  # of /aircraft#1
+    assert len(tape["y_m"].stamp_ns) == 13  # of both: the second begins after the first
 
 
 def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ class Signal:
         stamp_ns: Instants of the samples, shape (N,), int64, ns, ascending.
         names: The k channels.
         values: Samples, shape (N, k), of a log with a channel contiguous in memory.
+        sender: Number of the publisher of each sample, shape (N,), in the order of their first
+            samples; None: one publisher.
 
     Examples:
         >>> q = rise_di.Signal(np.array([0, 2_000_000]), ("q",), np.array([[0.0], [0.1]]))
@@ -36,6 +38,7 @@ class Signal:
     stamp_ns: NDArray[np.int64]
     names: tuple[str, ...]
     values: FloatArray
+    sender: NDArray[np.int16] | None = None
 
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of a channel, shape (N,). Raises ParameterError with the list of channels."""
@@ -55,7 +58,8 @@ class Signal:
             The signal, values of shape (n, k).
         """
         count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
-        return Signal(self.stamp_ns[:count], self.names, self.values[:count])
+        sender = None if self.sender is None else self.sender[:count]
+        return Signal(self.stamp_ns[:count], self.names, self.values[:count], sender)
 
     def where(self, keep: NDArray[np.bool_]) -> "Signal":
         """The samples of a mask, shape (N,).
@@ -66,7 +70,8 @@ class Signal:
         Returns:
             The signal, values of shape (n, k).
         """
-        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+        sender = None if self.sender is None else self.sender[keep]
+        return Signal(self.stamp_ns[keep], self.names, self.values[keep], sender)
 
     def after(self, earlier: "Signal | None") -> "Signal":
         """The samples of an earlier part, if any, then these; the channels are the same.
@@ -115,6 +120,7 @@ class Signal:
             self.stamp_ns,
             names,
             self.values[:, slice(columns[0], columns[-1] + 1) if adjacent else columns],
+            self.sender,
         )
 
 
@@ -151,7 +157,8 @@ class Tape:
     `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of
     `simulate`: `scenario`, and `changes` of the controller's parameters in flight. Of a log:
     `recording` by topic, `duration`, s, of a whole flight where the log has it, `processes` by
-    name, how many samples of a topic were `refused`, and the `account` of `rise_di.read_run`.
+    name, how many samples of a topic were `refused`, whether the flight was by the simulated time
+    of /clock, `is_by_clock`, and the `account` of `rise_di.read_run`.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -170,6 +177,7 @@ class Tape:
     processes: Mapping[str, Process] = field(default_factory=dict)
     refused: Mapping[str, int] = field(default_factory=dict)
     account: Any = None
+    is_by_clock: bool = False
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""

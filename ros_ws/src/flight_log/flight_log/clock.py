@@ -5,7 +5,6 @@ stamps, equal stamps.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -213,7 +212,10 @@ def without_leaps(
             continue
         leaps.append(earlier)
         for name in leaping:
-            mended[name] = replace(mended[name], stamp_ns=earlier.undone(mended[name].stamp_ns))
+            signal = mended[name]
+            mended[name] = Signal(
+                earlier.undone(signal.stamp_ns), signal.names, signal.values, signal.sender
+            )
             if name in clocks and clocks[name].step_ns > 0:
                 clocks[name] = clocks[name]._replace(step_ns=0, step_at_ns=0, left_out=0)
     for name, clock in clocks.items():

@@ -33,15 +33,19 @@ class Columns:
     def __init__(self, width: int, expected: int) -> None:
         self.count = 0
         self._width = width
+        self._senders: dict[str, int] = {}  # numbers of the publishers
+        self._sender: list[NDArray[np.int16]] = []  # of each sample
         self._stamp_ns, self._store = self._new(expected)
 
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_Memory | _File"]:
         kind = _File if 8 * self._width * capacity > IN_MEMORY else _Memory
         return np.empty(capacity, np.int64), kind(self._width, capacity)
 
-    def append(self, stamp_ns: NDArray[np.int64], rows: FloatArray) -> None:
-        """Append samples: stamps (N,) and rows (N, k)."""
+    def append(self, stamp_ns: NDArray[np.int64], rows: FloatArray, sender: str = "") -> None:
+        """Append samples of a publisher: stamps (N,) and rows (N, k)."""
         end = self.count + len(rows)
+        number = self._senders.setdefault(sender, len(self._senders))
+        self._sender.append(np.full(len(rows), number, np.int16))
         if end > len(self._stamp_ns):
             stamps = self._stamp_ns
             store = self._store
@@ -57,9 +61,10 @@ class Columns:
     def signal(self, names: tuple[str, ...]) -> Signal:
         """The samples as a signal, in the order of arrival."""
         stamp_ns = self._stamp_ns[: self.count]
+        sender = np.concatenate(self._sender) if len(self._senders) > 1 else None
         if isinstance(self._store, _File):
-            return _StoredSignal(stamp_ns, names, self._store, 0)
-        return Signal(stamp_ns, names, self._store.read(0, self._width, self.count))
+            return _StoredSignal(stamp_ns, names, sender, self._store, 0)
+        return Signal(stamp_ns, names, self._store.read(0, self._width, self.count), sender)
 
 
 class _Memory:
@@ -121,11 +126,17 @@ class _StoredSignal(Signal):
     """
 
     def __init__(
-        self, stamp_ns: NDArray[np.int64], names: tuple[str, ...], store: _File, first: int
+        self,
+        stamp_ns: NDArray[np.int64],
+        names: tuple[str, ...],
+        sender: NDArray[np.int16] | None,
+        store: _File,
+        first: int,
     ) -> None:
         for name, value in (
             ("stamp_ns", stamp_ns),
             ("names", names),
+            ("sender", sender),
             ("_store", store),
             ("_first", first),
         ):
@@ -140,7 +151,8 @@ class _StoredSignal(Signal):
 
     def until(self, end_ns: int) -> Signal:
         count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
-        return _StoredSignal(self.stamp_ns[:count], self.names, self._store, self._first)
+        sender = None if self.sender is None else self.sender[:count]
+        return _StoredSignal(self.stamp_ns[:count], self.names, sender, self._store, self._first)
 
     def group(self, prefix: str) -> Signal:
         names = [name for name in self.names if name.startswith(f"{prefix}.")]
@@ -150,6 +162,7 @@ class _StoredSignal(Signal):
         return _StoredSignal(
             self.stamp_ns,
             tuple(name.removeprefix(f"{prefix}.") for name in names),
+            self.sender,
             self._store,
             self._first + first,
         )

@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.serde.errors import SerdeError
 
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Process
+from flight_core.tape import Process, Signal
 from flight_core.vectors import FloatArray
 from flight_log.named_vectors import typestore
 
@@ -89,6 +89,28 @@ def flight_processes(
     return processes | {
         node: Process(times[-1], None, None) for node, times in waiting.items() if times
     }
+
+
+SILENT_NS = NANOSECONDS // 5  # `aircraft.max_age`: a further publisher is then admitted
+SILENT_PERIODS = 3  # of a slow publisher
+
+
+def admitted(signal: Signal) -> Signal:
+    """The samples that the nodes admit: of the first publisher, and after a silence of the next."""
+    if signal.sender is None:
+        return signal
+    keep = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
+    begin = 0
+    while begin < len(keep):
+        own = begin + np.flatnonzero(signal.sender[begin:] == signal.sender[begin])
+        intervals_ns = np.diff(signal.stamp_ns[own])
+        usual_ns = int(np.median(intervals_ns)) if len(intervals_ns) else 0
+        silent_ns = max(SILENT_NS, SILENT_PERIODS * usual_ns)
+        silences = np.flatnonzero(intervals_ns > silent_ns)
+        last = own[silences[0]] if len(silences) else own[-1]
+        keep[own[own <= last]] = True
+        begin = int(last) + 1
+    return signal if keep.all() else signal.where(keep)
 
 
 RESTART = 10  # a number of a tick that is less by more is of another controller

@@ -158,7 +158,7 @@ class TopicSamples:
                     # other names are few, or those of a hostile log
                     expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
-                self._samples[names].append(stamp_ns, values)
+                self._samples[names].append(stamp_ns, values, sender)
             else:
                 self._refused += len(stamps)
 
@@ -207,7 +207,8 @@ class TopicSamples:
             # of a part that is there twice
             again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
             keep = np.append(True, ~again)
-            signal = Signal(stamps[keep], signal.names, values[keep])
+            sender = None if signal.sender is None else signal.sender[order][keep]
+            signal = Signal(stamps[keep], signal.names, values[keep], sender)
         return signal
 
     def _names(self) -> tuple[str, ...]:
@@ -229,7 +230,8 @@ class TopicSamples:
             return ""
         publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
         return (
-            f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
+            f"{name}: samples of {publishers}: the figures are of the first, and of the next once "
+            "that is silent, as the nodes admit them"
         )
 
     def recording(self) -> Recording:

@@ -22,13 +22,15 @@ from flight_log.age_of_u import age_of_u
 from flight_log.bag import (
     IMPORTED,
     OUTCOME,
+    SIMULATED_TIME,
     full_names,
 )
-from flight_log.clock import leap_note, recording_note, without_leaps
+from flight_log.clock import SINCE_EPOCH_NS, leap_note, recording_note, without_leaps
 from flight_log.engagements import ENGAGEMENT, Engagement, engagements
 from flight_log.flight_processes import (
     INSTANCE,
     Span,
+    admitted,
     flight_processes,
     ready_times,
 )
@@ -188,7 +190,7 @@ def _tape(
     topics = {name: log.topics[topic] for topic, name in names.items()}
     recordings = {printable(name): samples.recording() for name, samples in stamped.items()}
     signals, recording, leaps = without_leaps(
-        {printable(name): signal for name, signal in filled.items()},
+        {printable(name): admitted(signal) for name, signal in filled.items()},
         {name: clock for name, clock in recordings.items() if clock.found},
     )
     start_ns = _start_ns(signals)
@@ -214,7 +216,15 @@ def _tape(
         recording=recording,
         processes={printable(name): process for name, process in processes.items()},
         refused=refused,
+        is_by_clock=SIMULATED_TIME in log.metadata or _is_before_epoch(start_ns, spans),
     )
+
+
+def _is_before_epoch(start_ns: int, spans: Mapping[str, Span]) -> bool:
+    """Whether processes stamped by /clock: by the host's time stamps are since the epoch, and in
+    lockstep a node leaves out its process id.
+    """
+    return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:

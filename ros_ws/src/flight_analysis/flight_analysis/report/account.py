@@ -5,7 +5,6 @@
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -14,6 +13,7 @@ from flight_analysis.report.sample_counts import (
     GUIDED,
     LEAST,
     RATED,
+    SILENCE,
     TICKS,
     WHOLE,
     Span,
@@ -25,7 +25,6 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
 
-SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
@@ -148,7 +147,9 @@ def account(
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
-        if topic.expected is not None and not topic.holds(topic.expected - topic.unsent)
+        if topic.expected is not None
+        and topic.is_of_stack
+        and not topic.holds(topic.expected - topic.unsent)
     ]
     parts = lost_log_parts(tape.notes, planned=planned_ns is not None)
     return Account(
@@ -296,10 +297,10 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     content = summary.get("account")
     if content is None:
         return None
-    fields_of = itemgetter(*TopicAccount._fields)
     values: dict[str, Any] = content | {
         "topics": {
-            name: TopicAccount(*fields_of(topic)) for name, topic in content["topics"].items()
+            name: TopicAccount(**{key: topic[key] for key in TopicAccount._fields if key in topic})
+            for name, topic in content["topics"].items()
         },
         "processes": {
             name: ProcessAccount(**process)

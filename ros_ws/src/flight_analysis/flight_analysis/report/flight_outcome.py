@@ -5,8 +5,8 @@
 from dataclasses import replace
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.account import SILENCE, lost_log_parts, planned_end_ns
-from flight_analysis.report.sample_counts import LATE_TICK_NS, TICKS
+from flight_analysis.report.account import lost_log_parts, planned_end_ns
+from flight_analysis.report.sample_counts import LATE_TICK_NS, SILENCE, TICKS
 from flight_core.outcome import COMPLETED, UNKNOWN, Outcome, log_ends_at, never_flew
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Tape

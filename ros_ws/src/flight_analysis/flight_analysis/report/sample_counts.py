@@ -6,9 +6,11 @@ were never sent.
 
 import math
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.modes import Mode
@@ -20,14 +22,22 @@ from flight_log.flight_processes import controller_starts
 # least share of the samples of a topic without a remark, unless a single one is missing
 WHOLE = 0.99
 LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
+SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
-# of a process that is the simulated aircraft of the stack
-AIRCRAFT = re.compile(r"/aircraft(#\d+)?$")
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
-# topics with a rate of the scenario
-RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")
+# topics with a rate, by the node of the stack that sends them
+SENDERS = {
+    "y": "aircraft",
+    "y_m": "reference_model",
+    **dict.fromkeys(TICKS, "controller"),
+    **dict.fromkeys(OF_AIRCRAFT, "aircraft"),
+    **dict.fromkeys(GUIDED, "guidance"),
+}
+RATED = tuple(SENDERS)
+STEADY_RUN = 60  # samples, of which a steady publisher always takes about the same time
+SHORT_RUN = 6  # samples; of a publisher that leaves out 30 % a tenth of such runs is whole
 
 
 class TopicAccount(NamedTuple):
@@ -44,8 +54,9 @@ class TopicAccount(NamedTuple):
     unset: int  # samples without a usable stamp, left out
     step: float  # of the clock of the stamps, s; 0 without a step
     left_out: int  # samples after the step
-    # samples that the publisher left out on a busy host, by the numbers of the messages
+    # samples that the publisher left out, by the numbers of the messages
     unsent: int
+    is_of_stack: bool = True  # sent by a node of the stack, which leaves out samples on a busy host
 
     @property
     def share(self) -> float | None:
@@ -76,25 +87,30 @@ def topic_accounts(
 ) -> tuple[dict[str, TopicAccount], dict[str, float]]:
     """The accounts by topic, and how long before the end a last sample may be stamped, s.
 
-    The expected number of samples is rate times time. Ticks of the controller count from the first,
-    without the ticks that a busy host left out, up to a tenth of the ticks.
+    The expected number of samples is rate times time: by the scenario for a node of the stack in
+    the host's time, else by the log. Ticks of the controller count from the first. Samples that a
+    controller or a foreign publisher left out do not count, up to a tenth.
     """
-    expected = {} if scenario is None else _expected(tape, scenario, span)
+    periods = {} if scenario is None else _periods(tape, scenario, simulated=span.simulated)
+    expected = {} if scenario is None else _expected(tape, scenario, span, periods)
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
     begin_ns = tape.start_ns if span.from_start else None
     topics = {name: _topic(tape, name, expected.get(name), begin_ns, span.end_ns) for name in names}
     late = {} if scenario is None else _latest(scenario)
-    has_clock = tape.start_ns > SINCE_EPOCH_NS and not any(
-        clock.step_ns for clock in tape.recording.values()
+    has_clock = tape.is_by_clock or (
+        tape.start_ns > SINCE_EPOCH_NS
+        and not any(clock.step_ns for clock in tape.recording.values())
     )
-    if scenario is not None and has_clock:  # in real time
-        for name, step_ns in _periods(tape, scenario, simulated=span.simulated).items():
+    if has_clock:
+        for name, step_ns in periods.items():
             if ends_last(tape, name):
                 continue
             topics[name] = _with_unsent(tape, name, topics[name], step_ns)
             if unsent_at_end := _unsent_rest(tape, name, step_ns, span.end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 late[name] = seconds(span.end_ns)
+            if not _is_of_stack(tape, name):
+                topics[name] = _of_foreign(topics[name])
     failsafe = 0
     if "internals" in tape and "mode" in tape["internals"].names:
         failsafe = int(np.count_nonzero(tape["internals"]["mode"] != Mode.ENGAGED))
@@ -106,78 +122,114 @@ def topic_accounts(
     return topics, late
 
 
-def _expected(tape: Tape, scenario: Scenario, span: Span) -> dict[str, int]:
+def _expected(
+    tape: Tape, scenario: Scenario, span: Span, periods: Mapping[str, int]
+) -> dict[str, int]:
     """The number of samples by topic that the log of a flight should hold, where this is known."""
     sensors = scenario.aircraft.sensors
     pose = scenario.aircraft.pose
     expected = {}
     delays = {"y": sensors.delay, "pose": pose.delay}
-    for name, step_ns in _periods(tape, scenario, simulated=span.simulated).items():
+    for name, step_ns in periods.items():
+        is_of_stack = _is_of_stack(tape, name)
         first_ns = tape.start_ns
-        if not span.from_start and name in tape:
+        if name in tape and (name in TICKS or not span.from_start):
             first_ns = int(tape[name].stamp_ns[0])
-        delay_ns = nanoseconds(delays.get(name, 0.0))
+        delay_ns = nanoseconds(delays.get(name, 0.0)) if is_of_stack else 0
         count = max((span.end_ns - delay_ns - first_ns) // step_ns + 1, 0)
-        if name == "y" and sensors.dropout:
+        if name == "y" and is_of_stack and sensors.dropout:
             mean = count * (1.0 - sensors.dropout)
             count = max(math.floor(mean - 4.0 * math.sqrt(mean * sensors.dropout)), 0)
         expected[name] = count
     if not span.simulated:  # the controller is inactive until the bridge engages
         return expected
-    ticks, engaged = _ticks(
-        tape, period_ns(scenario.controller.rate, "controller.rate"), span.end_ns
-    )
-    expected |= dict.fromkeys(TICKS, ticks)
+    engaged = seconds(span.end_ns - tape.start_ns)
+    if _is_of_stack(tape, "u"):
+        ticks, engaged = _ticks(tape, scenario, span.end_ns)
+        expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
-        before_pose = math.ceil(pose.delay * scenario.guidance.rate)
-        steps = max(
-            math.floor(engaged * scenario.guidance.rate / scenario.controller.rate)
-            - 2
-            - before_pose,
-            0,
-        )
-        expected |= dict.fromkeys(GUIDED, steps)
+        step_ns = period_ns(scenario.guidance.rate, "guidance.rate")
+        for name in GUIDED:
+            if name not in tape or _is_of_stack(tape, name):
+                rate = NANOSECONDS / _period(tape, name, step_ns)
+                before_pose = math.ceil(pose.delay * rate)
+                expected[name] = max(math.floor(engaged * rate) - 2 - before_pose, 0)
     return expected
 
 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
     """Periods of the topics with a sample at each instant of a rate, ns.
 
-    A foreign aircraft has the rates of the log, and may have no truth and no pose.
+    A foreign aircraft may have no truth and no pose. Foreign commands u_m have no rate.
     """
-    periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
+    y_m_ns = period_ns(scenario.reference_model.rate, "reference_model.rate")
     if not simulated:
-        return periods
+        return {"y_m": _period(tape, "y_m", y_m_ns)}
     y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
-    aircraft_periods = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
-    is_of_stack = _is_of_stack(tape)
-    recorded = {"y", *tape.signals, *tape.recording, *(["truth"] if is_of_stack else [])}
-    for name, step_ns in aircraft_periods.items():
-        if name in recorded:
-            periods[name] = step_ns if is_of_stack else _period_in_log(tape, name, step_ns)
-    return periods
+    has_truth = _is_of_stack(tape, "truth")
+    recorded = {"y", "y_m", *tape.signals, *tape.recording, *(["truth"] if has_truth else [])}
+    nominal_ns = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
+    if not _is_of_stack(tape, "u"):
+        nominal_ns["u"] = period_ns(scenario.controller.rate, "controller.rate")
+    return {
+        name: _period(tape, name, step_ns)
+        for name, step_ns in ({"y_m": y_m_ns} | nominal_ns).items()
+        if name in recorded
+    }
 
 
-def _is_of_stack(tape: Tape) -> bool:
-    """Whether the simulated aircraft of the stack flew, by the names of the processes; a flight in
-    one process has no names.
+def _is_of_stack(tape: Tape, name: str) -> bool:
+    """Whether a node of the stack sent a topic, by the names of the processes; a flight in one
+    process has no names. A foreign controller has no `internals`.
     """
+    if name in TICKS and ("internals" in tape or "u" not in tape):
+        return True
     if tape.processes:
-        return any(AIRCRAFT.search(name) for name in tape.processes)
+        node = re.compile(rf"/{SENDERS[name]}(#\d+)?$")
+        return any(node.search(process) for process in tape.processes)
     return tape.duration is not None or "truth" in tape.recording
 
 
-def _period_in_log(tape: Tape, name: str, otherwise: int) -> int:
-    """The median interval of the samples of a topic, by the numbers of the messages without the
-    lost messages, ns.
+def _period(tape: Tape, name: str, nominal_ns: int) -> int:
+    """The period of the samples of a topic, ns.
+
+    In the host's time a node of the stack has the period of the parameters. By /clock a node leaves
+    out the instants between two messages of the clock.
     """
-    intervals_ns = np.diff(tape[name].stamp_ns) if name in tape else np.zeros(0)
-    if not np.any(intervals_ns > 0):
-        return otherwise
-    lost = tape.recording.get(name, Recording(0)).lost or 0
-    share = (len(intervals_ns) + 1) / (len(intervals_ns) + 1 + lost)
-    median_ns = float(np.median(intervals_ns[intervals_ns > 0]))
-    return max(round(median_ns * share) if share < LEAST else round(median_ns), 1)
+    is_of_stack = _is_of_stack(tape, name)
+    if is_of_stack and not tape.is_by_clock:
+        return nominal_ns
+    recorded_ns = nominal_ns
+    if name in tape:
+        lost = tape.recording.get(name, Recording(0)).lost or 0
+        recorded_ns = period_of(tape[name].stamp_ns, lost, nominal_ns)
+    return max(nominal_ns, recorded_ns) if is_of_stack else recorded_ns
+
+
+def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
+    """The period at which a publisher sent samples, ns, by their stamps, shape (N,), and the number
+    of lost messages.
+
+    A steady publisher takes the same time for any STEADY_RUN samples, within an interval: by a
+    coarse clock the intervals differ. Where samples are missing the times scatter, and the
+    quickest tenth of short runs has the period.
+    """
+    stamp_ns = np.unique(stamp_ns)
+    intervals_ns = np.diff(stamp_ns)
+    if len(intervals_ns) < 2:
+        return otherwise_ns
+    count = min(STEADY_RUN, len(intervals_ns) // 2)
+    run_ns = stamp_ns[count:] - stamp_ns[:-count]
+    lower, middle, upper = np.quantile(run_ns, [0.25, 0.5, 0.75])
+    shortest, longest = np.quantile(intervals_ns, [0.05, 0.95])
+    if upper - lower <= longest - shortest:
+        step_ns = middle / count
+    else:
+        count = min(SHORT_RUN, count)
+        step_ns = np.quantile(stamp_ns[count:] - stamp_ns[:-count], 0.1) / count
+    if lost:
+        step_ns = min(step_ns, (stamp_ns[-1] - stamp_ns[0]) / (len(intervals_ns) + lost))
+    return max(round(float(step_ns)), 1)
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
@@ -198,6 +250,16 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
     instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
     stored = topic.found + recording.lost + recording.unset + tape.refused.get(name, 0)
     return topic._replace(unsent=max(instants - stored, 0))
+
+
+def _of_foreign(topic: TopicAccount) -> TopicAccount:
+    """The account of a topic of a publisher with an unknown plan: the samples sent are whole, up to
+    a tenth below the rate, without a silence.
+    """
+    is_silent = topic.gap is not None and topic.gap > SILENCE
+    if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
+        return topic._replace(is_of_stack=False)
+    return topic._replace(expected=topic.expected - topic.unsent, unsent=0, is_of_stack=False)
 
 
 def ends_last(tape: Tape, name: str) -> bool:
@@ -240,33 +302,45 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     return 0 if was_sent else max(int(later_ns[-1]) // step_ns, 0)
 
 
-def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
-    """The number of ticks of the controller up to the end, and the number of engaged ticks."""
+def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
+    """The number of ticks of the controller up to the end, and the engaged time, s. The numbers of
+    the ticks count for each publisher alone.
+    """
+    step_ns = period_ns(scenario.controller.rate, "controller.rate")
     begins = [
         int(tape[name].stamp_ns[0]) for name in TICKS if name in tape and len(tape[name].stamp_ns)
     ]
     if not begins:
         return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
     begin_ns = min(begins)
-    instants = max((end_ns - begin_ns) // step_ns + 1, 1)
     if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
-        return instants, float(instants)
+        instants = max((end_ns - begin_ns) // step_ns + 1, 1)
+        return instants, seconds(instants * step_ns)
     log = tape["internals"].until(end_ns)
+    tick_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
+    if tape.is_by_clock:
+        step_ns = max(step_ns, period_of(tick_ns, 0, step_ns))
+    instants = max((end_ns - begin_ns) // step_ns + 1, 1)
     if not len(log.stamp_ns):
-        return instants, float(instants)
+        return instants, seconds(instants * step_ns)
     count = instants
-    if "y" in tape and not _is_of_stack(tape):
+    if "y" in tape and not _is_of_stack(tape, "y"):
         count = min(instants, _instants_with_y(tape, log, step_ns))
-    by_controller = np.split(log["number"], controller_starts(log["number"]))
+    number = log["number"]
+    senders = () if log.sender is None else np.unique(log.sender)
+    by_sender = [number[log.sender == sender] for sender in senders] or [number]
+    by_controller = [
+        part for numbers in by_sender for part in np.split(numbers, controller_starts(numbers))
+    ]
     missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in by_controller)
     before = float(by_controller[0].min()) - 1.0
-    last_ns = int(log.stamp_ns[-1]) + round(float(log["age"][-1]) * NANOSECONDS)
     goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
+    last_ns = int(tick_ns[-1])
     after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0) * count // instants
     ticks = int(len(log.stamp_ns) + max(missing, 0.0) + before + after)
     ticks = count if ticks < LEAST * count else ticks
     engaged = float(np.mean(log["mode"] == Mode.ENGAGED))
-    return ticks, engaged * ticks * instants / count
+    return ticks, engaged * ticks * instants / count * seconds(step_ns)
 
 
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
@@ -299,7 +373,8 @@ def _topic(
         float(t[0]) if count else None, float(t[-1]) if count else None,
         None if longest is None else float(gaps[longest]),
         None if longest is None else float(t[longest]),
-        recording.repeated if recording.found else int(np.count_nonzero(gaps == 0.0)),
+        recording.repeated if recording.found and signal.sender is None
+        else int(np.count_nonzero(gaps == 0.0)),
         recording.unset, seconds(recording.step_ns), recording.left_out, 0,
     )  # fmt: skip
 

@@ -315,7 +315,7 @@ def _with_late_ticks(
     """The account with the ticks that found no new y although the log has every y: the host is too
     busy.
 
-    The rate of y is that of the scenario: that of an autopilot is not known.
+    The rate of y is that of the scenario: a foreign aircraft and an autopilot have their own.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -325,6 +325,7 @@ def _with_late_ticks(
     y = flight_account.topics.get("y")
     rated = (
         y is not None
+        and y.is_of_stack
         and y.expected is not None
         and y.expected >= (1.0 - BUSY) * flight_account.end * scenario.controller.rate
     )
