@@ -6,6 +6,7 @@ import base64
 import hashlib
 import re
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import comparison, figures, html, plotting
 from flight_analysis.report.display_units import DisplayUnit
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext, SampleStore
 from flight_analysis.report.spectra import spectra
-from flight_analysis.report.summary import RecordedFlight, summarise
+from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.tables import events
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, Outcome, ended_early
@@ -278,6 +280,96 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
     ]
+
+
+WINDS: dict[str, dict[str, Any]] = {
+    "calm": {"gusts": {}},
+    "wind": {"gusts": {}, "wind": [5.0, 0.0]},
+    "turbulence": {"gusts": {}, "wind": [5.0, 0.0], "turbulence": {"altitude": 100.0, "wind": 8.0}},
+}
+
+
+@pytest.mark.parametrize("air", WINDS)
+def test_part_without_command_and_gust_is_named_by_what_was_in_the_air(
+    air: str, servo: Scenario
+) -> None:
+    """Only calm air has an ultimate bound."""
+    scenario = servo.vary(aircraft=WINDS[air], flight={"duration": 3.0})
+    figures_of_q = summarise(simulate(scenario))["errors"]["q"]
+    assert figures_of_q[air]["rms"] > 0.0
+    assert {*figures_of_q} & {"calm", "wind", "turbulence", "other"} == {air}
+    bound = figures_of_q[air]["max"] if air == "calm" else None
+    assert figures_of_q["bound"] == bound
+
+
+def test_wind_of_an_aircraft_of_another_maker_is_not_known(servo: Scenario) -> None:
+    """The log has no truth: the gusts of the scenario were not flown, and the air has no name."""
+    y_m = signal([0, 1000], **dict.fromkeys(OUTPUTS, 1.0))
+    tape = flight(y=y_m, y_m=y_m)
+    assert summarise(tape, servo)["air"] == "other"
+    assert {event.kind for event in transients(servo, tape)} == {"command"}
+
+
+def test_gust_that_comes_again_is_a_gust_each_time(servo: Scenario) -> None:
+    gust = {"start": 1.0, "speed": 4.0, "length": 15.0, "every": 3.0}
+    scenario = servo.vary(aircraft={"gusts": {"lateral": gust}}, flight={"duration": 9.0})
+    assert [start for start, _ in scenario.gust_windows().values()] == [1.0, 4.0, 7.0]
+    listed = figures.gust_intervals(simulate(scenario), scenario.gust_windows())
+    assert [(each.label, each.start) for each in listed] == [
+        ("lateral gust", 1.0),
+        ("lateral gust", 4.0),
+        ("lateral gust", 7.0),
+    ]
+
+
+@pytest.fixture(scope="module")
+def unlike(servo: Scenario) -> list[RecordedFlight]:
+    """A flight in a gust, one in turbulence, and one in the gust under other gains."""
+    gust = {"vertical": {"start": 1.0, "speed": 4.0, "length": 15.0}}
+    gusts = servo.vary(aircraft={"gusts": gust}, flight={"duration": 3.0})
+    turbulence = servo.vary(aircraft=WINDS["turbulence"], flight={"duration": 3.0})
+    gains = gusts.vary(controller={"delay": 0.02})
+    return [
+        recorded(name, scenario, simulate(scenario))
+        for name, scenario in (("gusts", gusts), ("turbulence", turbulence), ("gains", gains))
+    ]
+
+
+def test_comparison_of_unlike_flights_begins_with_what_differs(
+    unlike: list[RecordedFlight], tmp_path: Path
+) -> None:
+    """The parameters are by hand those of the three scenarios. A ratio beside other wind is neither
+    better nor worse; one under other gains is.
+    """
+    listed = {each.key: each.texts for each in comparison.conditions(unlike)}
+    assert listed["aircraft.turbulence.wind"] == ("none", "8", "none")
+    assert listed["aircraft.gusts.vertical.speed"] == ("4", "none", "4")
+    assert "controller.delay" in listed
+    assert list(listed).index("controller.delay") == len(listed) - 1
+    rows = [row for table in comparison.error_tables(unlike) for row in table.rows]
+    assert {row.verdict(1) for row in rows} == {"same"}
+    assert {row.verdict(2) for row in rows} > {"same"}
+    write_page(tmp_path / "comparison.html", unlike)
+    page = (tmp_path / "comparison.html").read_text()
+    assert headings(page)[:2] == ["What differs", "Tracking error"]
+    assert comparison.UNLIKE in page
+
+
+def test_gusts_of_one_flight_are_not_drawn_over_another(unlike: list[RecordedFlight]) -> None:
+    gusts, turbulence, gains = unlike
+    assert comparison.plot_context([gusts, turbulence]).intervals == []
+    labels = [each.label for each in comparison.plot_context([gusts, gains]).intervals]
+    assert labels == ["vertical gust"]
+
+
+def test_ticks_of_another_time_are_neither_better_nor_worse(unlike: list[RecordedFlight]) -> None:
+    """A flight in one process has no late tick, and says nothing of a host in real time."""
+    first = unlike[0]
+    later = replace(first.tape, start_ns=EPOCH)
+    pair = [first._replace(tape=later), first._replace(name="in one process")]
+    assert comparison.alike(pair) == (True, True)
+    assert comparison.alike(pair, timed=True) == (True, False)
+    assert [each.key for each in comparison.conditions(pair)] == ["flown"]
 
 
 def test_curve_is_broken_at_gap_and_u_held() -> None:

@@ -43,27 +43,36 @@ figure is taken."""
 TRUE_ERROR = "true error"
 MEASURED_ERROR = "measured error"
 
-PARTS_LEGEND = (
-    f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the "
-    f"entry of a gust to {SETTLING_DWELL:g} s after its end; undisturbed: all other times, except "
-    f"{SETTLING_DWELL:g} s after engagement"
-)
-"""Legend of the tables: the parts of a flight. Their keys are "whole", "calm" (undisturbed),
-"command" and "gust"."""
-
 TURN_BANK = math.radians(5.0)  # rad: a turn commands more bank
 CAPTURE_ANGLE = math.radians(1.0)  # rad: a capture commands a steeper flight path
 CAPTURE_TIME = 0.5  # s: a capture is farther beside its path than the aircraft flies in this time
 
-GUIDED_LEGEND = (
-    f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of "
-    "turns, a commanded path steeper"
-    f" than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving command of V, or a cross-track "
-    f"error above {CAPTURE_TIME:g} s of"
-    f" flight, each to {SETTLING_DWELL:g} s after its end; undisturbed: steady flight, all "
-    "other times outside gusts"
-)
-"""Legend of the tables of a guided flight: the keys "turn" and "capture" replace "command"."""
+CALM = "calm"
+UNKNOWN_AIR = "other"
+AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
+"""What was in the air beside gusts: the name of the part of a flight without a gust, a command and
+an engagement. UNKNOWN_AIR: no simulated aircraft flew."""
+
+
+def parts_legend(air: str, *, is_guided: bool) -> str:
+    """Legend of the tables: the parts of a flight. The keys are "whole", `air`, "command" and
+    "gust"; of a guided flight "turn" and "capture" replace "command".
+    """
+    after = f"to {SETTLING_DWELL:g} s after its end"
+    others = f"{air}: all other times, except {SETTLING_DWELL:g} s after engagement"
+    if air == UNKNOWN_AIR:
+        others += "; the wind is not known"
+    if not is_guided:
+        return (
+            f"command: from an edge of a command {after}; gust: from the entry of a gust {after}; "
+            f"{others}"
+        )
+    return (
+        f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of "
+        f"turns, a commanded path steeper than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving "
+        f"command of V, or a cross-track error above {CAPTURE_TIME:g} s of flight, each {after}; "
+        f"{others}, outside gusts"
+    )
 
 
 class Transient(NamedTuple):
@@ -238,7 +247,7 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` never
+    """Turns and captures of a guided flight, from `guidance`, as `parts_legend` says; `u_m` never
     rests.
 
     Transients of a kind less than SETTLING_DWELL apart are a single transient.
@@ -293,13 +302,16 @@ def in_spans(
 
 
 def part_masks(
-    t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+    t: FloatArray,
+    transients: Sequence[Transient],
+    settle: float = SETTLING_DWELL,
+    air: str = CALM,
 ) -> dict[str, NDArray[np.bool_]]:
-    """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command",
+    """Masks of the instants t of shape (N,) by part of the flight: "whole", `air`, "command",
     "gust".
 
     Of a guided flight "capture" and "turn" replace "command". An instant counts to the last
-    matching part in this order. "calm" is undisturbed: no transient of any kind.
+    matching part in this order. `air` has no transient of any kind.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
@@ -313,7 +325,7 @@ def part_masks(
         free &= ~parts[kind]
     return {
         "whole": np.ones(len(t), dtype=bool),
-        "calm": free,
+        air: free,
         **{kind: parts[kind] for kind in (*commands, "gust")},
     }
 
@@ -406,15 +418,18 @@ def known_entries(learned: Signal) -> list[str]:
 
 
 def errors_by_part(
-    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+    tape: Tape,
+    transients: Sequence[Transient],
+    settle: float = SETTLING_DWELL,
+    air: str = CALM,
 ) -> dict[str, dict[str, ErrorMetrics]]:
     """Metrics of `best_error` by channel and part of the flight.
 
     The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of
-    every transient.
+    every transient, in calm air.
     """
     _, error = best_error(tape)
-    masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
+    masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle, air)
     times = sample_times(error.stamp_ns)
     by_channel = {}
     for name in error.names:
@@ -509,7 +524,11 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
 
 
 def inputs_by_part(
-    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL, topic: str = "u"
+    tape: Tape,
+    transients: Sequence[Transient],
+    settle: float = SETTLING_DWELL,
+    topic: str = "u",
+    air: str = CALM,
 ) -> dict[str, dict[str, InputMetrics]]:
     """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot); of y
     with `topic`.
@@ -521,7 +540,7 @@ def inputs_by_part(
         return {}
     u = tape[topic]
     t = tape.time(topic)
-    masks = part_masks(t, transients, settle)
+    masks = part_masks(t, transients, settle, air)
     times = sample_times(u.stamp_ns)
 
     def metrics(values: FloatArray, mask: NDArray[np.bool_]) -> InputMetrics:

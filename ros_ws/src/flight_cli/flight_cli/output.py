@@ -88,11 +88,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
     if commands := command_results(summary):
         say(console, commands)
-    say(
-        console,
-        f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error",
-        style="dim",
-    )
+    say(console, parts_legend(summary), style="dim")
     for line in (
         *_timing(summary),
         *(f"note: {note}" for note in summary["notes"] if note != busy),
@@ -240,8 +236,8 @@ def grouped_table(
     table.add_column(f"\n{first}", no_wrap=True)
     for column, before in zip(columns, (None, *columns), strict=False):
         begins = before is None or column.group != before.group
-        head = column.head.replace("undisturbed", "undist.")  # fits a terminal of 80 columns
-        table.add_column(f"{column.group if begins else ''}\n{head}", justify="right", no_wrap=True)
+        heading = f"{column.group if begins else ''}\n{column.head}"
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table

@@ -112,6 +112,10 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
     ):
         result = f"{flight.summary['outcome']['sentence']}{taken_over(flight.summary, 'errors')}"
         say(console, f"{k}: {label}, {result}")
+    for condition in comparison.conditions(flights):
+        say(console, f"{condition.key}: {'; '.join(condition.texts)}")
+    if not all(comparison.alike(flights)):
+        say(console, comparison.UNLIKE, style="bold")
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table(
         "Tracking error, and its ratio to the first", headings, left_aligned=("channel", "")

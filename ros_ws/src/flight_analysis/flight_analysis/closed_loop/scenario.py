@@ -170,13 +170,30 @@ class Scenario:
         """Whether the models of the controller are learned in flight."""
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
+    def air(self) -> str:
+        """What is in the air beside gusts, of flight_analysis.metrics.AIRS: the most violent."""
+        aircraft = self.aircraft
+        if aircraft.microburst is not None:
+            return "microburst"
+        if aircraft.turbulence is not None:
+            return "turbulence"
+        if aircraft.shear is not None:
+            return "shear"
+        return "wind" if any(aircraft.wind) else "calm"
+
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Start and stop of the gusts, s: entry and entry + 2 H / V0."""
+        """Start and stop of the gusts, s: entry and entry + 2 H / V0. A repeated gust has a number
+        from the second time on.
+        """
         speed = self.aircraft.channels().speed
-        return {
-            name: (gust.start, gust.start + 2.0 * gust.length / speed)
-            for name, gust in self.aircraft.gusts.items()
-        }
+        windows = {}
+        for name, gust in self.aircraft.gusts.items():
+            again = (self.flight.duration - gust.start) / gust.every  # 0 of a single gust
+            entries = gust.start + gust.every * np.arange(1.0, max(math.ceil(again), 1))
+            for number, entry in enumerate([gust.start, *entries.tolist()], 1):
+                label = name if number == 1 else f"{name} {number}"
+                windows[label] = (entry, entry + 2.0 * gust.length / speed)
+        return windows
 
 
 def as_scenario(value: object) -> Scenario:

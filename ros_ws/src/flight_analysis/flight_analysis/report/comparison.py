@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_analysis.closed_loop.scenario import SCHEMAS
 from flight_analysis.metrics import best_error
 from flight_analysis.report import figures
 from flight_analysis.report.display_units import (
@@ -35,7 +36,9 @@ from flight_analysis.report.summary_rows import (
     metric,
     slowest_settling,
 )
+from flight_core.parameters import flatten
 from flight_core.tape import Signal, Tape
+from flight_log.clock import SINCE_EPOCH_NS
 
 # Okabe and Ito 2008, distinct to the colour blind too; lighter on a dark page.
 DARK = {
@@ -65,10 +68,14 @@ class ComparisonRow(NamedTuple):
     texts: tuple[str, ...]
     ratios: tuple[float | None, ...]
     lower_is_better: bool = True
+    # whether each flight had the conditions of the first, so that the ratio says better or worse
+    alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:
-        """A flight compared with the first: "better", "worse" or "same"."""
+        """A flight beside the first: "better", "worse" or "same"; an unlike flight is "same"."""
         ratio = self.ratios[flight]
+        if self.alike and not self.alike[flight]:
+            return "same"
         if ratio is None or not self.lower_is_better or abs(ratio - 1.0) < EQUAL_RATIO_TOLERANCE:
             return "same"
         return "better" if ratio < 1.0 else "worse"
@@ -103,6 +110,80 @@ def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
     return by_channel
 
 
+# ---- Conditions
+
+
+class Condition(NamedTuple):
+    """A parameter that differs, by flight."""
+
+    key: str
+    texts: tuple[str, ...]
+
+
+WINDS = tuple(f"aircraft.{key}" for key in ("gusts", "turbulence", "wind", "shear", "microburst"))
+COMPARED = ("controller.",)  # what a comparison may be of: the ratios keep their colours
+NO_CONDITION = ("recorder.",)
+PACE = "flown"
+LONG = 40  # characters of a value, as of a matrix
+UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of the law"
+
+
+def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
+    """The parameters with unlike values, wind first, and whether a flight was in real time."""
+    values = [_parameters(flight) for flight in flights]
+    keys = sorted(
+        {key for each in values for key in each if not key.startswith(NO_CONDITION)},
+        key=lambda key: (not key.startswith(WINDS), key.startswith(COMPARED), key),
+    )
+    rows = [(key, [each.get(key, "none") for each in values]) for key in keys]
+    return [Condition(key, _shortened(texts)) for key, texts in rows if len(set(texts)) > 1]
+
+
+def _parameters(flight: RecordedFlight) -> dict[str, str]:
+    """The parameters of a flight as text, by full name."""
+    if flight.scenario is None:
+        return {}
+    tree = {
+        section: config.model_dump()
+        for section in SCHEMAS
+        if (config := getattr(flight.scenario, section)) is not None
+    }
+    return {key: _text(value) for key, value in flatten(tree)} | {PACE: _pace(flight.tape)}
+
+
+def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
+    """The texts; of a long list of numbers the count, and whether the numbers differ."""
+    counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
+    return tuple(
+        f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count
+        for text, count in zip(texts, counts, strict=True)
+    )
+
+
+def _pace(tape: Tape) -> str:
+    if tape.is_by_clock:
+        return "by /clock"
+    return "in real time" if tape.start_ns > SINCE_EPOCH_NS else "not in real time"
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_text, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def alike(flights: Sequence[RecordedFlight], *, timed: bool = False) -> tuple[bool, ...]:
+    """Whether each flight had the conditions of the first, but for the controller; `timed`: with
+    the same time.
+    """
+    rows = [
+        row
+        for row in conditions(flights)
+        if not row.key.startswith(COMPARED) and (timed or row.key != PACE)
+    ]
+    return tuple(all(row.texts[k] == row.texts[0] for row in rows) for k in range(len(flights)))
+
+
 # ---- Tables
 
 
@@ -113,6 +194,7 @@ def metric_tables(
     a value.
     """
     display = units(flights)
+    same = alike(flights)
     tables = []
     for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
         factor = display.get(channel, NO_UNIT).factor
@@ -122,7 +204,7 @@ def metric_tables(
                 flights, f"{group} {head}".strip(), (key, channel, *path), factor if scaled else 1.0
             )
             if set(row.texts) != {NO_VALUE}:
-                rows.append(row._replace(lower_is_better=lower_is_better))
+                rows.append(row._replace(lower_is_better=lower_is_better, alike=same))
         tables.append(ComparisonTable(channel_label(channel, display), tuple(rows), channel))
     return tables
 
@@ -151,7 +233,10 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers as a table; none for zeros alone."""
-    rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
+    same = alike(flights, timed=True)
+    rows = [
+        _row(flights, name, path, 1e3)._replace(alike=same) for name, path in TIMING_METRICS.items()
+    ]
     nonzero = tuple(row for row in rows if set(row.texts) - {NO_VALUE, format_value(0.0)})
     return [ComparisonTable("Ticks of the controller", nonzero)] if nonzero else []
 
@@ -169,12 +254,14 @@ def _row(
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
-    """The context of the flights, from t = 0 of every flight on, with shaded gusts."""
-    intervals: dict[Interval, None] = {}
-    for flight in flights:
-        intervals |= dict.fromkeys(figures.gust_intervals(flight.tape, flight.gusts))
-    end = max(figures.flight_end(flight.tape) for flight in flights)
-    return PlotContext(Tape({}), units(flights), list(intervals), end, SampleStore())
+    """The context of the flights, from t = 0 of every flight on, with common gusts alone."""
+    gusts = flights[0].gusts
+    longest = max(flights, key=lambda flight: figures.flight_end(flight.tape))
+    intervals: list[Interval] = []
+    if all(flight.gusts == gusts for flight in flights):
+        intervals = figures.gust_intervals(longest.tape, gusts)
+    end = figures.flight_end(longest.tape)
+    return PlotContext(Tape({}), units(flights), intervals, end, SampleStore())
 
 
 def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure:

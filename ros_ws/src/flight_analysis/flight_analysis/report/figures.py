@@ -94,10 +94,10 @@ def flight_end(tape: Tape) -> float:
 
 
 def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
-    """The gusts up to the end of the flight."""
+    """The gusts up to the end of the flight; a repeated gust has one label."""
     end = flight_end(tape)
     return [
-        Interval(f"{name} gust", start, min(stop, end), GUST, True)
+        Interval(f"{name.rstrip('0123456789 ')} gust", start, min(stop, end), GUST, True)
         for name, (start, stop) in gusts.items()
         if start < end
     ]

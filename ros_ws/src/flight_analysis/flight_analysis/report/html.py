@@ -36,7 +36,7 @@ from flight_analysis.report.summary import (
     parts_legend,
     time_flown,
 )
-from flight_analysis.report.summary_rows import INPUT_COLUMNS
+from flight_analysis.report.summary_rows import INPUT_COLUMNS, Column
 from flight_core.files import replacing
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -202,6 +202,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     )
     inputs = comparison.metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
     groups = [
+        *_condition_group(flights, list(colours)),
         TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
         TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette),
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
@@ -236,6 +237,17 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
             ),
         )
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
+
+
+def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> list[TableGroup]:
+    """The parameters with unlike values."""
+    rows = comparison.conditions(flights)
+    if not rows:
+        return []
+    columns = [Column("", label) for label in labels]
+    table = tables.Table("", columns, [(row.key, *row.texts) for row in rows])
+    legend = "" if all(comparison.alike(flights)) else comparison.UNLIKE
+    return [TableGroup([table], "What differs", legend)]
 
 
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:

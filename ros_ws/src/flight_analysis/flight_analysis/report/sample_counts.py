@@ -190,6 +190,11 @@ def _is_of_stack(tape: Tape, name: str) -> bool:
     return tape.duration is not None or "truth" in tape.recording
 
 
+def is_simulated(tape: Tape) -> bool:
+    """Whether the simulated aircraft of the stack flew, in the wind of the scenario."""
+    return tape.scenario is not None or "truth" in tape or _is_of_stack(tape, "y")
+
+
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
     """The period of the samples of a topic, ns.
 

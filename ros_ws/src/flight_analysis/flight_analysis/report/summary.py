@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_analysis import metrics
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.metrics import (
-    GUIDED_LEGEND,
-    PARTS_LEGEND,
+    CALM,
     TRUE_ERROR,
+    UNKNOWN_AIR,
     Transient,
     best_error,
     engagements,
@@ -42,7 +43,7 @@ from flight_analysis.report.display_units import (
     format_seconds,
 )
 from flight_analysis.report.guided import guidance_notices, guidance_summary
-from flight_analysis.report.sample_counts import WHOLE, ends_last
+from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
 from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.timing import (
     AgeMetrics,
@@ -82,7 +83,8 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
 
     Turns and captures replace the commands of a guided flight.
     """
-    gusts = [Transient("gust", name, *window) for name, window in scenario.gust_windows().items()]
+    windows = scenario.gust_windows() if is_simulated(tape) else {}
+    gusts = [Transient("gust", name, *window) for name, window in windows.items()]
     if "guidance" in tape:
         return [*engagements(tape), *guided_transients(tape), *gusts]
     live = live_commands(tape)
@@ -121,7 +123,9 @@ class RecordedFlight(NamedTuple):
     @property
     def gusts(self) -> dict[str, tuple[float, float]]:
         """Start and end of each gust of the scenario, s."""
-        return {} if self.scenario is None else self.scenario.gust_windows()
+        if self.scenario is None or not is_simulated(self.tape):
+            return {}
+        return self.scenario.gust_windows()
 
 
 def summarise(
@@ -156,6 +160,7 @@ def summarise(
     _require_topics(tape)
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     events = transients(scenario, tape)
+    air = scenario.air() if is_simulated(tape) else UNKNOWN_AIR
     flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
     ticks = None
     if "internals" in tape:
@@ -167,8 +172,9 @@ def summarise(
     summary = empty_summary(scenario, judged(outcome, tape, scenario, flight_account)) | {
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
-        "errors": _errors(tape, events),
-        "inputs": _inputs(tape, events),
+        "air": air,
+        "errors": _errors(tape, events, air),
+        "inputs": _inputs(tape, events, air),
         "transients": [
             settling.transient._asdict() | {"until": settling.until, "settling": settling.time}
             for settling in settling_times(tape, events)
@@ -444,6 +450,7 @@ def empty_summary(scenario: Scenario | None, outcome: Outcome) -> dict[str, Any]
         "outcome": outcome.as_json(),
         "flight": None,
         "duration": None,
+        "air": None,
         "error": None,
         "errors": {},
         "inputs": {},
@@ -458,14 +465,14 @@ def empty_summary(scenario: Scenario | None, outcome: Outcome) -> dict[str, Any]
     }
 
 
-def _errors(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
+def _errors(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]:
     bands = settling_bands(tape)
     floors = noise_floor(tape)
     switches = sign_switches(tape)
     figures = {}
-    for channel, parts in errors_by_part(tape, events).items():
-        figures[channel] = {part: metrics._asdict() for part, metrics in parts.items()} | {
-            "bound": parts["calm"].max,
+    for channel, parts in errors_by_part(tape, events, air=air).items():
+        figures[channel] = {part: figures_of._asdict() for part, figures_of in parts.items()} | {
+            "bound": parts[CALM].max if air == CALM else None,
             "band": bands[channel],
             "floor": floors[channel],
             "sign_switches": switches.get(channel),
@@ -473,11 +480,11 @@ def _errors(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
     return figures
 
 
-def _inputs(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
+def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]:
     saturation = saturation_shares(tape)
     figures: dict[str, Any] = {}
-    for name, parts in inputs_by_part(tape, events).items():
-        by_part: dict[str, Any] = {part: metrics._asdict() for part, metrics in parts.items()}
+    for name, parts in inputs_by_part(tape, events, air=air).items():
+        by_part: dict[str, Any] = {part: effort._asdict() for part, effort in parts.items()}
         figures[name] = by_part | {"limited": saturation.get(name)}
     return figures
 
@@ -496,5 +503,7 @@ def finite_or_null(value: Any) -> Any:
 
 def parts_legend(summary: Mapping[str, Any]) -> str:
     """Legend of the parts of a flight."""
-    guided = any("turn" in metrics for metrics in summary["errors"].values())
-    return GUIDED_LEGEND if guided else PARTS_LEGEND
+    is_guided = any("turn" in parts for parts in summary["errors"].values())
+    air = summary["air"] or UNKNOWN_AIR
+    bound = ". ultimate bound: the largest error in calm" if air == CALM else ""
+    return f"{metrics.parts_legend(air, is_guided=is_guided)}{bound}"

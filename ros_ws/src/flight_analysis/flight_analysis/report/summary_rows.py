@@ -5,6 +5,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from flight_analysis.metrics import AIRS, CALM
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,
@@ -27,7 +28,7 @@ class Column(NamedTuple):
 
 RMS_COLUMNS = (
     Column("rms", "whole", ("whole", "rms")),
-    Column("rms", "undisturbed", ("calm", "rms")),
+    *(Column("rms", air, (air, "rms")) for air in AIRS),
     Column("rms", "command", ("command", "rms")),
     Column("rms", "capture", ("capture", "rms")),
     Column("rms", "turn", ("turn", "rms")),
@@ -41,6 +42,7 @@ ERROR_COLUMNS = (
     Column("max", "capture", ("capture", "max")),
     Column("max", "turn", ("turn", "max")),
     Column("max", "gust", ("gust", "max")),
+    *(Column("max", air, (air, "max")) for air in AIRS if air != CALM),
     Column("ultimate", "bound", ("bound",)),
 )
 """Columns of every table of errors; `columns_of` chooses those of a flight."""
@@ -56,7 +58,7 @@ INPUT_COLUMNS = (
     *RMS_COLUMNS,
     Column("", "max", ("whole", "max")),
     Column("rate", "whole", ("whole", "rate")),
-    Column("rate", "undisturbed", ("calm", "rate")),
+    *(Column("rate", air, (air, "rate")) for air in AIRS),
 )
 """Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a
 flight."""
@@ -69,11 +71,12 @@ SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """The columns whose part of the flight the metrics have: a guided flight has "capture" and
-    "turn" in place of "command".
-    """
-    parts = set().union(*channels.values())
-    return tuple(column for column in columns if column.path[0] in parts)
+    """The columns with a value: a part of the flight that did not occur has none."""
+    return tuple(
+        column
+        for column in columns
+        if any(metric(metrics, *column.path) is not None for metrics in channels.values())
+    )
 
 
 def metric(summary: Mapping[str, Any], *path: str) -> float | None:

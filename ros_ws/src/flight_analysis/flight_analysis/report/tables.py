@@ -37,8 +37,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
 ERROR_LEGEND = (
-    "ultimate bound: the largest undisturbed error. switches: of the sign term's direction. "
-    "settling: time"
+    f"switches: of the sign term's direction. settling: time"
     f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest "
     f"y_m, or within {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
