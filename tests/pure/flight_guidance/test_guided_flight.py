@@ -155,7 +155,7 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
         )
         state, commands = modes.step(state, inputs, None, params)
         assert (
-            guidance.row(inputs, state, commands, guidance.digest(None), 0.0).tobytes()
+            guidance.row(inputs, state, commands, guidance.digest(None), 0.0, 0).tobytes()
             == values.tobytes()
         )
         assert state == logged

@@ -9,6 +9,7 @@ from flight_core.kinematics import body_rates as inverse
 from flight_core.kinematics import clip, tilt, turn_rate
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.protection import forward
 
 YAW_TO_BANK = 1.5
 """1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off
@@ -68,6 +69,7 @@ def body_rates(
     leads the angle of attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W.
     Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """  # noqa: D400, D415 - what follows is an equation
+    speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
     lead = phi_dot * array_namespace(phi).tan(tilt(phi)) / params.n_alpha
@@ -86,6 +88,6 @@ def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     the outer wing is faster, and the dihedral rolls away from the sideslip.
     """
     xp = array_namespace(phi)
-    turn = GRAVITY / speed
+    turn = GRAVITY / forward(speed)
     off = SKIDDING * phi_c - phi
     return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * off, turn * math.tan(LARGEST_YAW))

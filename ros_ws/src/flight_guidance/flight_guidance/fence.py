@@ -17,6 +17,7 @@ import numpy as np
 from flight_core.units import GRAVITY
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.lateral import LARGEST_SLIP
+from flight_guidance.protection import forward
 from flight_guidance.ways import POINTS, Ways, line_clearance, ways
 from flight_guidance.zones import Fence, Zone, clearance
 
@@ -32,6 +33,13 @@ HOMEWARD = math.radians(20.0)
 AHEAD = math.radians(60.0)
 """Angle between the course and the bearing of the way home up to which an aircraft flies along the
 way."""
+
+LEAST_TURN = math.radians(5.0)
+"""Bank of the longest turn that is predicted: 2 min at 20 m/s.
+
+A turn at a smaller bank is predicted for as long. At a bank of 0, that of 1.1 V_s and below, the
+prediction is the straight way.
+"""
 
 SHARES = (1.0, 1.0 - LARGEST_SLIP)
 """Shares of the coordinated turn that the predicted turns have; the nearer turn counts.
@@ -74,20 +82,20 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before the way home, at the latest after nearly a full turn.
-    Trapezoidal rule over POINTS.
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn, or
+    the time of one at LEAST_TURN. Trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
     turns = np.array([*product((1.0, -1.0), SHARES)])
     side, share = (column.reshape(-1, 1, *axes) for column in turns.T)
     aim = side * motion.bank
-    turn = share * GRAVITY / motion.speed
+    turn = share * GRAVITY / forward(motion.speed)
     rolled = motion.lag + abs(aim - motion.phi) / motion.roll_rate
     longest = (
         motion.lag
         + 2.0 * motion.bank / motion.roll_rate
-        + 1.95 * math.pi / (turn * xp.tan(motion.bank))
+        + 1.95 * math.pi / (turn * xp.tan(xp.maximum(motion.bank, LEAST_TURN)))
     )
     t = np.linspace(0.0, 1.0, POINTS).reshape(-1, *axes) * longest
     reach = motion.roll_rate * xp.maximum(t - motion.lag, 0.0)

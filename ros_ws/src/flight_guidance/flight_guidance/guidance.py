@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_core.channels import POSE, UNKNOWN
+from flight_core.failures import Failures, sentence
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
@@ -34,7 +35,13 @@ from flight_guidance.guidance_state import (
     Target,
     Vertical,
 )
-from flight_guidance.notices import LEARNED, LINK_AGE, STALE_TIME
+from flight_guidance.notices import (
+    FAILED,
+    LAST_GOES_ON,
+    LEARNED,
+    LINK_AGE,
+    STALE_TIME,
+)
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 from flight_guidance.reach import Authority, RollTest, authority_of
@@ -44,9 +51,9 @@ STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
 HEADING = "state.psi"
-ADDED = (LINK_AGE, HEADING, *LEARNED)
-"""Channels that logs of earlier versions lack, or flights without a learner: LINK_AGE is taken by
-no step, HEADING by `Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
+ADDED = (LINK_AGE, HEADING, FAILED, *LEARNED)
+"""Channels that logs of earlier versions lack, or flights without a learner: no step takes LINK_AGE
+and FAILED, HEADING is taken by `Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
 
 
 class GuidanceOutput(NamedTuple):
@@ -65,7 +72,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
         *(f"fence.{name}" for name in FENCE),
         *("phi_c", "theta_c", "climb_c", "V_c"),
         *(f"limited.{name}" for name in LIMITED),
-        *("age.pose", LINK_AGE, "begin", "given", *LEARNED),
+        *("age.pose", LINK_AGE, FAILED, "begin", "given", *LEARNED),
         *(f"target.{name}" for name in TARGETS),
         *(f"state.{name}" for name in STATE),
         *(f"wind.{name}" for name in WIND),
@@ -84,12 +91,17 @@ def u_m(state: GuidanceState) -> FloatArray:
 
 
 def row(
-    inputs: Inputs, state: GuidanceState, commands: Commands, route: int, link_age: float
+    inputs: Inputs,
+    state: GuidanceState,
+    commands: Commands,
+    route: int,
+    link_age: float,
+    failed: int,
 ) -> FloatArray:
     """A sample of the log, in the order of `names`: inputs, state after the step, commands.
 
     `route`: a `digest`; `link_age`: time since the last message of an operator, s, 0 without a
-    limit.
+    limit; `failed`: number of failed steps.
     """
     return np.array(
         [
@@ -109,6 +121,7 @@ def row(
             *(
                 seconds(inputs.pose_age_ns),
                 link_age,
+                failed,
                 inputs.begin,
                 guidance_state.bits(inputs.commands),
                 *inputs.authority,
@@ -214,7 +227,10 @@ class Guidance:
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
-        self._waits_from_ns: int | None = None  # for a pose that is young enough
+        # for a pose that is young enough, or a step that does not fail
+        self._waits_from_ns: int | None = None
+        self._failures = Failures()
+        self._failure = ""  # why there is no u_m, as a sentence; empty where it waits for a pose
         # the instant of the operator's last message, or of the first step
         self._operated_ns: int | None = None
         self._link_lost = False
@@ -225,6 +241,11 @@ class Guidance:
     def mode(self) -> Mode:
         """Mode of the last step."""
         return Mode.OFF if self._state is None or self._begin is not Begin.NO else self._state.mode
+
+    @property
+    def failed(self) -> int:
+        """Number of failed steps."""
+        return self._failures.count
 
     @property
     def state(self) -> GuidanceState | None:
@@ -263,7 +284,7 @@ class Guidance:
         require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
         if last is not None:
             require_newer(sample.stamp_ns, last.stamp_ns)
-        if (largest := float(np.max(np.abs(sample.value)))) > guidance_state.LARGEST:
+        if not (largest := float(np.max(np.abs(sample.value)))) <= guidance_state.LARGEST:
             raise ChannelError(
                 "bounds",
                 f"found a value of {largest:g}, expected at most {guidance_state.LARGEST:g} in SI",
@@ -417,29 +438,31 @@ class Guidance:
         }
 
     def waits(self, now_ns: int) -> str:
-        """Why there is no u_m, once guidance has waited for STALE_TIME for a pose that is young
-        enough; else "".
+        """Why there is no u_m, once guidance has waited for STALE_TIME for a young pose or a step
+        without a failure; else "".
         """
         since = self._waits_from_ns
         pose = self._pose
         if since is None or pose is None or now_ns - since < nanoseconds(STALE_TIME):
             return ""
+        if self._failure:
+            return f"no u_m: a step of guidance failed: {self._failure}"
         age = seconds(now_ns - pose.stamp_ns)
         limit = seconds(self._params.max_age_ns)
         return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
 
-    def _watch_link(self, now_ns: int) -> int:
-        """Age of the operator's link, ns, 0 without a limit; fly home, once, where the age exceeds
-        the limit.
-        """
-        if not (limit_ns := self._params.link_timeout_ns):
-            return 0
+    def _watch_link(self, now_ns: int) -> None:
+        """Fly home, once, where the age of the operator's link exceeds the limit."""
+        if not self._params.link_timeout_ns:
+            return
         if self._operated_ns is None:
             self._operated_ns = now_ns
-        age_ns = now_ns - self._operated_ns
-        if age_ns > limit_ns and not self._link_lost:
+        if now_ns - self._operated_ns > self._params.link_timeout_ns and not self._link_lost:
             self._link_lost = self.home()  # again at the next step while guidance does not fly
-        return age_ns
+
+    def _link_age(self, now_ns: int) -> float:
+        """Age of the operator's link, s, 0 without a limit."""
+        return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
         """Add to the authority whether p follows the command of the last step."""
@@ -469,8 +492,45 @@ class Guidance:
         """A step at an instant and flight time t; None without fresh y, before the first pose, and
         while disengaged.
 
-        After steps of None the filters start again at the measured values.
+        After steps of None the filters start again at the measured values. A step fails by an
+        exception or a value that is not finite: the state stays, commands wait for the next step,
+        and the last u_m goes on up to the age limit.
         """
+        try:
+            return self._step(now_ns, t_ns)
+        except Exception as error:  # whatever it is, the next step is tried
+            is_said = self._failures.add(seconds(t_ns))
+            return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
+
+    def _last_goes_on(self, now_ns: int, cause: str, *, is_said: bool) -> GuidanceOutput | None:
+        """The output of a failed step: the last u_m; None beyond the age limit."""
+        state = self._state
+        pose = self._pose
+        y = self._y
+        is_old = state is None or now_ns - state.t_ns > self._params.max_age_ns
+        if is_old or state is None or pose is None or y is None or self._begin is not Begin.NO:
+            self._begin = max(self._begin, Begin.AGAIN)
+            self._waits_from_ns = now_ns if self._waits_from_ns is None else self._waits_from_ns
+            self._failure = cause
+            return None
+        inputs = self._inputs(now_ns, pose, y)._replace(commands={})
+        log = row(inputs, state, Commands(), self._digest, self._link_age(now_ns), self.failed)
+        notices = (f"{LAST_GOES_ON}: {cause}",) if is_said else ()
+        return GuidanceOutput(u_m(state), log, notices)
+
+    def _inputs(self, now_ns: int, pose: StampedVector, y: StampedVector) -> Inputs:
+        """What a step takes at an instant."""
+        return Inputs(
+            now_ns,
+            self._begin,
+            tuple(pose.value.tolist()),
+            max(now_ns - pose.stamp_ns, 0),
+            tuple(y.value.tolist()),
+            self._given,
+            self._authority,
+        )
+
+    def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         while self._program and self._program[0][0] <= t_ns:
             self.take_target(self._program.popleft()[1])
         y = self._y
@@ -479,28 +539,27 @@ class Guidance:
         if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not flies:
             self._begin = max(self._begin, Begin.AGAIN)
             return None
-        age_ns = now_ns - pose.stamp_ns
-        if self._begin is not Begin.NO and age_ns > self._params.max_age_ns:
+        is_stale = now_ns - pose.stamp_ns > self._params.max_age_ns
+        if self._begin is not Begin.NO and is_stale:
             self._waits_from_ns = now_ns if self._waits_from_ns is None else self._waits_from_ns
+            self._failure = ""
             return None
-        self._waits_from_ns = None
-        link_age_ns = self._watch_link(now_ns)
+        self._watch_link(now_ns)
         self._land()
-        y_values = tuple(y.value.tolist())
-        pose_values = tuple(pose.value.tolist())
-        self._test_roll(y_values)
-        inputs = Inputs(
-            now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority
-        )
+        self._test_roll(y.value.tolist())
+        inputs = self._inputs(now_ns, pose, y)
         route_notes = self.route.notes if self.route is not None and self._route_waits else ()
-        self._begin = Begin.NO
-        self._given = {}
-        self._route_waits = False
-        self._state, commands = step(self._state, inputs, self.route, self._params)
-        log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
+        state, commands = step(self._state, inputs, self.route, self._params)
+        log = row(inputs, state, commands, self._digest, self._link_age(now_ns), self.failed)
+        output = u_m(state)
+        if not np.isfinite(np.append(log, output)).all():
+            raise ArithmeticError("a value that is not finite")
         notices = self._notices.take(
             seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True))
         )
-        return GuidanceOutput(
-            u_m(self._state), log, (*route_notes, *(notice.text for notice in notices))
-        )
+        self._state = state
+        self._begin = Begin.NO
+        self._given = {}
+        self._route_waits = False
+        self._waits_from_ns = None
+        return GuidanceOutput(output, log, (*route_notes, *(notice.text for notice in notices)))

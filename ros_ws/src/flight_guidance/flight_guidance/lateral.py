@@ -11,6 +11,7 @@ from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance import reach
+from flight_guidance.protection import forward
 
 # Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the
 # stop: 0.09.
@@ -85,7 +86,7 @@ def path_acceleration(
     """  # noqa: D400, D415 - what follows is an equation
     e, track, kappa = error
     xp = array_namespace(e)
-    x = xp.minimum(abs(e) / (ground_speed * params.period * params.damping), 1.0)
+    x = xp.minimum(abs(e) / (forward(ground_speed) * params.period * params.damping), 1.0)
     look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
     tangent = xp.acos(1.0 / xp.maximum(1.0 - kappa * e, 1.0))
     bearing = track - xp.copysign(

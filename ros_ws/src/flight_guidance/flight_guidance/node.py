@@ -463,6 +463,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         further: dict[str, object] = {
             f"age of {name} (s)": f"{age:.4f}" for name, age in ages.items()
         }
+        further["failed steps"] = self._guidance.failed
         if (state := self._guidance.state) is not None:
             further |= {
                 "lateral": state.lateral.name,

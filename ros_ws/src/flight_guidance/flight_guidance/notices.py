@@ -11,7 +11,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from flight_core.channels import UNKNOWN
+from flight_core.failures import Failures
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
 from flight_guidance.guidance_state import LARGEST, Lateral
@@ -23,6 +26,11 @@ DWELL = 10.0
 
 LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
+
+FAILED = "failed"
+"""Channel of `guidance`: number of failed steps. Earlier versions had none."""
+
+LAST_GOES_ON = "a step of guidance failed, the last u_m goes on"
 
 LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
@@ -223,7 +231,11 @@ class Notices:
         notices: list[Notice] = []
         for instant, *row in zip(t.tolist(), *columns, strict=True):
             notices += self.take(instant, dict(zip(names, row, strict=True)))
-        return notices
+        if FAILED in log:
+            failures = Failures()
+            rises = t[np.diff(log[FAILED], prepend=0.0) > 0.0]
+            notices += [Notice(at, LAST_GOES_ON) for at in rises.tolist() if failures.add(at)]
+        return sorted(notices, key=lambda notice: notice.t)
 
 
 def has_channels(names: Sequence[str]) -> bool:

@@ -21,12 +21,24 @@ SHORTFALL = 0.05
 the limit is zero."""
 
 
+LEAST_SPEED = 0.1
+"""m/s, of a speed that divides: no aircraft flies there, and a flow from behind counts as none."""
+
+
+def forward(speed: Scalar) -> Scalar:
+    """A speed that divides, m/s: max(V, LEAST_SPEED)."""
+    return array_namespace(speed).maximum(speed, LEAST_SPEED)
+
+
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
     """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)), for the load factor of a level turn
     is 1 / cos(phi).
+
+    0 at a V of 1.1 V_s and below: the wings are level.
     """
     xp = array_namespace(speed)
-    return xp.minimum(limit, xp.acos(xp.minimum((STALL_MARGIN * stall_speed / speed) ** 2, 1.0)))
+    ratio = STALL_MARGIN * stall_speed / forward(speed)
+    return xp.minimum(limit, xp.acos(xp.minimum(ratio**2, 1.0)))
 
 
 def speed_floor(stall_speed: float) -> float:

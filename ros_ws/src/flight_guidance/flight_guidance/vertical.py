@@ -8,6 +8,7 @@ from typing import NamedTuple
 from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.protection import forward
 
 STALL_ANGLE = 0.3
 """rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by
@@ -95,4 +96,4 @@ def path_lag(stall_speed: float, speed: float) -> float:
 
 def path_angle(climb: Scalar, speed: Scalar) -> Scalar:
     """Flight path angle in the air mass, rad: asin(climb / V)."""
-    return array_namespace(climb).asin(clip(climb / speed, 1.0))
+    return array_namespace(climb).asin(clip(climb / forward(speed), 1.0))

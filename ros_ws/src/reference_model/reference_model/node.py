@@ -64,11 +64,17 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         before = self._reference.source()
-        self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
+        self._publish_y_m(self._encoder.encode(now_ns, self._sample(tick.number)))
         self._start_ns = now_ns - tick.number * self.period_ns()
         self._u_m.poll(now_ns)
         if (source := self._reference.source()) != before:
             self._log_source(source)
+
+    def _sample(self, number: int) -> FloatArray:
+        y_m = self._reference.sample(number)
+        if failure := self._reference.failure():
+            self.get_logger().error(failure)
+        return y_m
 
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.live.max_age)
@@ -117,7 +123,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         advanced = False
         while True:
             if self._next is None and self._commands_known():
-                self._next = self._reference.sample(self._number)
+                self._next = self._sample(self._number)
             t_ns = self._number * self.period_ns()
             if self._next is None or t_ns > self._clock_ns:
                 return advanced
@@ -148,4 +154,5 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level, _, figures = super().status()
         source = self._reference.source()
+        figures["failed steps"] = self._reference.failed
         return DiagnosticStatus.ERROR if source == "ending" else level, source, figures

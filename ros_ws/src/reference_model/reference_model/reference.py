@@ -6,12 +6,15 @@ one process.
 
 import numpy as np
 
+from flight_core.failures import Failures, sentence
 from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray, require_newer
 from reference_model import live, model
 from reference_model.command import command
 from reference_model.live import Live
 from reference_model.params import ReferenceModelConfig
+
+LAST_GOES_ON = "a step of the reference model failed, the last y_m goes on"
 
 BLOCK = 100  # steps for which the profile is evaluated at once
 
@@ -29,9 +32,12 @@ class Reference:
         self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim
         self._number = 0
         self._u_m = self._block(0)
+        self._begin = 0  # the number of its first step
         self._live_params = parameters.live_params()
         self._live: Live | None = None
         self._applied = np.zeros_like(self._u_m[0])  # u_m at the end of the last step
+        self._failures = Failures()
+        self._failure = ""
 
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
@@ -61,26 +67,51 @@ class Reference:
         """y_m at sample `number`, shape (m,), computed in steps of a period.
 
         The law tracks the last sample until this sample: over skipped samples the dead reckoning
-        takes the last rates.
+        takes the last rates. A step fails by an exception or a value that is not finite: the state
+        stays, and the last y_m goes on.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
-            index = self._number % BLOCK
-            if index == 0:
-                self._u_m = self._block(self._number)
-            if self._live is None:
-                u_m = self._u_m[2 * index : 2 * index + 3].ravel()
-                self._applied = self._u_m[2 * index + 2]
-            else:
-                self._applied = self._live_u_m(self._live)
-                u_m = np.tile(self._applied, 3)
-                self._live = live.dead_reckon(
-                    self._live, tracked, self.period_ns, self._live_params
-                )
-            self._x_m = model.step(self._x_m, u_m, self._stepper)
+            try:
+                self._x_m, self._applied, self._live = self._stepped(tracked)
+            except Exception as error:  # whatever it is, the next step is tried
+                if self._failures.add(seconds(self._number * self.period_ns)):
+                    self._failure = f"{LAST_GOES_ON}: {sentence(error)}"
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
         return y_m
+
+    @property
+    def failed(self) -> int:
+        """Number of failed steps."""
+        return self._failures.count
+
+    def failure(self) -> str:
+        """Why steps have failed since the last call, as a sentence; empty without news."""
+        failure = self._failure
+        self._failure = ""
+        return failure
+
+    def _stepped(self, tracked: FloatArray) -> tuple[FloatArray, FloatArray, Live | None]:
+        """x_m, the applied u_m and the live u_m a period later."""
+        index = self._number % BLOCK
+        if self._begin != self._number - index:
+            self._u_m = self._block(self._number - index)
+            self._begin = self._number - index
+        after = self._live
+        if self._live is None:
+            u_m = self._u_m[2 * index : 2 * index + 3].ravel()
+            applied = self._u_m[2 * index + 2]
+        else:
+            applied = self._live_u_m(self._live)
+            u_m = np.tile(applied, 3)
+            after = live.dead_reckon(self._live, tracked, self.period_ns, self._live_params)
+        with np.errstate(over="ignore", invalid="ignore"):
+            x_m = model.step(self._x_m, u_m, self._stepper)
+        attitude = () if after is None or after.attitude is None else after.attitude
+        if not np.isfinite([*x_m, *applied, *attitude]).all():
+            raise ArithmeticError("a value that is not finite")
+        return x_m, applied, after
 
     def rate(self) -> FloatArray:
         """Derivative of y_m at the last sample, shape (m,): C x_m_dot, equation (2)."""

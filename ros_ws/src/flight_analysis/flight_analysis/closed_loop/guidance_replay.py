@@ -16,8 +16,8 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance
-from flight_guidance.guidance_state import Begin, GuidanceState, Inputs, Lateral
-from flight_guidance.notices import LINK_AGE
+from flight_guidance.guidance_state import Begin, Commands, GuidanceState, Inputs, Lateral
+from flight_guidance.notices import FAILED, LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
 from flight_guidance.route_file import Waypoint
@@ -61,6 +61,7 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
+    After a failed step the state before stays and the last u_m goes on, which is checked.
     Steps on a route outside the log are not checked, nor steps with the channels of a different
     version; a log may lack `guidance.ADDED`; without `guidance.HEADING` the steps that hold a
     heading are not checked. Raises ParameterError for a log without the scenario's section of
@@ -76,9 +77,11 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     differences = [*comparison.differences()]
     missing = steps - comparison.checked
     why = "the log does not hold their route, or the state before them"
-    notes = (f"{missing} steps of guidance not checked: {why}",) if missing else ()
+    notes = [f"{missing} steps of guidance not checked: {why}"] if missing else []
+    if comparison.failed:
+        notes.append(f"{comparison.failed} steps of guidance failed: the last u_m went on")
     first = next(iter(differences), None)
-    return GuidanceReplay(steps, comparison.checked, len(differences), first, notes)
+    return GuidanceReplay(steps, comparison.checked, len(differences), first, tuple(notes))
 
 
 def _has_known_channels(names: tuple[str, ...], outputs: tuple[str, ...]) -> bool:
@@ -93,6 +96,7 @@ class _Comparison:
 
     def __init__(self, tape: Tape, parameters: GuidanceConfig) -> None:
         self.checked = 0
+        self.failed = 0
         self._signal = tape["guidance"]
         self._t = tape.time("guidance")
         self._names = self._signal.names
@@ -107,6 +111,7 @@ class _Comparison:
     def differences(self) -> Iterator[Difference]:
         """The first different channel of each different step, in the order of the steps."""
         previous: GuidanceState | None = None
+        failed_before = 0.0
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
         for k, (stamp_ns, row) in enumerate(rows):
             channels = dict(zip(self._names, row.tolist(), strict=True))
@@ -115,25 +120,35 @@ class _Comparison:
                 recorded.lateral is Lateral.HEADING and guidance.HEADING not in channels
             )
             begins = previous is not None or inputs.begin is Begin.HOLD
+            # After a failed step without a sample in the log the filters begin again.
+            failed = channels.get(FAILED, 0.0)
+            goes_on = failed > failed_before and inputs.begin is Begin.NO
+            failed_before = failed
+            self.failed += goes_on
             if int(channels["route"]) in self._legs and not without_heading and begins:
                 self.checked += 1
-                computed = self._computed(previous, inputs, channels)
+                computed = self._computed(previous, inputs, channels, goes_on=goes_on)
                 u_m = self._published.get(stamp_ns, guidance.u_m(recorded))
                 if difference := self._difference(k, np.append(row, u_m), computed):
                     yield difference
-            previous = recorded
+            previous = previous if goes_on else recorded
 
     def _computed(
         self,
         previous: GuidanceState | None,
         inputs: Inputs,
         channels: Mapping[str, float],
+        *,
+        goes_on: bool,
     ) -> FloatArray:
-        """The channels of a step after a state, then its u_m."""
+        """The channels of a step after a state, then u_m. `goes_on`: a failed step."""
         flown = int(channels["route"])
-        state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
-        link_age = channels.get(LINK_AGE, 0.0)
-        row = guidance.row(inputs, state, commands, flown, link_age)
+        if goes_on and previous is not None:
+            state, commands = previous, Commands()
+        else:
+            state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
+        copied = channels.get(LINK_AGE, 0.0), int(channels.get(FAILED, 0.0))
+        row = guidance.row(inputs, state, commands, flown, *copied)
         logged = [name in self._names for name in guidance.names(self._outputs)]
         return np.append(row[logged], guidance.u_m(state))
 

@@ -25,7 +25,7 @@ from flight_guidance.guidance_state import (
     Vertical,
     bits,
 )
-from flight_guidance.notices import LINK_AGE, Notice, has_channels
+from flight_guidance.notices import FAILED, LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route, is_orbit, leg_places, lengths_after, route_outline
 from flight_guidance.zones import clearance
@@ -448,6 +448,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
         "wind": _mean_wind(tape),
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),
+        "failed": int(log[FAILED][-1]) if FAILED in log.names else 0,
         "limited": {name: float(np.mean(limited[name] != 0.0)) for name in limited.names},
     }
 

@@ -1,0 +1,28 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Failed steps of a node: the count, and when to log a sentence."""
+
+import math
+
+DWELL = 10.0
+"""s without a failed step before a second sentence."""
+
+
+class Failures:
+    """A count of failed steps, with a sentence at the first and at the first after DWELL."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last = -math.inf
+
+    def add(self, t: float) -> bool:
+        """Count a failed step at the flight time t, s; whether a sentence is due."""
+        is_first = t - self._last > DWELL
+        self.count += 1
+        self._last = t
+        return is_first
+
+
+def sentence(error: Exception) -> str:
+    """The kind and the words of an error, on one line."""
+    return " ".join(f"{type(error).__name__} {error}".split())
