@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from tests.conftest import refusing
 
 from c_export.constants import TABLE, constants, exportable, packed
-from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
+from c_export.drawn import drawn_calls, drawn_commands, drawn_standstill, drawn_steps
 from c_export.events import (
     RETUNE,
     Recorder,
@@ -97,6 +97,10 @@ PRIORITY = {"allocation": {**TWIN.model_dump()["allocation"], "priority": TWIN.i
 SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "servo": lambda: find_scenario("osprey_servo"),
     "observer": lambda: find_scenario("osprey_observer"),
+    # lost samples of more than ten periods within the age limit
+    "fast feedforward": lambda: find_scenario("osprey_turbulence").vary(
+        controller={"observer": None, "rate": 500.0}
+    ),
     "schedule and allocation": lambda: find_scenario("osprey_twin").vary(
         controller=SCHEDULE | PRIORITY
     ),
@@ -112,12 +116,13 @@ class Case(NamedTuple):
 
 
 def export_case(name: str, folder: Path) -> Case:
-    """Short flights at 100 Hz, 1500 drawn calls, and 300 steps with each parameter set; a tenth
-    where Python allocates.
+    """Short flights at the rate of the controller, 1500 drawn calls, and 300 steps with each
+    parameter set; a tenth where Python allocates.
     """
-    slow = {"rate": 100.0, "step": 0.005}
+    rate = SCENARIOS[name]().controller.rate
+    slow = {"rate": rate, "step": min(0.005, 1.0 / rate)}
     limits = {"bounds": {"q": 0.4, "p": 0.5}, "slew": {"p": 1.0, "r": 0.5}}
-    model = {"rate": 100.0, "live": limits}
+    model = {"rate": rate, "live": limits}
     scenario = SCENARIOS[name]().vary(
         aircraft=slow, reference_model=model, flight={"duration": 8.0}
     )
@@ -125,7 +130,8 @@ def export_case(name: str, folder: Path) -> Case:
     write_code(sets[0], name, folder, scenario.reference_model, float32=False)
     part = 10 if sets[0].allocation is None else 1
     steps = [drawn_steps(sets, k, 30 * part, k) for k in range(len(sets))]
-    drawn = [drawn_calls(sets, 150 * part, 3), any_numbers(sets), *steps]
+    calls = [drawn_calls(sets, 150 * part, 3), drawn_standstill(sets, 200 * part, 4)]
+    drawn = [*calls, any_numbers(sets), *steps]
     recordings = [
         *flight_recordings(scenario, sets),
         drawn_commands(scenario.reference_model, 900, 2),

@@ -19,11 +19,12 @@ from flight_core.vectors import FloatArray
 from reference_model.model import stepper
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
-from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
+from rise_di_controller.feedforward import LONGEST_PART
+from rise_di_controller.guard import LEAST_DT, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
 from rise_di_controller.observer import ObserverParams
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
-from rise_di_controller.samples import AGREEING, FIRST_NS, MEMORY, TIMES
+from rise_di_controller.samples import AGREEING, FIRST_NS, MEMORY, MOVING, STILL, TIMES
 from rise_di_controller.saturation import Limits
 from rise_di_controller.schedule import ScheduleParams, airspeed_range
 
@@ -177,8 +178,8 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     }
     reals: dict[str, ArrayLike] = {
         "period": period,
-        "dt_least": DT_RANGE[0] * period,
-        "dt_largest": DT_RANGE[1] * period,
+        "dt_least": LEAST_DT * period,
+        "dt_largest": seconds(guard.longest_ns),
     }
     reals |= {
         name: getattr(law, name)
@@ -291,6 +292,9 @@ def header(
         *_names_and_sizes(controller, r, samples, float32=float32),
         f"#define RISE_DI_AGREEING {AGREEING} /* samples in a row after a jump of y */",
         f"#define RISE_DI_FIRST_NS {FIRST_NS} /* after the first y, in which it may jump */",
+        f"#define RISE_DI_STILL {STILL} /* samples and periods without a change: y is frozen */",
+        f"#define RISE_DI_MOVING {MOVING} /* samples in a row with a change before */",
+        f"#define RISE_DI_LONGEST_PART {LONGEST_PART} /* periods, of a Runge-Kutta step */",
         *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in REALS.items()),
         f"#define RISE_DI_SWEEPS {SWEEPS}",
         f"#define RISE_DI_HALVINGS {HALVINGS}",

@@ -33,7 +33,7 @@ from rise_di_controller import feedforward
 from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.feedforward import FeedforwardState, Nominal
-from rise_di_controller.guard import DT_RANGE, SAMPLE_BUFFER_SIZE
+from rise_di_controller.guard import LEAST_DT, SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 from rise_di_controller.saturation import saturate
 
@@ -116,19 +116,45 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
         yield off
 
 
+def drawn_standstill(
+    sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
+) -> Recording:
+    """Samples of y with noise, and stretches of up to twelve equal ones, at the ticks and between
+    them.
+    """
+    rng = np.random.default_rng(seed)
+    period_ns = sets[0].guard().period_ns
+    unit = 0.01 * sets[0].law_params().eps
+    recorder = Recorder(sets, samples=samples)
+    y = np.zeros(len(unit))
+    equal = 0
+    for k in range(ticks):
+        now_ns = EPOCH_NS + k * period_ns
+        recorder.take_y_m(StampedVector(now_ns, np.zeros_like(unit)), now_ns)
+        begins = equal == 0 and rng.random() < 0.01
+        equal = int(rng.integers(1, 13)) if begins else max(equal - 1, 0)
+        for stamp_ns in (now_ns - period_ns // 2, now_ns)[rng.integers(2) :]:
+            y = y if equal else unit * rng.normal(size=len(unit))
+            recorder.take_y(StampedVector(stamp_ns, y), now_ns)
+        recorder.tick(now_ns)
+    return recorder.recording("drawn standstill")
+
+
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
     """Single steps of an engaged controller from drawn states, with the parameters of an index, all
     computed at once.
 
     Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9
-    missed samples.
+    missed samples, where no gap engages the law again.
     """
     rng = np.random.default_rng(seed)
-    period_ns = sets[index].guard().period_ns
+    guard = sets[index].guard()
+    period_ns = guard.period_ns
+    longest_ns = min(guard.longest_ns, feedforward.LONGEST_PART * period_ns)
     factor = 10.0 ** (
         rng.choice([0.0, 0.0, 0.3, 1.0, -1.0], steps) + rng.uniform(-0.05, 0.05, steps)
     )
-    dt_ns = np.round(period_ns * factor).astype(np.int64)
+    dt_ns = np.minimum(np.round(period_ns * factor).astype(np.int64), longest_ns)
     before, y, y_m = _drawn_states(sets[index], rng, dt_ns)
     after = _stepped(sets[index], before, y, y_m, dt_ns)
     zero = np.zeros((steps, 9), dtype=np.int64)
@@ -254,7 +280,7 @@ def _stepped(
     guard = controller.guard()
     law = controller.tuned_law()
     period = seconds(guard.period_ns)
-    dt = np.minimum(np.maximum(dt_ns / NANOSECONDS, DT_RANGE[0] * period), DT_RANGE[1] * period)
+    dt = np.maximum(dt_ns / NANOSECONDS, LEAST_DT * period)
     params = _columns(law.params)
     limits = _columns(guard.limits)
     zero = np.zeros_like(y)
@@ -264,7 +290,7 @@ def _stepped(
         before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before
     )
     missed = np.round(dt / period) - 1.0
-    for k in range(round(DT_RANGE[1])):
+    for k in range(round(missed.max())):
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
     u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff

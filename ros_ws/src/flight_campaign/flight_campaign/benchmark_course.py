@@ -25,7 +25,6 @@ from flight_core.vectors import FloatArray
 from reference_model.reference import Reference
 from rise_di_controller import feedforward
 from rise_di_controller.feedforward import Nominal
-from rise_di_controller.guard import DT_RANGE
 
 HOLD, ENGAGE, STEP = range(3)
 """Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of
@@ -160,7 +159,7 @@ def build_course(scenario: Scenario, *, learns: bool = False) -> Course:
     wind, timed = _forcing(ticks, steps, plant)
     axes, basis, (over_step, now) = _reduced(wind, timed)
     guard = controller.guard()
-    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used])
+    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used], seconds(tick_ns))
     segments = Segments(
         np.arange(ticks) * np.float64(seconds(tick_ns)),
         phase,
@@ -195,7 +194,7 @@ def _phases(
             gap = (k - last + late) * period
             require(gap <= max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
             phase[k] = STEP
-            dt[k] = min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
+            dt[k] = (k - last) * period
         last = k
     return phase, dt
 
@@ -226,7 +225,11 @@ def _require_plain_vanes(scenario: Scenario, late: int) -> None:
 
 
 def _feedforward(
-    nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArray, y_m: FloatArray
+    nominal: Nominal | None,
+    phase: NDArray[np.int32],
+    dt: FloatArray,
+    y_m: FloatArray,
+    period: float,
 ) -> tuple[FloatArray, FloatArray]:
     """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a
     model.
@@ -240,7 +243,8 @@ def _feedforward(
         if action == ENGAGE:
             state = feedforward.initial_state(y_m[k], nominal)
         elif action == STEP:
-            state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal)
+            parts = feedforward.parts_of(round(dt[k] / period), 1)
+            state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal, parts)
         elif k:
             u_ff[k] = u_ff[k - 1]
         x_m[k] = state.x

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from c_export.autopilots import SAMPLES, SHELLS, write_module
 from c_export.constants import exportable
-from c_export.drawn import drawn_calls, drawn_commands, drawn_steps
+from c_export.drawn import drawn_calls, drawn_commands, drawn_standstill, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import Units, build_fmu, si_units
 from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
@@ -208,6 +208,7 @@ def _recordings(
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)
     if drawn:
         yield drawn_calls(sets, max(drawn // 10, 100), seed, samples)
+        yield drawn_standstill(sets, max(drawn // 20, 100), seed, samples)
         each = -(-drawn // len(sets))
         for index in range(len(sets)):
             for begin in range(0, each, PART):

@@ -258,8 +258,9 @@ class Controller:
     def take_y(self, sample: StampedVector, now_ns: int) -> str:
         """Buffer a sample of y, in the law's order.
 
-        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. A sample
-        whose jump is confirmed engages the law again.
+        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. One that
+        is lost for how y changes does not come again. A sample whose jump is confirmed engages the
+        law again.
 
         Args:
             sample: The sample, shape (m,), with vanes longer, SI, deviations from trim.
@@ -270,17 +271,19 @@ class Controller:
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than the stamp of the sample taken before.
+                Reason "order": the stamp is not later than that of the last sample, lost ones too.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
-        if lost := self._lost(self._y, outputs, now_ns):
+        if lost := self._lost(self._samples and self._samples.far, outputs, now_ns):
             return lost
         if self._samples is None:
             self._samples = samples.begun(outputs)
         else:
             last = self._samples.last
             self._samples, change = samples.step(self._samples, outputs, self._guard.samples)
+            if change is samples.Change.FROZEN:
+                return samples.standstill(self._samples, outputs)
             if change is not samples.Change.NEAR:
                 jump = samples.jump(last, outputs, self._parameters.outputs)
                 if change is samples.Change.FAR:
@@ -304,18 +307,18 @@ class Controller:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
                 Reason "order": the stamp is not later than the stamp of the sample taken before.
         """
-        if lost := self._lost(self._y_m, sample, now_ns):
+        if lost := self._lost(self._y_m[-1] if self._y_m else None, sample, now_ns):
             return lost
         self._y_m.append(sample)
         return ""
 
-    def _lost(self, earlier: deque[StampedVector], sample: StampedVector, now_ns: int) -> str:
+    def _lost(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> str:
         """Why a sample of m values is beyond the bounds; empty for one inside. Raises
         ChannelError.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
-        if earlier:
-            require_newer(sample.stamp_ns, earlier[-1].stamp_ns)
+        if last is not None:
+            require_newer(sample.stamp_ns, last.stamp_ns)
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def restarted(self) -> str:
@@ -338,6 +341,7 @@ class Controller:
             u and the internals, SI; None where nothing is to be published.
         """
         y = self._newest_paired_y()
+        last = self._state.y
         was_engaged = self._state.mode is Mode.ENGAGED
         self._state, inputs = guard.tick(
             self._state, now_ns, y, list(self._y_m), self._guard, self._law, active
@@ -346,7 +350,12 @@ class Controller:
             return None
         # a step has another dt
         if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
-            self._restarted = "u or the state of the law was not finite"
+            gap_ns = 0 if last is None else inputs.stamp_ns - last.stamp_ns
+            self._restarted = (
+                f"a gap of y of {seconds(gap_ns):g} s, longer than max_age"
+                if gap_ns > self._guard.longest_ns
+                else "u or the state of the law was not finite"
+            )
         effects = self._tested(inputs)
         self._measure_vanes(inputs)
         self._number += self.has_internals

@@ -22,6 +22,10 @@ from flight_core.vectors import Array, array_namespace
 ZERO_REAL_PART = 1e-6
 
 
+LONGEST_PART = 10
+"""periods, of a Runge-Kutta step of the nominal model; a tick after lost samples has several."""
+
+
 class Nominal(NamedTuple):
     """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI
     and radians.
@@ -125,8 +129,15 @@ def sines(x: Array, nominal: Nominal) -> Array:
     return values
 
 
+def parts_of(span_ns: int, period_ns: int) -> int:
+    """Number of Runge-Kutta steps over the time between two ticks, each of at most LONGEST_PART
+    periods.
+    """
+    return max(-(-span_ns // (LONGEST_PART * period_ns)), 1)
+
+
 def step(
-    state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal
+    state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal, parts: int = 1
 ) -> tuple[FeedforwardState, Array]:
     """A tick: (state, y_m, dt) -> (state, u_ff - u_0), a term added to u of the law.
 
@@ -134,7 +145,7 @@ def step(
     states (the zero dynamics) are integrated with the required input:
 
         y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m a tick ago
-        x       = Runge-Kutta step of x_dot from x_p       C x = y_m
+        x       = Runge-Kutta steps of x_dot from x_p      C x = y_m, `parts` equal ones
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
@@ -148,7 +159,10 @@ def step(
     """
     xp = array_namespace(y_m)
     y_m_dot = (y_m - product(nominal.C, state.x)) / dt
-    x = rk4(x_dot, 0.0, state.x, product(nominal.B, product(nominal.inverse, y_m_dot)), nominal, dt)
+    forced = product(nominal.B, product(nominal.inverse, y_m_dot))
+    x = state.x
+    for _ in range(parts):
+        x = rk4(x_dot, 0.0, x, forced, nominal, dt / parts)
     u = ideal((x + state.x) / 2.0, y_m_dot, nominal)
     u_ff = u + (dt + 2.0 * nominal.lead) * (u - state.u) / (dt + state.dt)
     u_0 = xp.where(state.ticks < 2.0, u_ff, state.u_0)

@@ -66,12 +66,19 @@ class GuardParams(NamedTuple):
     over_speed: OverSpeed | None = None
     probe: Probe | None = None  # added to u_trim; None: no probe
 
+    @property
+    def longest_ns(self) -> int:
+        """Longest time between two y of a step of the law; after more the law engages again.
 
-# The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full:
-# with half of the ticks lost, an upper end of 3 increases the error by 15 % in q and 22 % in r. The
-# lower end keeps a burst of samples from exciting the sign term. A gap beyond the age limit leads
-# to re-engagement.
-DT_RANGE = (0.2, 10.0)
+        The last tick with a y within the age limit may be a period before the tick of the next y.
+        A step integrates the whole time: with half of the ticks lost, an upper limit of 3 periods
+        increases the error by 15 % in q and 22 % in r.
+        """
+        return self.max_age_ns + self.period_ns
+
+
+# periods. Least dt of a step: it keeps a burst of samples from exciting the sign term.
+LEAST_DT = 0.2
 
 
 class Vanes(NamedTuple):
@@ -204,12 +211,13 @@ def tick(
     """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
     Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step
-    of the law with the measured dt, clipped to DT_RANGE periods. `ControlLaw.missed` predicts over
-    every whole period without a y before the step. The law adds to u_trim, or to u_trim + u_ff with
-    a feedforward. Without a new y nothing changes. Stale inputs start the failsafe: HOLD (nothing
-    is integrated), then RAMP to trim, then TRIM. Where `active` is false the mode is INACTIVE, and
-    u is held or ramps to trim; with fresh inputs u is published at trim before the first engagement
-    too. Returns None for the inputs where nothing is to be published.
+    of the law with the measured dt, at least LEAST_DT periods; after more than `longest_ns` the law
+    engages again. `ControlLaw.missed` predicts over every whole period without a y before the step.
+    The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
+    Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM.
+    Where `active` is false the mode is INACTIVE, and u is held or ramps to trim; with fresh inputs
+    u is published at trim before the first engagement too. Returns None for the inputs where
+    nothing is to be published.
 
     Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's
     order; readings of vanes follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace
@@ -249,23 +257,24 @@ def _with_sample(
     last = state.y
     if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
-    if y.stamp_ns <= last.stamp_ns:
+    span_ns = y.stamp_ns - last.stamp_ns
+    if span_ns <= 0:
         return state, None
+    if span_ns > guard.longest_ns:
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
     period = seconds(guard.period_ns)
-    shortest, longest = (factor * period for factor in DT_RANGE)
-    dt = min(max(seconds(y.stamp_ns - last.stamp_ns), shortest), longest)
-    law_state = state.law
+    dt = max(seconds(span_ns), LEAST_DT * period)
     u_trim = _probed_trim(state, y.stamp_ns, guard)
     u_ff = state.u_ff
     ff_state = state.feedforward
     missed = max(round(dt / period) - 1, 0)
-    if missed:
-        held = Measurements(last.value, state.y_m, np.zeros_like(u_ff), u_trim + u_ff, state.u)
-        for _ in range(missed):
-            law_state = law.control_law.missed(law_state, held, law.params)
+    zero = np.zeros_like(u_ff)
+    held = Measurements(last.value, state.y_m, zero, u_trim + u_ff, state.u)
+    law_state = _predicted(state.law, held, missed, law)
     model = _nominal(guard, law_state)
     if model is not None and ff_state is not None:
-        ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model)
+        parts = feedforward.parts_of(span_ns, guard.period_ns)
+        ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model, parts)
         u_trim = u_trim + u_ff
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
@@ -294,6 +303,13 @@ def _with_sample(
     if guard.history:
         stepped = _with_history(state, stepped, inputs, missed, guard)
     return stepped, inputs
+
+
+def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
+    """The state of the law over periods without a y, u held."""
+    for _ in range(missed):
+        law_state = law.control_law.missed(law_state, held, law.params)
+    return law_state
 
 
 def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> FloatArray:

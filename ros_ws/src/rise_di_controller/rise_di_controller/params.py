@@ -33,8 +33,13 @@ from flight_core.rates import divide, nanoseconds, period_ns
 from flight_core.vectors import FloatArray, selection_matrix
 from rise_di_controller import internals, samples
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
-from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, zero_dynamics
-from rise_di_controller.guard import DT_RANGE, GuardParams
+from rise_di_controller.feedforward import (
+    LONGEST_PART,
+    ZERO_REAL_PART,
+    Nominal,
+    zero_dynamics,
+)
+from rise_di_controller.guard import GuardParams
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
 from rise_di_controller.model_sections import AllocationConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.observer import ObserverParams, filter_matrix, with_observer, without_frozen
@@ -245,7 +250,7 @@ class ControllerConfig(NodeConfig):
             f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s",
             "none in the right half plane: u_ff would grow without bound",
         )
-        limit = MAX_STABLE_STEP / DT_RANGE[1] * self.rate
+        limit = MAX_STABLE_STEP / LONGEST_PART * self.rate
         require(
             fastest <= limit,
             "feedforward.A",

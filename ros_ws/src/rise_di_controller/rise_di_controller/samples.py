@@ -7,6 +7,7 @@ arrive.
 - `step`: y changes faster than an aircraft can. The test compares y with the y before and has no
   model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
   controller takes the third in a row that agrees.
+- `step`: y stands still, every value to the bit, though it has changed with every sample before.
 """
 
 from collections.abc import Sequence
@@ -36,6 +37,18 @@ LEAST = {"V": 1.0}
 LEAST_RATE = 0.1
 AGREEING = 3  # samples in a row after a jump that agree
 
+STILL = 5
+"""Samples in a row, over as many periods, with every value as before, after which y is frozen."""
+
+MOVING = 100
+"""Samples in a row with a change, which show that this y never stands still by itself.
+
+Noise changes every sample. A sensor with steps, where at rest a share c of the samples changes,
+shows c^100 by chance and (1 - c)^5 then: at most 1e-9, at c = 0.95. A y that a bridge repeats, and
+the y of a simulation without noise in trim, do not show that, and are never frozen. A simulation
+that settles comes to rest by ever rarer changes of the last bit.
+"""
+
 
 class SampleLimits(NamedTuple):
     """Bounds of the m outputs of y and of y_m."""
@@ -51,6 +64,16 @@ class Change(IntEnum):
     NEAR = 0  # taken
     FAR = 1  # lost
     JUMPED = 2  # taken: y has jumped, and the law engages again
+    FROZEN = 3  # lost: y stands still
+
+
+class Stillness(NamedTuple):
+    """How y changes from sample to sample."""
+
+    since_ns: int  # stamp of the first sample with the present values
+    changes: int = 0  # samples in a row with a change, at most MOVING
+    equal: int = 0  # samples in a row since, with every value as before, at most STILL
+    is_frozen: bool = False
 
 
 class SampleState(NamedTuple):
@@ -59,8 +82,11 @@ class SampleState(NamedTuple):
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
     change: FloatArray  # (m,) largest change in a period of the samples taken, fading, units of y
-    far: StampedVector  # the last sample; another one than `last` where that one is lost
+    # the last sample that was compared; another one than `last` where that one is lost. Its stamp
+    # does not come again: a wrong sample that is sent three times is not three that agree
+    far: StampedVector
     agreeing: int  # samples in a row up to `far` that are lost, and agree with the one before
+    stillness: Stillness
 
 
 def bounds(
@@ -96,9 +122,16 @@ def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> 
     return f"a jump of y in {seconds(sample.stamp_ns - before.stamp_ns):g} s: {moves}"
 
 
+def standstill(state: SampleState, sample: StampedVector) -> str:
+    """That y stands still, as a sentence."""
+    span = seconds(sample.stamp_ns - state.stillness.since_ns)
+    return f"y: found every value as before for {span:g} s, expected an aircraft that moves"
+
+
 def begun(sample: StampedVector) -> SampleState:
     """The state after the first sample."""
-    return SampleState(sample.stamp_ns, sample, np.zeros_like(sample.value), sample, 0)
+    stillness = Stillness(sample.stamp_ns)
+    return SampleState(sample.stamp_ns, sample, np.zeros_like(sample.value), sample, 0, stillness)
 
 
 def step(
@@ -112,20 +145,45 @@ def step(
 
     The possible change grows with the time since the last sample taken: no sensor is locked out for
     ever. After lost samples, largest takes the whole change, since y may be as noisy.
+
+    The samples of the first FIRST_NS are NEAR, too. They may be those of a gyro that starts, so
+    largest takes no change that is far, and of the others at most reach.
+
+    FROZEN where every value is as before, for STILL samples and periods, after MOVING samples with
+    a change.
     """
+    stillness = _after(state.stillness, sample, state.last, limits)
+    state = state._replace(stillness=stillness)
+    if stillness.is_frozen:
+        return state._replace(far=sample, agreeing=0), Change.FROZEN
     near, change = _compared(state.last, sample, state.change, limits)
-    if near or sample.stamp_ns - state.begin_ns < FIRST_NS:
-        if state.agreeing:
+    is_first = sample.stamp_ns - state.begin_ns < FIRST_NS
+    if near or is_first:
+        if is_first:
+            change = np.minimum(change, limits.reach) if near else np.zeros_like(change)
+        elif state.agreeing:
             change = np.abs(sample.value - state.last.value)
         fading = 1.0 - min(seconds(sample.stamp_ns - state.last.stamp_ns) / MEMORY, 1.0)
-        return SampleState(
-            state.begin_ns, sample, np.maximum(change, fading * state.change), sample, 0
-        ), Change.NEAR
+        largest = np.maximum(change, fading * state.change)
+        return state._replace(last=sample, change=largest, far=sample, agreeing=0), Change.NEAR
     agrees = state.agreeing > 0 and _compared(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
         return state._replace(far=sample, agreeing=agreeing), Change.FAR
     return state._replace(last=sample, far=sample, agreeing=0), Change.JUMPED
+
+
+def _after(
+    before: Stillness, sample: StampedVector, last: StampedVector, limits: SampleLimits
+) -> Stillness:
+    """How y changes after a sample, beside the last sample taken."""
+    if not np.array_equal(sample.value, last.value):
+        is_moving = before.is_frozen or before.equal == 0
+        changes = min(before.changes + 1, MOVING) if is_moving else 1
+        return Stillness(sample.stamp_ns, changes)
+    equal = min(before.equal + 1, STILL)
+    lasts = equal == STILL and sample.stamp_ns - before.since_ns >= STILL * limits.period_ns
+    return before._replace(equal=equal, is_frozen=lasts and before.changes == MOVING)
 
 
 def _compared(

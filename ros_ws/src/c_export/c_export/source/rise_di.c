@@ -396,17 +396,32 @@ static void engage_feedforward(const rise_di_parameters *p, rise_di_feedforward 
     state->ticks = ZERO;
 }
 
-/* A Runge-Kutta step of the nominal model along y_m, and u_ff extrapolated to the instant of action. */
-static void step_feedforward(const rise_di_parameters *p, rise_di_feedforward *state, const rise_di_real *y_m, rise_di_real dt,
-                             rise_di_real *u_ff) {
-    rise_di_real output[RISE_DI_M];
-    rise_di_real y_m_dot[RISE_DI_M];
-    rise_di_real input[RISE_DI_M];
-    rise_di_real forced[RISE_DI_N];
+/* A Runge-Kutta step of the nominal model under the ideal input. */
+static void advance(const rise_di_parameters *p, const rise_di_real *forced, rise_di_real dt, rise_di_real *x) {
     rise_di_real k1[RISE_DI_N];
     rise_di_real k2[RISE_DI_N];
     rise_di_real k3[RISE_DI_N];
     rise_di_real k4[RISE_DI_N];
+    slope(p, x, forced, k1);
+    stage(p, x, dt / TWO, k1, forced, k2);
+    stage(p, x, dt / TWO, k2, forced, k3);
+    stage(p, x, dt, k3, forced, k4);
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        x[i] = x[i] + ((dt / SIX) * (((k1[i] + (TWO * k2[i])) + (TWO * k3[i])) + k4[i]));
+    }
+}
+
+/* Runge-Kutta steps of the nominal model along y_m, and u_ff extrapolated to the instant of action. */
+static void step_feedforward(const rise_di_parameters *p, rise_di_feedforward *state, const rise_di_real *y_m, rise_di_real dt,
+                             uint64_t span_ns, rise_di_real *u_ff) {
+    const uint64_t longest_ns = (uint64_t)RISE_DI_LONGEST_PART * (uint64_t)p->period_ns;
+    const uint64_t rest = ((span_ns % longest_ns) > 0U) ? (uint64_t)1 : (uint64_t)0;
+    const uint64_t parts = (span_ns / longest_ns) + rest; /* at least 1: a span is above 0 */
+    rise_di_real output[RISE_DI_M];
+    rise_di_real y_m_dot[RISE_DI_M];
+    rise_di_real input[RISE_DI_M];
+    rise_di_real forced[RISE_DI_N];
+    rise_di_real begin[RISE_DI_N];
     rise_di_real middle[RISE_DI_N];
     product(p->C, RISE_DI_M, RISE_DI_N, state->x, output);
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -414,14 +429,12 @@ static void step_feedforward(const rise_di_parameters *p, rise_di_feedforward *s
     }
     product(p->inverse, RISE_DI_M, RISE_DI_M, y_m_dot, input);
     product(p->B, RISE_DI_N, RISE_DI_M, input, forced);
-    slope(p, state->x, forced, k1);
-    stage(p, state->x, dt / TWO, k1, forced, k2);
-    stage(p, state->x, dt / TWO, k2, forced, k3);
-    stage(p, state->x, dt, k3, forced, k4);
+    copy(state->x, begin, RISE_DI_N);
+    for (uint64_t k = 0; k < parts; k++) {
+        advance(p, forced, dt / (rise_di_real)parts, state->x);
+    }
     for (int32_t i = 0; i < RISE_DI_N; i++) {
-        const rise_di_real x = state->x[i] + ((dt / SIX) * (((k1[i] + (TWO * k2[i])) + (TWO * k3[i])) + k4[i]));
-        middle[i] = (x + state->x[i]) / TWO;
-        state->x[i] = x;
+        middle[i] = (state->x[i] + begin[i]) / TWO;
     }
     drift(p, p->A, p->gravity, middle, forced);
     product(p->C, RISE_DI_M, RISE_DI_N, forced, output);
@@ -651,6 +664,7 @@ static const rise_di_sample *sample_at(const rise_di_samples *samples, int32_t b
 void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_real value[RISE_DI_M]) {
     samples->newest = (samples->count == 0) ? 0 : ((samples->newest + 1) % RISE_DI_SAMPLES);
     samples->sample[samples->newest].stamp_ns = stamp_ns;
+    samples->seen_ns = stamp_ns;
     copy(value, samples->sample[samples->newest].value, RISE_DI_M);
     if (samples->count < RISE_DI_SAMPLES) {
         samples->count = samples->count + 1;
@@ -787,8 +801,8 @@ static void engage(rise_di_controller *c, const rise_di_sample *y, const rise_di
 /* A step of the law with a new y. Returns dt; 0 where u or a state would not be finite, and the law has to engage again. */
 static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const rise_di_real *y_m) {
     const rise_di_parameters *p = c->parameters;
-    const rise_di_real measured = seconds(elapsed_ns(y->stamp_ns, c->y_stamp_ns));
-    const rise_di_real dt = clipped(measured, p->dt_least, p->dt_largest);
+    const uint64_t span_ns = elapsed_ns(y->stamp_ns, c->y_stamp_ns);
+    const rise_di_real dt = clipped(seconds(span_ns), p->dt_least, p->dt_largest);
     rise_di_law after;
     rise_di_real u_trim[RISE_DI_M];
     rise_di_real u_free[RISE_DI_M];
@@ -817,7 +831,7 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     const rise_di_law *before = &c->law;
 #endif
 #if RISE_DI_N > 0
-    step_feedforward(p, &c->feedforward, y_m, dt, c->u_ff);
+    step_feedforward(p, &c->feedforward, y_m, dt, span_ns, c->u_ff);
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         u_trim[i] = c->u_trim[i] + c->u_ff[i];
     }
@@ -875,6 +889,12 @@ static bool are_numbers(const rise_di_real *y, const rise_di_real *y_m) {
     return is_finite(sum, RISE_DI_M);
 }
 
+/* Whether the last y of the law is longer ago than a step may take: the last tick with a fresh y, and a period. */
+static bool has_gap(const rise_di_controller *c, int64_t stamp_ns) {
+    const uint64_t longest_ns = (uint64_t)c->parameters->max_age_ns + (uint64_t)c->parameters->period_ns;
+    return elapsed_ns(stamp_ns, c->y_stamp_ns) > longest_ns;
+}
+
 static bool any(const rise_di_real *values) {
     bool result = false;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -904,7 +924,7 @@ bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const ri
     } else if ((!active) || (!fresh)) {
         published = failsafe(c, now_ns, active, output);
     } else {
-        if ((!c->has_law) || (c->mode != RISE_DI_ENGAGED)) {
+        if ((!c->has_law) || (c->mode != RISE_DI_ENGAGED) || has_gap(c, y->stamp_ns)) {
             engage(c, y, reference);
         } else if (y->stamp_ns <= c->y_stamp_ns) {
             published = false;
@@ -1020,7 +1040,7 @@ static rise_di_status checked(const rise_di_controller *c, const rise_di_samples
         status = RISE_DI_NOT_STARTED;
     } else if (elapsed_ns(stamp_ns, now_ns) > (uint64_t)c->parameters->max_age_ns) {
         status = RISE_DI_FUTURE;
-    } else if ((samples->count > 0) && (stamp_ns <= sample_at(samples, 0)->stamp_ns)) {
+    } else if ((samples->count > 0) && (stamp_ns <= samples->seen_ns)) {
         status = RISE_DI_ORDER;
     } else if (!is_finite(value, RISE_DI_M)) {
         status = RISE_DI_NOT_FINITE;
@@ -1048,17 +1068,60 @@ static bool is_near(const rise_di_controller *c, const rise_di_sample *before, i
     return near;
 }
 
+/* Begin to look for a y that stands still, with `changes` y in a row with a change. */
+static void begin_stillness(rise_di_controller *c, int64_t stamp_ns, int32_t changes) {
+    c->since_ns = stamp_ns;
+    c->changes = changes;
+    c->equal = 0;
+    c->is_frozen = false;
+}
+
+/* Whether y stands still: every value as before, though it has changed with every sample before. */
+static bool stands_still(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value) {
+    const rise_di_sample *last = sample_at(&c->y_samples, 0);
+    bool same = true;
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        same = same && is_equal(value[i], last->value[i]);
+    }
+    if (!same) {
+        const int32_t more = (c->changes < RISE_DI_MOVING) ? (c->changes + 1) : RISE_DI_MOVING;
+        begin_stillness(c, stamp_ns, (c->is_frozen || (c->equal == 0)) ? more : 1);
+    } else {
+        const uint64_t longest_ns = (uint64_t)RISE_DI_STILL * (uint64_t)c->parameters->period_ns;
+        c->equal = (c->equal < RISE_DI_STILL) ? (c->equal + 1) : RISE_DI_STILL;
+        c->is_frozen = (c->equal == RISE_DI_STILL) && (elapsed_ns(stamp_ns, c->since_ns) >= longest_ns) &&
+                       (c->changes == RISE_DI_MOVING);
+    }
+    return c->is_frozen;
+}
+
+/* Note the largest change of y, with that of a sample taken. In the first second no change that is far, and of the others at most
+ * the reach: a gyro may start with garbage. */
+static void note_change(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value, const rise_di_real *change, bool near,
+                        bool first) {
+    const rise_di_sample *last = sample_at(&c->y_samples, 0);
+    const rise_di_real faded = ONE - lesser(seconds(elapsed_ns(stamp_ns, last->stamp_ns)) / RISE_DI_MEMORY, ONE);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        rise_di_real seen = change[i];
+        if (first) {
+            seen = near ? lesser(change[i], c->parameters->y_reach[i]) : ZERO;
+        } else if (c->agreeing > 0) {
+            seen = magnitude(value[i] - last->value[i]);
+        } else {
+            /* the change in a period */
+        }
+        c->change[i] = greater(seen, faded * c->change[i]);
+    }
+}
+
 /* Whether y has come here as an aircraft moves, or has jumped and stays: three far samples in a row agree. */
 static rise_di_status compared(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value) {
-    const rise_di_sample *last = sample_at(&c->y_samples, 0);
+    const bool first = elapsed_ns(stamp_ns, c->begin_ns) < (uint64_t)RISE_DI_FIRST_NS;
     rise_di_status status = RISE_DI_TAKEN;
     rise_di_real change[RISE_DI_M];
-    if (is_near(c, last, stamp_ns, value, change) || (elapsed_ns(stamp_ns, c->begin_ns) < (uint64_t)RISE_DI_FIRST_NS)) {
-        const rise_di_real faded = ONE - lesser(seconds(elapsed_ns(stamp_ns, last->stamp_ns)) / RISE_DI_MEMORY, ONE);
-        for (int32_t i = 0; i < RISE_DI_M; i++) {
-            const rise_di_real seen = (c->agreeing > 0) ? magnitude(value[i] - last->value[i]) : change[i];
-            c->change[i] = greater(seen, faded * c->change[i]);
-        }
+    const bool near = is_near(c, sample_at(&c->y_samples, 0), stamp_ns, value, change);
+    if (near || first) {
+        note_change(c, stamp_ns, value, change, near, first);
         c->agreeing = 0;
     } else {
         const bool agrees = (c->agreeing > 0) && is_near(c, &c->far, stamp_ns, value, change);
@@ -1078,10 +1141,17 @@ static rise_di_status compared(rise_di_controller *c, int64_t stamp_ns, const ri
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
     rise_di_status status = checked(controller, &controller->y_samples, stamp_ns, now_ns, value);
     if ((status == RISE_DI_TAKEN) && (controller->y_samples.count > 0)) {
-        status = compared(controller, stamp_ns, value);
+        controller->y_samples.seen_ns = stamp_ns; /* a lost sample does not come again */
+        if (stands_still(controller, stamp_ns, value)) {
+            controller->agreeing = 0;
+            status = RISE_DI_IMPLAUSIBLE;
+        } else {
+            status = compared(controller, stamp_ns, value);
+        }
     } else if (status == RISE_DI_TAKEN) {
         controller->begin_ns = stamp_ns;
         controller->agreeing = 0;
+        begin_stillness(controller, stamp_ns, 0);
         fill(controller->change, RISE_DI_M, ZERO);
     } else {
         /* refused */

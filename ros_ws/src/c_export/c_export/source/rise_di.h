@@ -89,7 +89,7 @@ typedef struct {
 #endif
     rise_di_real period;      /* s */
     rise_di_real dt_least;    /* s, lower limit of dt */
-    rise_di_real dt_largest;  /* s, upper limit of dt */
+    rise_di_real dt_largest;  /* s, max_age_ns and period_ns: upper limit of dt */
     rise_di_real K[RISE_DI_M];           /* diagonal of K (22), 1/s */
     rise_di_real Lambda[RISE_DI_M];      /* diagonal of Lambda (4), 1/s */
     rise_di_real beta[RISE_DI_M];        /* diagonal of beta (21), units of y / s^2 */
@@ -170,8 +170,9 @@ typedef struct {
 /* The last samples with increasing stamps, a ring. */
 typedef struct {
     rise_di_sample sample[RISE_DI_SAMPLES];
-    int32_t newest; /* index of the newest sample */
-    int32_t count;  /* number of samples, at most RISE_DI_SAMPLES */
+    int32_t newest;  /* index of the newest sample */
+    int32_t count;   /* number of samples, at most RISE_DI_SAMPLES */
+    int64_t seen_ns; /* stamp of the newest sample, or of a later one that was lost for how y changes */
 } rise_di_samples;
 
 /* A controller. Read by the caller: mode, rise_di_command. u may be set by the caller before engagement: the law begins there. */
@@ -204,6 +205,10 @@ typedef struct {
     rise_di_real change[RISE_DI_M]; /* largest change of y in a period, fading, units of y */
     rise_di_sample far;             /* the last y that was lost after a jump */
     int32_t agreeing;               /* number of such y in a row that agree */
+    int64_t since_ns;               /* stamp of the first y with the present values */
+    int32_t changes;                /* number of y in a row with a change, at most RISE_DI_MOVING */
+    int32_t equal;                  /* number of y in a row since, as before in every value, at most RISE_DI_STILL */
+    bool is_frozen;                 /* whether y stands still */
 } rise_di_controller;
 
 /* Inputs of a tick, for a log, and the stamp of u. */
@@ -220,7 +225,7 @@ typedef struct {
  * one in memory of zeros that was never started. */
 bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters);
 
-/* Take a sample of y or of y_m. A refused sample changes nothing. */
+/* Take a sample of y or of y_m. A refused sample changes nothing, but for the tests of how y changes. */
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 

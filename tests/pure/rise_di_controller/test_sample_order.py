@@ -1,0 +1,334 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Samples that come again, a first second of garbage, gaps, and a y that stands still."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pytest import approx
+
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_core.modes import Mode
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from rise_di_controller.controller import Controller
+from rise_di_controller.feedforward import parts_of
+from rise_di_controller.laws import AnyLaw
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.samples import MOVING, STILL
+
+MS = 1_000_000  # ns
+PERIOD_NS = 10 * MS
+SERVO = find_scenario("osprey_servo").controller
+NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # rad/s and m/s, of osprey_servo
+ZERO = np.zeros(4)
+
+
+def noise(seed: int = 5) -> Iterator[FloatArray]:
+    rng = np.random.default_rng(seed)
+    while True:
+        yield NOISE * rng.normal(size=4)
+
+
+def take(controller: Controller, value: FloatArray, stamp_ns: int, now_ns: int) -> str:
+    """Why a sample is not taken, as the node counts it; empty for a sample taken."""
+    try:
+        return controller.take_y(StampedVector(stamp_ns, value), now_ns)
+    except ChannelError as error:
+        return error.reason
+
+
+def step(controller: Controller, value: FloatArray | None, k: int) -> str:
+    """A tick with a y, or with none, and y_m of 0; why y is not taken."""
+    now_ns = k * PERIOD_NS
+    lost = "" if value is None else take(controller, value, now_ns, now_ns)
+    controller.take_y_m(StampedVector(now_ns, ZERO), now_ns)
+    controller.tick(now_ns)
+    return lost
+
+
+# A sample that comes again
+
+
+@pytest.mark.parametrize("behind_ns", [0, 1, 5 * MS], ids=["again", "1 ns older", "older"])
+def test_one_wrong_sample_sent_again_is_never_three_that_agree(behind_ns: int) -> None:
+    """A lost sample has a stamp, too: neither itself nor an older one comes after it."""
+    controller = Controller(SERVO)
+    calm = noise()
+    for k in range(1, 200):
+        assert step(controller, next(calm), k) == ""
+    now_ns = 200 * PERIOD_NS
+    wrong = np.array([3.0, 0.0, 0.0, 0.0])
+    assert "a jump of y" in take(controller, wrong, now_ns, now_ns)
+    assert [take(controller, wrong, now_ns - behind_ns, now_ns) for _ in range(5)] == ["order"] * 5
+    controller.take_y_m(StampedVector(now_ns, ZERO), now_ns)
+    controller.tick(now_ns)
+    assert controller.restarted() == ""
+    for k in range(201, 220):
+        assert step(controller, next(calm), k) == ""
+
+
+def test_frozen_sample_does_not_come_again_either() -> None:
+    controller = Controller(SERVO)
+    last = moving(controller, 150)
+    assert any(still(controller, 10, 151, last))
+    stamp_ns = 160 * PERIOD_NS
+    assert [take(controller, ZERO, stamp_ns - 1, stamp_ns)] == ["order"]
+    assert take(controller, ZERO, stamp_ns + 1, stamp_ns) == ""
+
+
+def test_sample_beyond_its_bound_does_not_take_the_place_of_another() -> None:
+    """No aircraft gives such a value, so the stamp beside it is none of an aircraft."""
+    controller = Controller(SERVO)
+    assert "is beyond" in take(controller, np.full(4, np.nan), PERIOD_NS, PERIOD_NS)
+    assert take(controller, ZERO, PERIOD_NS, PERIOD_NS) == ""
+    sample = StampedVector(PERIOD_NS, np.full(4, 1e9))
+    assert "is beyond" in controller.take_y_m(sample, PERIOD_NS)
+    assert controller.take_y_m(StampedVector(PERIOD_NS, ZERO), PERIOD_NS) == ""
+
+
+def test_sample_from_the_future_does_not_keep_later_ones_out() -> None:
+    controller = Controller(SERVO)
+    assert take(controller, ZERO, 10**12, PERIOD_NS) == "future"
+    assert take(controller, ZERO, PERIOD_NS, PERIOD_NS) == ""
+
+
+# The first second
+
+
+def garbage(kind: str, k: int, rng: np.random.Generator) -> FloatArray:
+    """What a gyro that starts adds to q at the sample k."""
+    size = {"one": 20.0 * (k == 60), "all": rng.uniform(-20.0, 20.0), "ramp": 0.3 * k}[kind]
+    added: FloatArray = size * np.eye(4)[0] * (k < 100)
+    return added
+
+
+@pytest.mark.parametrize("kind", ["one", "all", "ramp"])
+@pytest.mark.parametrize("at", [2.0, 5.0, 60.0])
+def test_garbage_in_the_first_second_does_not_open_the_test(kind: str, at: float) -> None:
+    """A glitch of 3 rad/s, five times what full inputs change q by, is lost as without garbage."""
+    controller = Controller(SERVO)
+    calm = noise()
+    rng = np.random.default_rng(1)
+    for k in range(1, round(100 * at)):
+        step(controller, next(calm) + garbage(kind, k, rng), k)
+    before = controller.state.u
+    glitch = next(calm) + 3.0 * np.eye(4)[0]
+    assert "a jump of y" in step(controller, glitch, round(100 * at))
+    assert (controller.state.u == before).all()
+
+
+def test_noise_of_the_first_second_is_learned() -> None:
+    """Vibration of five times the noise: no sample is lost, in the first second and after it."""
+    controller = Controller(SERVO)
+    loud = noise()
+    assert [*filter(None, (step(controller, 5.0 * next(loud), k) for k in range(1, 1000)))] == []
+
+
+# Gaps
+
+
+def at_rate(rate: float) -> ControllerConfig:
+    """The controller of osprey_turbulence with its feedforward, without an observer."""
+    section = find_scenario("osprey_turbulence").controller.model_dump()
+    left_out = ("observer", "schedule", "learn")
+    kept = {name: value for name, value in section.items() if name not in left_out}
+    return AnyLaw.validate_mapping(kept | {"rate": rate, "max_age": 0.1}, "controller")
+
+
+GAP = 0.09  # s
+
+
+def after_gap(parameters: ControllerConfig, *, has_gap: bool) -> tuple[FloatArray, float]:
+    """The u and the dt of the tick after a gap, in a pitch that swings; y is y_m throughout."""
+    controller = Controller(parameters)
+    rate = parameters.rate
+    end = round((1.5 + GAP) * rate)
+    begin = round(1.5 * rate) if has_gap else end
+    for k in range(1, end + 1):
+        now_ns = 10**9 + k * controller.period_ns
+        y_m = 0.3 * np.sin(2.0 * np.pi * 0.5 * k / rate) * np.eye(4)[parameters.outputs.index("q")]
+        controller.take_y_m(StampedVector(now_ns, y_m), now_ns)
+        if not begin <= k < end:
+            controller.take_y(StampedVector(now_ns, y_m), now_ns)
+        output = controller.tick(now_ns)
+    assert output is not None
+    return controller.state.u, output.inputs.dt
+
+
+@pytest.mark.parametrize("rate", [200.0, 500.0, 1000.0])
+def test_gap_within_the_age_limit_counts_in_full_at_any_rate(rate: float) -> None:
+    """A gap of 90 ms: the input of the feedforward is as without, and as far off as at 100 Hz.
+
+    y_m is linear over the gap: 1 % of u.
+    """
+    ratios = []
+    for parameters in (at_rate(100.0), at_rate(rate)):
+        elevator = parameters.inputs.index("elevator")
+        u, dt = after_gap(parameters, has_gap=True)
+        assert dt == approx(GAP + 1.0 / parameters.rate)
+        whole, _ = after_gap(parameters, has_gap=False)
+        ratios.append(u[elevator] / whole[elevator])
+    assert ratios == approx([1.0, 1.0], abs=0.02)
+    assert ratios[0] == approx(ratios[1], abs=0.005)
+
+
+def test_steps_of_the_model_are_at_most_ten_periods_long() -> None:
+    """So that a gap of 100 periods of a fast model is as stable as one of ten."""
+    period_ns = MS
+    assert [parts_of(span * period_ns, period_ns) for span in (1, 10, 11, 20, 21, 101)] == [
+        1, 1, 2, 2, 3, 11,
+    ]  # fmt: skip
+    assert parts_of(10 * period_ns + 1, period_ns) == 2
+    assert parts_of(1, period_ns) == 1
+
+
+def test_gap_beyond_the_age_limit_engages_again_and_says_so() -> None:
+    """Stamps ahead of the clock leave no tick without a fresh y, but a gap of 0.12 s."""
+    controller = Controller(SERVO)
+    calm = noise()
+    for k in range(1, 150):
+        step(controller, next(calm), k)
+    assert controller.mode is Mode.ENGAGED
+    u = controller.state.u
+    now_ns = 151 * PERIOD_NS
+    ahead_ns = (149 + 12) * PERIOD_NS
+    assert take(controller, next(calm), ahead_ns, now_ns) == ""
+    for stamp_ns in (now_ns, ahead_ns):
+        controller.take_y_m(StampedVector(stamp_ns, ZERO), now_ns)
+    output = controller.tick(now_ns)
+    assert output is not None
+    assert output.inputs.dt == 0.0
+    assert (controller.state.u == u).all()
+    assert controller.mode is Mode.ENGAGED
+    assert controller.restarted() == "a gap of y of 0.12 s, longer than max_age"
+
+
+# A y that stands still
+
+
+def still(controller: Controller, count: int, first: int, value: FloatArray) -> list[str]:
+    return [step(controller, value, k) for k in range(first, first + count)]
+
+
+def moving(controller: Controller, count: int) -> FloatArray:
+    """Ticks with noise; the last y."""
+    calm = noise()
+    value = ZERO
+    for k in range(1, count + 1):
+        value = next(calm)
+        assert step(controller, value, k) == ""
+    return value
+
+
+def test_y_that_stands_still_is_lost_and_the_failsafe_begins() -> None:
+    """As a frozen pose: five periods, and from then on no sample, until a value changes."""
+    controller = Controller(SERVO)
+    last = moving(controller, 150)
+    lost = still(controller, 40, 151, last)
+    assert lost[: STILL - 1] == [""] * (STILL - 1)
+    assert all(lost[STILL - 1 :])
+    assert lost[STILL - 1] == (
+        "y: found every value as before for 0.05 s, expected an aircraft that moves"
+    )
+    modes = [controller.mode]
+    changed = last + np.array([1e-12, 0.0, 0.0, 0.0])
+    assert step(controller, changed, 191) == ""
+    modes.append(controller.mode)
+    assert modes in ([Mode.HOLD, Mode.ENGAGED], [Mode.RAMP, Mode.ENGAGED])
+    # again at once: what has been seen is not forgotten
+    assert any(still(controller, 10, 192, changed))
+
+
+@pytest.mark.parametrize("count", [1, MOVING])
+def test_y_that_has_not_moved_before_is_not_frozen(count: int) -> None:
+    """A simulation in trim without noise gives zeros, and a bridge may repeat its samples."""
+    controller = Controller(SERVO)
+    last = moving(controller, count)
+    assert not any(still(controller, 500, count + 1, last))
+    assert controller.mode is Mode.ENGAGED
+
+
+def test_one_value_that_changes_is_enough() -> None:
+    controller = Controller(SERVO)
+    last = moving(controller, 150)
+    for k in range(151, 300):
+        assert step(controller, last + 1e-9 * k * np.eye(4)[3], k) == ""
+
+
+def test_sensor_that_repeats_now_and_then_is_not_frozen() -> None:
+    """Coarse steps of an airspeed at rest, gyros without noise: stretches of equal samples."""
+    controller = Controller(SERVO)
+    rng = np.random.default_rng(3)
+    for k in range(1, 3000):
+        V = 0.5 * np.round(rng.normal() * 0.3)
+        assert step(controller, V * np.eye(4)[SERVO.outputs.index("V")], k) == ""
+
+
+def test_repeats_faster_than_the_ticks_are_not_frozen() -> None:
+    """A y of 100 Hz that is sent at 1 kHz: ten equal samples are one period."""
+    controller = Controller(SERVO)
+    moving(controller, 150)
+    value = ZERO
+    for k, value in zip(range(1511, 3000), noise(7), strict=False):
+        assert take(controller, value, k * MS, k * MS) == ""
+        if k > 2000:
+            break
+    repeated = [take(controller, value, (2002 + k) * MS, (2002 + k) * MS) for k in range(60)]
+    assert not any(repeated[:49])  # 5 periods of the ticks
+    assert repeated[-1]
+
+
+@pytest.mark.slow
+def test_frozen_y_in_flight_is_told_and_replayed_to_the_bit() -> None:
+    """From 5 s on every value stands still while stamps go on: 0.15 s later the failsafe begins."""
+    scenario = find_scenario("osprey_servo", 8.0).vary(
+        aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    )
+    sentences: list[str] = []
+
+    class Frozen(Controller):
+        kept: FloatArray | None = None
+
+        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+            if now_ns >= 5_000 * MS:
+                self.kept = sample.value if self.kept is None else self.kept
+                sample = sample._replace(value=self.kept)
+            lost = super().take_y(sample, now_ns)
+            if lost:
+                sentences.append(lost)
+            return lost
+
+    tape = simulate(scenario, control=Frozen)
+    ticks = tape["internals"]
+    left = tape.time("internals")[ticks["mode"] != Mode.ENGAGED]
+    assert left[0] == approx(5.15, abs=0.011)
+    assert "every value as before" in sentences[0]
+    # the topic has what the controller received
+    y = tape["y"]
+    values = y.values.copy()
+    values[y.stamp_ns >= 5_000 * MS] = values[y.stamp_ns == 5_000 * MS]
+    received = replace(tape, signals={**tape.signals, "y": replace(y, values=values)})
+    assert replay(received).equal()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["osprey_gust", "osprey_observer", "jsbsim_c172p", "x8_elevons"])
+def test_healthy_flights_have_no_frozen_y(name: str) -> None:
+    """Without noise too, in trim before the first command and long after the last."""
+    scenario = find_scenario(name, 20.0)
+    quiet: dict[str, Any] = {"sensors": {}}
+    lost: list[str] = []
+
+    class Listening(Controller):
+        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+            lost.append(super().take_y(sample, now_ns))
+            return lost[-1]
+
+    for flight in (scenario, scenario.vary(aircraft=quiet)):
+        simulate(flight, control=Listening)
+    assert not any(lost)
