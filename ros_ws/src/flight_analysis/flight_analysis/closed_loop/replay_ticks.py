@@ -183,7 +183,8 @@ class Ticks:
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
-            state = self.begin(state)  # the controller was configured again before this tick
+            # As `Controller.restart`: the law has engaged again by itself, and the rest goes on.
+            state = state._replace(mode=Mode.WAITING)
         # After a gap the log has the feedforward's output but not its state: only the law is
         # computed.
         only_law = (
