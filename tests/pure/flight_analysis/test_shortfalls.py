@@ -222,7 +222,7 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
     assert aims == [Aim.ROUTE, Aim.TOUCHDOWN, Aim.LOG]
     assert outcome.status == 4
     assert str(outcome).startswith(
-        "osprey landed at t = 5 s, leg 0 not flown, outside of the touch"
+        "osprey landed at t = 5 s, legs 0 to 1 not flown, outside of the touch"
     )
 
 

@@ -21,10 +21,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
-from flight_analysis.report.flight_outcome import final_outcome
 from flight_analysis.report.guided import guidance_notices
+from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.summary import summarise
 from flight_core.channels import POSE, SIDES, UNKNOWN
+from flight_core.outcome import COMPLETED
 from flight_core.vectors import Array, ChannelError, FloatArray, StampedVector
 from flight_guidance import guidance as module
 from flight_guidance.attitude import AttitudeParams, body_rates, yaw_for_bank
@@ -196,8 +197,9 @@ def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report(fault: str) -> 
     log = tape["guidance"]
     stall = section.params().limits.stall_speed
     assert (section.speed + log["y.V"]).min() < 1.1 * stall
-    assert tape.outcome == "completed"
-    assert final_outcome(tape.outcome, account(tape, flight, tape.outcome))
+    assert tape.outcome == COMPLETED
+    told = judged(tape.outcome, tape, flight, account(tape, flight, tape.outcome))
+    assert told.status == 4, "the airspeed is far below its command"
     assert log["failed"].max() == 0
     assert summarise(tape)["guidance"]["failed"] == 0
     replayed = replay_guidance(tape, section)

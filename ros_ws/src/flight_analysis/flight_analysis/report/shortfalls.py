@@ -132,6 +132,7 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
         )
         shortfalls.append(Shortfall(aim=Aim.FENCE, sentence=sentence, figures=outing._asdict()))
     if "guidance" in tape and len(tape["guidance"].stamp_ns):
+        shortfalls += _failed_steps(tape)
         shortfalls += _route(tape, section, has_landed=has_landed)
     beside = touched_beside(tape, section) if has_landed else 0.0
     if beside:
@@ -139,6 +140,15 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
         figures = {"beside_m": beside}
         shortfalls.append(Shortfall(aim=Aim.TOUCHDOWN, sentence=sentence, figures=figures))
     return shortfalls
+
+
+def _failed_steps(tape: Tape) -> list[Shortfall]:
+    """The steps of guidance without commands: the commands of the step before went on."""
+    count = int(tape["guidance"]["failed"].max()) if "failed" in tape["guidance"].names else 0
+    if not count:
+        return []
+    sentence = f"{count} steps of guidance failed"
+    return [Shortfall(aim=Aim.GUIDANCE, sentence=sentence, figures={"failed": count})]
 
 
 def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:

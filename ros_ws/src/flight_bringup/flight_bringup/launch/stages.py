@@ -258,9 +258,9 @@ def fail_on_exit(
     """
     if context.is_shutdown:
         return None
-    if event.returncode == STATUS_LANDED:
-        return complete(run, "the aircraft has landed", Outcome(End.LANDED))
-    end_with(run, ended_early(f"{event.process_name} ended before the flight did"))
+    if event.returncode != STATUS_LANDED:
+        end_with(run, ended_early(f"{event.process_name} ended before the flight did"))
+    return complete(run, "the aircraft has landed", Outcome(End.LANDED))
 
 
 def end_with(run: Path, outcome: Outcome) -> NoReturn:
