@@ -6,7 +6,6 @@ saturation, ticks.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -97,15 +96,6 @@ class ErrorMetrics(NamedTuple):
 
     rms: float
     max: float
-
-
-class ModelSpan(NamedTuple):
-    """A span of a flight under the same parameters of the controller."""
-
-    model: int  # 0: the parameters of the start
-    start: float  # s
-    stop: float  # s
-    rms: dict[str, float]  # of `best_error` by channel
 
 
 class InputMetrics(NamedTuple):
@@ -373,35 +363,6 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
     weighted = times is not None and np.ptp(times) > 0.0
     square = np.average(e**2, weights=times) if weighted else np.mean(e**2)
     return ErrorMetrics(float(np.sqrt(square)), float(np.max(np.abs(e))))
-
-
-def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Rms of `best_error` before the first model of a learner and under each model; empty for a
-    tape without a learner.
-
-    The time in which the law is not engaged does not count.
-    """
-    if "learned" not in tape or "internals" not in tape:
-        return []
-    _, error = best_error(tape)
-    t = (error.stamp_ns - tape.start_ns) / 1e9
-    ticks = tape.time("internals")
-    flown = tape["internals"]["parameters"]
-    changes = np.flatnonzero(np.diff(flown, prepend=np.nan) != 0.0)
-    digests = list(dict.fromkeys(flown[changes].tolist()))
-    engaged = (
-        tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)]
-        == Mode.ENGAGED
-    )
-    spans = []
-    for digest, (start, stop) in zip(
-        flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True
-    ):
-        in_span = (t >= start) & (t < stop) & engaged
-        rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
-        if in_span.any():
-            spans.append(ModelSpan(digests.index(digest), start, stop, rms))
-    return spans
 
 
 def known_entries(learned: Signal) -> list[str]:

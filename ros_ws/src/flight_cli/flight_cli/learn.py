@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from flight_analysis.closed_loop.replay import recorded_scenario
-from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.display_units import display_units
+from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import log_namespace, log_scenario, scenario_file, warn_of_lacks
 from flight_cli.output import (

@@ -23,12 +23,14 @@ from rich.progress import (
 from rich.table import Table
 
 from flight_analysis.closed_loop.learning_loop import Entry
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.display_units import (
     QUANTITY_UNITS,
     DisplayUnit,
     format_seconds,
     format_value,
 )
+from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.guided import leg_results
 from flight_analysis.report.summary import (
     RecordedFlight,
@@ -86,6 +88,8 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
             say(console, f"{legs}{taken_over(summary, 'guidance')}")
     if summary["models"]:
         console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
+    if flight.controllers:
+        _show_margins(console, flight, flight.scenario)
     if commands := command_results(summary):
         say(console, commands)
     say(console, parts_legend(summary), style="dim")
@@ -94,6 +98,17 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         *(f"note: {note}" for note in summary["notes"] if note != busy),
     ):
         say(console, line)
+
+
+def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) -> None:
+    """Print the margins under the parameters that flew, where these changed in flight."""
+    from flight_analysis.report import margin_figures  # noqa: PLC0415 - loads SciPy
+
+    loops = flown_loops(flight.tape, scenario, flight.controllers)
+    if not loops:
+        return
+    margins = margin_figures.flown_margin_table(loops)
+    console.print(grouped_table(margins.caption, "", margins.columns, margins.rows))
 
 
 def _show_imported(console: Console, flight: RecordedFlight) -> None:

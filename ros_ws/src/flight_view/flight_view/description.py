@@ -8,9 +8,9 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import ModelSpan
 from flight_analysis.report.display_units import NO_UNIT, display_units
 from flight_analysis.report.guided import mission_drawing
+from flight_analysis.report.model_spans import ModelSpan, model_names
 from flight_analysis.report.summary import pulse_edges
 from flight_analysis.report.summary_rows import model_rows
 from flight_core.modes import Mode
@@ -40,17 +40,24 @@ class Flown(NamedTuple):
 
 
 def rms_by_model(
-    flown: Sequence[Flown], start_ns: int, scenario: Scenario | None
+    flown: Sequence[Flown], start_ns: int, scenario: Scenario | None, proposed_ns: Sequence[int]
 ) -> dict[str, Any]:
-    """Headings and rows of the rms of the measured error by model, from the ticks of a flight."""
-    digests = list(dict.fromkeys(span.digest for span in flown))
+    """Headings and rows of the rms of the measured error by model, from the ticks of a flight and
+    the stamps of proposed models.
+    """
+    first_ns: dict[float, int] = {}
+    for span in flown:
+        first_ns.setdefault(span.digest, span.start_ns)
+    digests = list(first_ns)
+    names = model_names(list(first_ns.values()), proposed_ns)
     ends_ns = [*(span.start_ns for span in flown[1:]), flown[-1].stop_ns]
     spans = []
     for span, stop_ns in zip(flown, ends_ns, strict=True):
         start, stop = ((stamp_ns - start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
         if span.ticks:
             rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
-            spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
+            model = digests.index(span.digest)
+            spans.append(ModelSpan(names[model], model, start, stop, rms)._asdict())
     known = {} if scenario is None else display_units(scenario)
     headings, rows = model_rows(spans, dict.fromkeys(flown[0].squares, NO_UNIT) | known)
     return {"headings": ["", *headings], "rows": rows}

@@ -229,7 +229,10 @@ class Flight:
         """
         if LEARNED not in self.samples or not self._flown:
             return {}
-        return rms_by_model(self._flown, self.start_ns, self.scenario)
+        learned = self.samples[LEARNED]
+        is_proposed = learned.values[:, learned.names.index("proposed")] > 0.0
+        proposed_ns = learned.stamp_ns[is_proposed].tolist()
+        return rms_by_model(self._flown, self.start_ns, self.scenario, proposed_ns)
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""

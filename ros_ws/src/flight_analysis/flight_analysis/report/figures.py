@@ -244,9 +244,16 @@ def integral_figure(context: PlotContext) -> Figure | None:
     return time_series_figure(context, {"": curve}, columns=2, height=120)
 
 
-def learned_figure(context: PlotContext) -> Figure | None:
+BEYOND_END = 1.02  # of the length of a flight: the last bar is whole
+LEARNED_LINES: tuple[dict[str, Any], ...] = (
+    {"color": REFERENCE, "width": 1.6},
+    {"color": PLANT, "width": 1.2, "dash": "dot"},
+)
+
+
+def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]]) -> Figure | None:
     """Entries of A and B over time, as identified in flight, with bars of two deviations; open
-    marks: no model was proposed.
+    marks: no model was proposed. `lines`: known values by entry, by label.
 
     None without a learner. An entry that is not among `known_entries` is left out.
     """
@@ -271,9 +278,13 @@ def learned_figure(context: PlotContext) -> Figure | None:
             "cliponaxis": False,
             "hovertemplate": "%{y:.4g} at %{x:.1f} s",
         }
+        for (label, known_values), line in zip(lines.items(), LEARNED_LINES, strict=False):
+            if name in known_values:
+                level = known_values[name]
+                add_line(figure, index, label, [0.0, context.end], [level, level], line)
         figure.add_scatter(name, t, values[name], index, "markers", **style)
         figure.x[index] |= {
-            "range": [0.0, context.end],
+            "range": [0.0, BEYOND_END * context.end],
             "showticklabels": index + columns >= len(known),
         }
         figure.x[index] |= {"title": {"text": "t (s)"}} if index + columns >= len(known) else {}

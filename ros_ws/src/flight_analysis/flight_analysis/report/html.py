@@ -6,7 +6,7 @@ comparison of flights.
 
 import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.kept_guarantee import kept
-from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment, scenario_loop
+from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import (
     comparison,
@@ -27,6 +27,7 @@ from flight_analysis.report import (
     tables,
 )
 from flight_analysis.report.display_units import QUANTITY_UNITS, format_seconds, format_value
+from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay
 from flight_analysis.report.summary import (
@@ -38,7 +39,6 @@ from flight_analysis.report.summary import (
 )
 from flight_analysis.report.summary_rows import INPUT_COLUMNS, Column
 from flight_core.files import replacing
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 HERE = Path(__file__).parent
@@ -106,7 +106,8 @@ def _write(path: Path, page: Page) -> None:
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
     table = margin_figures.margin_table(loop_assessment(loop), kept(loop))
-    _write(path, Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore()))
+    sections = _loop_sections({"": loop})
+    _write(path, Page(title, [], [TableGroup([table])], sections, SampleStore()))
 
 
 def _imported_page(flight: RecordedFlight) -> Page:
@@ -150,7 +151,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     units = flight.units
     gusts = flight.gusts
     context = figures.plot_context(flight.tape, units, gusts)
-    loop = _linear_loop(scenario)
+    loops = flown_loops(flight.tape, scenario, flight.controllers)
     flight_tables = tables.flight_tables(
         flight.summary, units, tables.events(flight.tape, gusts, scenario)
     )
@@ -159,18 +160,9 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
         f"Flight {flight.name}",
         [_outcome_line(f"{'; '.join(description)}.", flight)],
         [
-            TableGroup(
-                [
-                    *flight_tables,
-                    *(
-                        []
-                        if loop is None
-                        else [margin_figures.margin_table(loop_assessment(loop), kept(loop))]
-                    ),
-                ]
-            )
+            TableGroup([*flight_tables, *_margin_tables(loops)]),
         ],
-        [*_sections(flight, scenario, context), *([] if loop is None else _loop_sections(loop))],
+        [*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
         context.samples,
         flight.summary["notes"],
         replay(flight, context),
@@ -282,8 +274,8 @@ def _sections(
         Section(
             "What was learned",
             "A and B as identified, SI, with bars of two standard deviations; open marks: no "
-            "model was proposed",
-            figures.learned_figure(context),
+            "model was proposed. Lines: the true value before a drift, and the value of the file",
+            figures.learned_figure(context, learned_lines(flight.tape, scenario)),
         ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
         Section("States", "SI where no unit is given", figures.state_figure(context)),
@@ -308,27 +300,35 @@ def _sections(
     ]
 
 
-def _linear_loop(scenario: Scenario) -> LinearLoop | None:
-    """The linear loop of a scenario; None without one: the literal sign, an aircraft without a
-    model.
-    """
-    try:
-        return scenario_loop(scenario, scenario.controller)
-    except ParameterError:
-        return None
+def _margin_tables(loops: Sequence[FlownLoop]) -> list[tables.Table]:
+    """The margins of a single loop by input, the least margins of several loops."""
+    if not loops:
+        return []
+    if len(loops) > 1:
+        return [margin_figures.flown_margin_table(loops)]
+    loop = loops[0].loop
+    return [margin_figures.margin_table(loop_assessment(loop), kept(loop))]
 
 
-def _loop_sections(loop: LinearLoop) -> list[Section]:
+def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:
+    """The loops of a flight by name, around the true aircraft if known."""
+    aircraft = TRUE if any(each.aircraft == TRUE for each in loops) else FILE
+    return {each.name: each.loop for each in loops if each.aircraft == aircraft}
+
+
+def _loop_sections(loops: Mapping[str, LinearLoop]) -> list[Section]:
+    if not loops:
+        return []
     hint = (
         "L at each input, the other inputs closed: the sampled loop with actuators, delay "
-        f"and hold; {loop.model}"
+        f"and hold; {next(iter(loops.values())).model}"
     )
     return [
-        Section("Bode plot of the loop", hint, margin_figures.bode_figure(loop), over_time=False),
+        Section("Bode plot of the loop", hint, margin_figures.bode_figure(loops), over_time=False),
         Section(
             "Nyquist plot of the loop",
             "Inside the circle around -1 the sensitivity is above 2.",
-            margin_figures.nyquist_figure(loop),
+            margin_figures.nyquist_figure(loops),
             over_time=False,
         ),
     ]

@@ -5,16 +5,17 @@ plots.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from flight_analysis.closed_loop.guarantee import Guarantee
-from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
+from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins, loop_assessment
 from flight_analysis.report import comparison
 from flight_analysis.report.display_units import NO_VALUE
-from flight_analysis.report.plotting import Figure, add_line, set_layout
+from flight_analysis.report.flown_models import FlownLoop
+from flight_analysis.report.plotting import Figure, add_line, axis, first_in_legend, set_layout
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_core.vectors import FloatArray
@@ -169,6 +170,30 @@ def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> Tabl
     )
 
 
+def flown_margin_table(loops: Sequence[FlownLoop]) -> Table:
+    """The least margins of the loops of a flight, a row each."""
+    columns = [
+        Column("flown", "from to (s)"),
+        Column("", "aircraft"),
+        Column("phase", "deg"),
+        Column("gain", "dB"),
+        Column("largest", "S"),
+        Column("disk", ""),
+        Column("damping", ""),
+        Column("delay", "ms"),
+    ]
+    rows = [
+        [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_assessment(loop.loop))]
+        for loop in loops
+    ]
+    legend = (
+        "the least margins of the inputs, one open and all others closed; disk and delay: all "
+        "inputs at once; damping: of slow modes. aircraft: that of the file, and the true one as "
+        "simulated before a drift"
+    )
+    return Table("Margins of the linear loop, by the parameters that flew", columns, rows, legend)
+
+
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
     """The margins in SI: phase in rad, gain as factors, delay in s. None for an infinite margin."""
     nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {
@@ -246,19 +271,23 @@ def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
 # Bode and Nyquist plots
 
 
-def bode_figure(loop: LinearLoop) -> Figure:
-    """Gain and phase of L_i over the frequency, nominal aircraft."""
-    w, L = _response(loop)
-    figure = Figure(2, 1, 220, spacing=0.06)
-    for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
-        phase = np.degrees(np.unwrap(np.angle(L[:, k])))
-        phase -= 360.0 * np.ceil(phase[0] / 360.0)
-        for place, (values, unit) in enumerate(((decibels(np.abs(L[:, k])), "dB"), (phase, "deg"))):
-            hover = f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"
-            style = _style(name, colour, hover) | {"showlegend": place == 0}
-            figure.add_scatter(name, w, values, place, **style)
+def bode_figure(loops: Mapping[str, LinearLoop]) -> Figure:
+    """Gain and phase of L_i over the frequency, nominal aircraft: a column an input, the loops by
+    label.
+    """
+    inputs = _inputs(loops)
+    count = len(inputs)
+    figure = Figure(2 * count, count, 220, spacing=0.06)
+    for (label, loop), colour in zip(loops.items(), _colours(list(loops)), strict=True):
+        w, L = _response(loop)
+        for k in range(count):
+            phase = np.degrees(np.unwrap(np.angle(L[:, k])))
+            phase -= 360.0 * np.ceil(phase[0] / 360.0)
+            add_curve(figure, k, label, w, decibels(np.abs(L[:, k])), colour, "dB")
+            add_curve(figure, k + count, label, w, phase, colour, "deg")
     ends = [float(w[0]), float(w[-1])]
-    for place, level in ((0, 0.0), (1, -180.0)):
+    for place in range(2 * count):
+        level = 0.0 if place < count else -180.0
         add_line(
             figure, place, "", ends, [level, level], {"color": BOUND, "width": 1.0, "dash": "dot"}
         )
@@ -266,37 +295,67 @@ def bode_figure(loop: LinearLoop) -> Figure:
         figure.x[place] |= {
             "type": "log",
             "range": [math.log10(end) for end in ends],
-            "showticklabels": place == 1,
+            "showticklabels": place >= count,
         }
-    figure.x[1] |= {"title": {"text": "rad/s"}, "matches": None}
-    figure.y[0] |= {"title": {"text": "gain (dB)"}, "range": [-60.0, 60.0]}
-    figure.y[1] |= {"title": {"text": "phase (deg)"}, "dtick": 90.0}
+    for k, name in enumerate(inputs):
+        figure.x[k + count] |= {"title": {"text": f"{name}, rad/s"}, "matches": None}
+        figure.y[k] |= {"range": [-60.0, 60.0]}
+        figure.y[k + count] |= {"dtick": 90.0}
+    figure.y[0] |= {"title": {"text": "gain (dB)"}}
+    figure.y[count] |= {"title": {"text": "phase (deg)"}}
     return set_layout(figure, below=44)
 
 
-def nyquist_figure(loop: LinearLoop) -> Figure:
-    """L_i around the point -1, with the unit circle and the circle of sensitivity 2."""
-    _, L = _response(loop)
-    figure = Figure(1, 1, 420)
+def nyquist_figure(loops: Mapping[str, LinearLoop]) -> Figure:
+    """L_i around the point -1, with the unit circle and the circle of sensitivity 2: a subplot an
+    input, the loops by label.
+    """
+    inputs = _inputs(loops)
+    figure = Figure(len(inputs), min(len(inputs), 2), 420)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circles = {
         "abs(L) = 1": (np.cos(turn), np.sin(turn), UNIT_CIRCLE),
         "S = 2": (0.5 * np.cos(turn) - 1.0, 0.5 * np.sin(turn), BOUND),
     }
-    for label, (x, y, colour) in circles.items():
-        add_line(
-            figure, 0, label, x.tolist(), y.tolist(), {"color": colour, "width": 1.0, "dash": "dot"}
-        )
-    for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
-        near = np.abs(L[:, k]) < 10.0
-        style = _style(name, colour, "%{x:.3g} %{y:+.3g} j")
-        figure.add_scatter(name, L[near, k].real, L[near, k].imag, **style)
-    point = {"symbol": "cross", "size": 9, "color": BOUND}
-    figure.add_scatter("-1", [-1.0], [0.0], mode="markers", marker=point, showlegend=False)
     across, up = NYQUIST_RANGE
-    figure.x[0] |= {"title": {"text": "Re L"}, "range": list(across), "constrain": "domain"}
-    figure.y[0] |= {"title": {"text": "Im L"}, "range": list(up), "scaleanchor": "x"}
+    point = {"symbol": "cross", "size": 9, "color": BOUND}
+    for k, name in enumerate(inputs):
+        for label, (x, y, colour) in circles.items():
+            line = {"color": colour, "width": 1.0, "dash": "dot"}
+            add_line(figure, k, label, x.tolist(), y.tolist(), line)
+        figure.add_scatter("-1", [-1.0], [0.0], k, "markers", marker=point, showlegend=False)
+        figure.x[k] |= {
+            "title": {"text": f"{name}, Re L"},
+            "range": list(across),
+            "constrain": "domain",
+        }
+        figure.y[k] |= {
+            "title": {"text": "Im L"},
+            "range": list(up),
+            "scaleanchor": axis("x", k),
+        }
+    for (label, loop), colour in zip(loops.items(), _colours(list(loops)), strict=True):
+        _, L = _response(loop)
+        for k in range(len(inputs)):
+            near = np.abs(L[:, k]) < 10.0
+            x, y = L[near, k].real, L[near, k].imag
+            add_curve(figure, k, label, x, y, colour, "")
     return set_layout(figure, below=44)
+
+
+def _inputs(loops: Mapping[str, LinearLoop]) -> tuple[str, ...]:
+    return next(iter(loops.values())).inputs
+
+
+def add_curve(
+    figure: Figure, place: int, label: str, x: FloatArray, y: FloatArray, colour: str, unit: str
+) -> None:
+    """Add a curve of a loop to a subplot, with one entry in the legend."""
+    hover = f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s" if unit else "%{x:.3g} %{y:+.3g} j"
+    figure.add_scatter(
+        label, x, y, place, legendgroup=label, line={"color": colour, "width": 1.4},
+        showlegend=bool(label) and first_in_legend(figure, label), hovertemplate=hover,
+    )  # fmt: skip
 
 
 def _response(loop: LinearLoop) -> tuple[FloatArray, Any]:
@@ -307,8 +366,3 @@ def _response(loop: LinearLoop) -> tuple[FloatArray, Any]:
 
 def _colours(names: Sequence[str]) -> list[str]:
     return [comparison.COLOURS[k % len(comparison.COLOURS)] for k in range(len(names))]
-
-
-def _style(name: str, colour: str, hover: str) -> dict[str, Any]:
-    line = {"color": colour, "width": 1.4}
-    return {"legendgroup": name, "line": line, "showlegend": True, "hovertemplate": hover}

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
+from flight_analysis.closed_loop.replay import recorded_changes
 from flight_analysis.closed_loop.scenario import (
     ParameterOverrides,
     Scenario,
@@ -22,6 +23,8 @@ from flight_analysis.closed_loop.scenario import (
 )
 from flight_analysis.report.account import Account, account
 from flight_analysis.report.flight_outcome import NEVER_ENGAGED, flown, outcome_of_log
+from flight_analysis.report.flown_models import FlownController, flown_controllers
+from flight_analysis.report.model_spans import flown_parameters
 from flight_analysis.report.summary import (
     RecordedFlight,
     empty_summary,
@@ -214,7 +217,18 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             *engagement_notes(summary["engagements"], has_figures=has_figures),
             *summary["notes"],
         ]
-    return RecordedFlight(name, scenario, tape, summary)
+    controllers = _controllers(recorded, tape, scenario)
+    return RecordedFlight(name, scenario, tape, summary, controllers=controllers)
+
+
+def _controllers(
+    recorded: RecordedRun, tape: Tape, scenario: Scenario
+) -> tuple[FlownController, ...]:
+    """The parameters that flew, where they changed in flight."""
+    if len({span.digest for span in flown_parameters(tape)}) < 2:
+        return ()
+    changes = recorded_changes(recorded, scenario.controller)
+    return flown_controllers(tape, scenario.controller, changes)
 
 
 def log_account(recorded: RecordedRun) -> Account | None:

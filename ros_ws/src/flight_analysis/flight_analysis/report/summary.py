@@ -19,7 +19,6 @@ from flight_analysis.metrics import (
     Transient,
     best_error,
     engagements,
-    errors_by_model,
     errors_by_part,
     guided_transients,
     inputs_by_part,
@@ -42,7 +41,9 @@ from flight_analysis.report.display_units import (
     display_units,
     format_seconds,
 )
+from flight_analysis.report.flown_models import FlownController
 from flight_analysis.report.guided import guidance_notices, guidance_summary
+from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
 from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.timing import (
@@ -105,6 +106,8 @@ class RecordedFlight(NamedTuple):
     tape: Tape
     summary: dict[str, Any]  # of `summarise`, or of `summarise_imported`
     si_units: Mapping[str, str] = {}  # by channel, of an imported flight
+    # the parameters that flew, where they changed in flight
+    controllers: tuple[FlownController, ...] = ()
 
     @property
     def period_ns(self) -> int:

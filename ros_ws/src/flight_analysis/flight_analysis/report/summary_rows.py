@@ -38,11 +38,11 @@ RMS_COLUMNS = (
 
 ERROR_COLUMNS = (
     *RMS_COLUMNS,
+    *(Column("max", air, (air, "max")) for air in AIRS if air != CALM),
     Column("max", "command", ("command", "max")),
     Column("max", "capture", ("capture", "max")),
     Column("max", "turn", ("turn", "max")),
     Column("max", "gust", ("gust", "max")),
-    *(Column("max", air, (air, "max")) for air in AIRS if air != CALM),
     Column("ultimate", "bound", ("bound",)),
 )
 """Columns of every table of errors; `columns_of` chooses those of a flight."""
@@ -96,8 +96,7 @@ def model_rows(
     rows = []
     for span in models:
         errors = (format_value(span["rms"][name], units[name].factor) for name in channels)
-        name = f"model {span['model']}" if span["model"] else "start"
-        rows.append([name, f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors])
+        rows.append([span["name"], f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors])
     return headings, rows
 
 

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of the controller over a flight, and the error under each set."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.metrics import best_error, error_metrics
+from flight_core.modes import Mode
+from flight_core.tape import Tape
+
+
+class ParameterSpan(NamedTuple):
+    """A span of a flight under the same parameters of the controller."""
+
+    digest: int
+    name: str  # of `model_names`
+    start: float  # s
+    stop: float  # s
+
+
+class ModelSpan(NamedTuple):
+    """The error over a span of a flight under the same parameters of the controller."""
+
+    name: str  # of `model_names`
+    model: int  # 0: the parameters of the start
+    start: float  # s
+    stop: float  # s
+    rms: dict[str, float]  # of `best_error` by channel
+
+
+def model_names(first: Sequence[float], proposed: Sequence[float]) -> list[str]:
+    """Names of parameters in the order of their first instants, s: "start", "file" before the first
+    instant at which a model was `proposed`, then "model 1" and so on.
+    """
+    names = ["start"]
+    for time in first[1:]:
+        is_learned = any(instant <= time for instant in proposed)
+        kind = "model" if is_learned else "file"
+        number = sum(name.startswith(kind) for name in names) + 1
+        names.append(f"{kind} {number}" if is_learned or number > 1 else kind)
+    return names[: len(first)]
+
+
+def flown_parameters(tape: Tape) -> list[ParameterSpan]:
+    """The spans of a flight by the parameters of the controller; empty without `internals`."""
+    if "internals" not in tape or "parameters" not in tape["internals"].names:
+        return []
+    t = tape.time("internals")
+    digests = tape["internals"]["parameters"]
+    changes = np.flatnonzero(np.diff(digests, prepend=np.nan) != 0.0)
+    first: dict[int, float] = {}
+    for change in changes.tolist():
+        first.setdefault(int(digests[change]), float(t[change]))
+    proposed: list[float] = []
+    if "learned" in tape:
+        proposed = tape.time("learned")[tape["learned"]["proposed"] > 0.0].tolist()
+    names = dict(zip(first, model_names(list(first.values()), proposed), strict=True))
+    ends = [*t[changes[1:]].tolist(), *t[-1:].tolist()]
+    return [
+        ParameterSpan(digest, names[digest], start, stop)
+        for digest, start, stop in zip(
+            digests[changes].astype(np.int64).tolist(), t[changes].tolist(), ends, strict=True
+        )
+    ]
+
+
+def errors_by_model(tape: Tape) -> list[ModelSpan]:
+    """Rms of `best_error` before the first model of a learner and under each model; empty for a
+    tape without a learner.
+
+    The time in which the law is not engaged does not count.
+    """
+    if "learned" not in tape or "internals" not in tape:
+        return []
+    _, error = best_error(tape)
+    t = (error.stamp_ns - tape.start_ns) / 1e9
+    ticks = tape.time("internals")
+    engaged = (
+        tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)]
+        == Mode.ENGAGED
+    )
+    spans = []
+    flown = flown_parameters(tape)
+    digests = list(dict.fromkeys(span.digest for span in flown))
+    for span in flown:
+        stop = float(t[-1]) if span is flown[-1] else span.stop
+        in_span = (t >= span.start) & (t < stop) & engaged
+        rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
+        if in_span.any():
+            spans.append(ModelSpan(span.name, digests.index(span.digest), span.start, stop, rms))
+    return spans
