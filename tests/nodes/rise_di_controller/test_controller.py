@@ -21,6 +21,7 @@ from std_msgs.msg import Header, String
 from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, stamp_ns, world_of
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros.messages import Encoder, to_message
@@ -617,3 +618,38 @@ def test_node_waits_for_the_next_whole_period(flight: Flight) -> None:
     """
     flight.engage()
     assert set(flight.at() % (10 * MS)) == {MS}
+
+
+def test_controller_that_was_shut_down_publishes_nothing(flight: Flight) -> None:
+    """Deactivated it ramps u to trim; shut down it says nothing: the aircraft has a failsafe."""
+    flight.engage()
+    assert flight.transition(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert flight.state == State.PRIMARY_STATE_FINALIZED
+    flight.run(0.05)
+    before = {topic: len(flight.world.sent[topic]) for topic in ("/u", "/internals")}
+    flight.run(1.5)
+    assert {topic: len(flight.world.sent[topic]) for topic in before} == before
+    assert diagnostics(flight.world, "/controller")[0] == "shut down: no u comes any more"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"observer.margin": 0.0},
+        {"observer.part": 0.3},
+        {"observer.fade": 3.0},
+        {"feedforward.lead": [0.03, 0.03, 0.03, 0.1]},
+        {"observer.F": [0.0]},
+        {"k_g": 2.0, "observer.margin": 0.0},
+    ],
+)
+def test_models_of_an_operator_are_refused_in_flight(changes: dict[str, Any]) -> None:
+    """A proposal of a learner is proved before it flies; the margin of the proof is no wish."""
+    with flying(find_scenario("osprey_observer")) as flight:
+        flight.engage()
+        before = flight.values("observer.margin", "observer.part", "observer.fade", "k_g")
+        successful, reason = flight.set(**changes)
+        assert not successful
+        assert "expected a change at a restart only" in reason
+        assert flight.values("observer.margin", "observer.part", "observer.fade", "k_g") == before
+        assert flight.set(hold=0.3) == (True, "")

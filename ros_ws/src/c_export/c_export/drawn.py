@@ -119,8 +119,8 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
 def drawn_standstill(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Samples of y with noise, and stretches of up to twelve equal ones, at the ticks and between
-    them.
+    """Samples of y with noise, and stretches of up to twelve equal samples, at the ticks and half a
+    period before.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[0].guard().period_ns

@@ -24,5 +24,5 @@ class Failures:
 
 
 def sentence(error: Exception) -> str:
-    """The kind and the words of an error, on one line."""
+    """The kind and the words of an error, on a single line."""
     return " ".join(f"{type(error).__name__} {error}".split())

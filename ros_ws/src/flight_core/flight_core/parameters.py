@@ -241,6 +241,11 @@ class NodeConfig(Config):
         """Parameters that may change in flight: dotted names, or names of groups as a whole."""
         return frozenset()
 
+    @classmethod
+    def learned(cls) -> frozenset[str]:
+        """Further parameters, which only the node itself changes in flight."""
+        return frozenset()
+
 
 SMALLEST = 1e-9
 LARGEST = 1e9
@@ -299,6 +304,11 @@ def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> 
         f"{len(values)} values",
         f"{len(names)}, one for each of {', '.join(names)}",
     )
+
+
+def require_distinct(key: str, names: Sequence[str]) -> None:
+    """Raise ParameterError for a name given twice."""
+    require(len(set(names)) == len(names), key, ", ".join(names), "different names")
 
 
 def require_channels(key: str, names: Sequence[str], expected: Sequence[str], owner: str) -> None:

@@ -35,9 +35,9 @@ AHEAD = math.radians(60.0)
 way."""
 
 LEAST_TURN = math.radians(5.0)
-"""Bank of the longest turn that is predicted: 2 min at 20 m/s.
+"""Bank of the longest predicted turn: 2 min at 20 m/s.
 
-A turn at a smaller bank is predicted for as long. At a bank of 0, that of 1.1 V_s and below, the
+A turn at a smaller bank is predicted for as long. At a bank of 0, at 1.1 V_s and below, the
 prediction is the straight way.
 """
 
@@ -82,8 +82,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before the way home, at the latest after nearly a full turn, or
-    the time of one at LEAST_TURN. Trapezoidal rule over POINTS.
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn, at
+    LEAST_TURN or more. Trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)

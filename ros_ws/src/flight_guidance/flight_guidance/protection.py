@@ -22,11 +22,11 @@ the limit is zero."""
 
 
 LEAST_SPEED = 0.1
-"""m/s, of a speed that divides: no aircraft flies there, and a flow from behind counts as none."""
+"""m/s, of a divisor: no aircraft flies there, and a flow from behind counts as none."""
 
 
 def forward(speed: Scalar) -> Scalar:
-    """A speed that divides, m/s: max(V, LEAST_SPEED)."""
+    """A speed as a divisor, m/s: max(V, LEAST_SPEED)."""
     return array_namespace(speed).maximum(speed, LEAST_SPEED)
 
 

@@ -14,10 +14,14 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from flight_core.fields import short_repr
 from flight_core.files import require_no_octal
-from flight_core.parameters import NodeConfig, ParameterError, flatten, nest
+from flight_core.parameters import NodeConfig, ParameterError, flatten, nest, require
 
 P = TypeVar("P", bound=NodeConfig)
+AT_RESTART = "a change at a restart only"
+"""What is expected of the parameters `learned`, from all but the node itself."""
+
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
@@ -40,15 +44,19 @@ def read_parameters(node: Node, schema: type[P]) -> P:
             f"{node.get_name()}: found no parameters, expected {expected}: {error}"
         ) from None
     tunable = parameters.tunable()
+    own = parameters.learned()
     descriptions = {
         name: field.description or "" for name, field in type(parameters).model_fields.items()
     }
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
-        read_only = group not in tunable and name not in tunable
+        read_only = group not in tunable | own and name not in tunable
         # dynamic_typing: the set validates the types and accepts an integer as a float
         descriptor = ParameterDescriptor(
-            description=descriptions.get(group, ""), read_only=read_only, dynamic_typing=True
+            description=descriptions.get(group, ""),
+            read_only=read_only,
+            dynamic_typing=True,
+            additional_constraints=AT_RESTART if group in own else "",
         )
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
@@ -76,7 +84,13 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
-    """The set with some parameters changed, validated as a whole. Raises ParameterError."""
+    """The set with some parameters changed, validated as a whole. Raises ParameterError, also for a
+    parameter of `learned`.
+    """
+    for change in changes:
+        is_own = change.name.split(".")[0] in parameters.learned()
+        name = f"{node.get_name()}.{change.name}"
+        require(not is_own, name, short_repr(change.value), AT_RESTART)
     values = {
         change.name: _as_list(change.value)
         for change in changes

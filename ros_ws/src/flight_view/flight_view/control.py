@@ -344,7 +344,7 @@ class Control:
 
     def _read(self) -> None:
         base = self._controller()
-        self._values = self._link.parameters("controller", sorted(base.tunable()))
+        self._values = self._link.parameters("controller", sorted(base.tunable() | base.learned()))
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:

@@ -131,6 +131,9 @@ class ReferenceModelConfig(NodeConfig):
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
+        parameters.require_distinct("outputs", self.outputs)
+        if self.linear is not None:
+            parameters.require_distinct("linear.states", self.linear.states)
         if self.u_m_rate:
             divides = period_ns(self.u_m_rate, "u_m_rate") % period == 0
             require(

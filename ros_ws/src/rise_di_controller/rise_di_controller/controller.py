@@ -258,9 +258,9 @@ class Controller:
     def take_y(self, sample: StampedVector, now_ns: int) -> str:
         """Buffer a sample of y, in the law's order.
 
-        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. One that
-        is lost for how y changes does not come again. A sample whose jump is confirmed engages the
-        law again.
+        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. After a
+        loss for the change of y no older stamp is taken. A sample whose jump is confirmed engages
+        the law again.
 
         Args:
             sample: The sample, shape (m,), with vanes longer, SI, deviations from trim.

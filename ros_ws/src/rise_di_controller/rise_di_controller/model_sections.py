@@ -18,6 +18,7 @@ from flight_core.parameters import (
     Positives,
     require,
     require_channels,
+    require_distinct,
     require_length,
 )
 from flight_core.vectors import FloatArray, selection_matrix
@@ -251,12 +252,7 @@ class AllocationConfig(Config):
             ", ".join(self.effectors),
             f"{m} or more, for {', '.join(inputs)}",
         )
-        require(
-            len(set(self.effectors)) == p,
-            "allocation.effectors",
-            ", ".join(self.effectors),
-            "different names",
-        )
+        require_distinct("allocation.effectors", self.effectors)
         _require_sizes(self, "allocation", {"T": (p, m), "effect": (m, p)})
         for key in ("lower", "upper", "slew"):
             require_length(

@@ -67,6 +67,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         LifecycleNodeMixin.__init__(self)
         answer_invalid_transitions(self)
         self._active = False
+        self._is_shut_down = False
         # a standby that was never activated publishes no u beside another's
         self._publishes = self.parameters.autostart
         self._controller = Controller(self.parameters)
@@ -129,7 +130,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._active = False
         return TransitionCallbackReturn.SUCCESS
 
-    on_shutdown = on_deactivate
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop the law for good, and publish nothing any more: the aircraft begins a failsafe."""
+        self._active = self._publishes = False
+        self._is_shut_down = True
+        return TransitionCallbackReturn.SUCCESS
 
     def on_parameters(self, parameters: ControllerConfig) -> None:
         """Replace the parameters between two ticks, all at once and without a jump of u."""
@@ -155,6 +160,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
+        if self._is_shut_down:
+            return
         now_ns += tick.late_ns
         if self._last_ns and (instants := self._controller.overrun(self._last_ns, now_ns)):
             self.get_logger().warning(
@@ -384,6 +391,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
+        if self._is_shut_down:
+            return DiagnosticStatus.WARN, "shut down: no u comes any more", {}
         mode = self._controller.mode
         level = DiagnosticStatus.OK if mode is Mode.ENGAGED else DiagnosticStatus.WARN
         ages = {}

@@ -27,6 +27,7 @@ from flight_core.parameters import (
     Signs,
     flatten,
     require,
+    require_distinct,
     require_length,
 )
 from flight_core.rates import divide, nanoseconds, period_ns
@@ -165,6 +166,7 @@ class ControllerConfig(NodeConfig):
             f"{self.delay:g} s",
             f"at most {longest:g} s, {MAX_DELAY_PERIODS} periods of rate",
         )
+        self._check_names()
         require_length("inputs", self.inputs, self.outputs)
         for key in ("D", "input_scale", "lag"):
             require_length(key, getattr(self, key), self.outputs)
@@ -195,6 +197,13 @@ class ControllerConfig(NodeConfig):
                     "has the model"
                 )
             yield from self._check_observer(self.observer, nominal)
+
+    def _check_names(self) -> None:
+        """No channel and no state has two places: a log could not tell these apart."""
+        require_distinct("outputs", self.outputs)
+        require_distinct("inputs", self.inputs)
+        for key, section in (("feedforward", self.feedforward), ("observer", self.observer)):
+            require_distinct(f"{key}.states", () if section is None else section.states)
 
     def _check_state(self) -> None:
         """The log holds each array of the law's state by output, beside groups of its own."""

@@ -166,8 +166,13 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Also the models: a learner replaces them."""
-        return (super().tunable() | {"input_scale", "feedforward", "observer"}) - {"learn"}
+        """Also the scale of the inputs."""
+        return (super().tunable() | {"input_scale"}) - {"learn"}
+
+    @classmethod
+    def learned(cls) -> frozenset[str]:
+        """The models, by proposals of a learner. A change by an operator would skip the proof."""
+        return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
         """A value per channel; k_d has no value for the last. A schedule needs V, and no model of

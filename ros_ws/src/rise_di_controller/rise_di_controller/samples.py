@@ -7,7 +7,7 @@ arrive.
 - `step`: y changes faster than an aircraft can. The test compares y with the y before and has no
   model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
   controller takes the third in a row that agrees.
-- `step`: y stands still, every value to the bit, though it has changed with every sample before.
+- `step`: y stands still, every value to the bit, after changes with every sample.
 """
 
 from collections.abc import Sequence
@@ -43,10 +43,10 @@ STILL = 5
 MOVING = 100
 """Samples in a row with a change, which show that this y never stands still by itself.
 
-Noise changes every sample. A sensor with steps, where at rest a share c of the samples changes,
-shows c^100 by chance and (1 - c)^5 then: at most 1e-9, at c = 0.95. A y that a bridge repeats, and
-the y of a simulation without noise in trim, do not show that, and are never frozen. A simulation
-that settles comes to rest by ever rarer changes of the last bit.
+Noise changes every sample. Of a sensor with steps, a share c of whose samples changes at rest, 100
+changes and 5 repeats have the probability c^100 (1 - c)^5, at most 1e-9, at c = 0.95. A y repeated
+by a bridge and a simulation without noise in trim have no 100 changes in a row, and are never
+frozen. A simulation settles by ever rarer changes of the last bit.
 """
 
 
@@ -123,7 +123,7 @@ def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> 
 
 
 def standstill(state: SampleState, sample: StampedVector) -> str:
-    """That y stands still, as a sentence."""
+    """The standstill of y, as a sentence."""
     span = seconds(sample.stamp_ns - state.stillness.since_ns)
     return f"y: found every value as before for {span:g} s, expected an aircraft that moves"
 
@@ -146,8 +146,8 @@ def step(
     The possible change grows with the time since the last sample taken: no sensor is locked out for
     ever. After lost samples, largest takes the whole change, since y may be as noisy.
 
-    The samples of the first FIRST_NS are NEAR, too. They may be those of a gyro that starts, so
-    largest takes no change that is far, and of the others at most reach.
+    The samples of the first FIRST_NS are NEAR, too. A gyro may start with garbage, so largest takes
+    no far change then, and of near changes at most reach.
 
     FROZEN where every value is as before, for STILL samples and periods, after MOVING samples with
     a change.
