@@ -133,6 +133,17 @@ def test_the_readme_links_the_main_pages() -> None:
     assert {f"docs/{page}.md" for page in LINKED} <= set(links(REPOSITORY / "README.md"))
 
 
+FIRST_SCREEN = 40  # lines of a page that a visitor sees without scrolling
+
+
+def test_first_screen_of_readme_says_how_to_fly_and_how_to_test() -> None:
+    lines = (REPOSITORY / "README.md").read_text().splitlines()[:FIRST_SCREEN]
+    targets = (REPOSITORY / "Makefile").read_text()
+    for target in ("fly", "test"):
+        assert any(line.startswith(f"    make {target} ") for line in lines)
+        assert f"\n{target}: " in targets
+
+
 def test_sources_tests_and_pages_use_words_of_field() -> None:
     files = [
         path
