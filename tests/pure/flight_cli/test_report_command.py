@@ -95,3 +95,12 @@ def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: s
 def test_flight_without_samples_has_summary_with_same_keys(runs: list[Path]) -> None:
     empty = empty_summary(find_scenario("osprey_gust"), ended_early("no progress"))
     assert empty.keys() == json.loads((runs[0] / "summary.json").read_text()).keys()
+
+
+def test_folder_in_the_place_of_the_link_to_the_run_is_refused_before_the_flight(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "latest").mkdir()
+    with refusing("latest: found a folder, expected no file of this name: it becomes a link"):
+        new_run(find_scenario("osprey_gust"), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["latest"]

@@ -77,6 +77,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     require(
         is_text, "runs", ascii(place), "a folder with a name in UTF-8, as logs and reports hold it"
     )
+    latest = runs / "latest"
+    is_free = latest.is_symlink() or not latest.exists()
+    require(is_free, str(latest), "a folder", "no file of this name: it becomes a link to the run")
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
