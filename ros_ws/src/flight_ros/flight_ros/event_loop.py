@@ -55,7 +55,7 @@ REPORT_TIME_NS = NANOSECONDS // 2  # in which the reports of a second are done
 
 STATUS_UNEXPECTED = 1  # exit status after an unexpected exception
 
-TEARDOWN_TIME = 1.5
+TEARDOWN_TIME = 0.8
 """s, at most, of the middleware at the end of a node, which needs 0.2 s. Fast DDS 2.14 can wait for
 ever there, with the interpreter held, where other participants end at the same time
 (eProsima/Fast-DDS, issue 6513). The other nodes then notice the end by the lease, 2 s."""
