@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from flight_cli.output import new_table, parse_numbers, print_json, say
+from flight_cli.output import new_table, parse_numbers, print_json, print_table, say
 from flight_cli.words import argument, json_option, option, setting, values_of, warn
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -122,7 +122,7 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
         table = new_table(title, columns, columns, wrapped=headings if cells is _roots else ())
         for airframe in facts:
             table.add_row(airframe.name, *cells(airframe))
-        console.print(table)
+        print_table(console, table)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
     say(
         console,

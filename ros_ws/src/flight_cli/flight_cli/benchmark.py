@@ -18,7 +18,15 @@ from flight_campaign.benchmark_entry import find_entry
 from flight_campaign.benchmark_scores import SCORES, Flights, define, drawn_release
 from flight_campaign.benchmark_scores import Benchmark as BenchmarkRun
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
-from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar, say
+from flight_cli.output import (
+    COUNT_COLUMNS,
+    INTERRUPTED,
+    new_table,
+    print_json,
+    print_table,
+    progress_bar,
+    say,
+)
 from flight_cli.words import REQUIRED, argument, json_option, option
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -122,7 +130,7 @@ def _show(console: Console, scores: Mapping[str, Any]) -> None:
                 str(scored["lost"]),
             )
             table.add_row(scored["title"], str(scored["aircraft"]), *figures)
-    console.print(table)
+    print_table(console, table)
     for scored in scores["sets"].values():
         if "over_time" in scored:
             windows = ", ".join(

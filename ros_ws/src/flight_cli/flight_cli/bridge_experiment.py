@@ -22,7 +22,7 @@ from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.log_options import warn_of_lacks
-from flight_cli.output import flight_progress, new_table, print_json, say
+from flight_cli.output import flight_progress, new_table, print_json, print_table, say
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.files import (
     display_path,
@@ -241,7 +241,7 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
             f"{controller.period[i]:g}",
             band,
         )
-    console.print(table)
+    print_table(console, table)
     say(
         console,
         f"{'Hover' if hovers else 'Fly straight and level'}, in the mode in which the map "
@@ -320,7 +320,7 @@ def _show_response(
         for value, deviation in pairs:
             cells += [_digits(value, 3), _digits(deviation, 2)]
         table.add_row(name, *cells)
-    console.print(table)
+    print_table(console, table)
 
 
 def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
@@ -352,7 +352,8 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
                 *(f"{value:.3g}" for value in numbers),
                 "model" if model.usable else "step response",
             )
-    console.print(table, loop)
+    print_table(console, table)
+    print_table(console, loop)
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)
@@ -391,7 +392,7 @@ def _show_gains(console: Console, channels: Channels, response: Response, flyabl
         place = response.outputs.index(output)
         bandwidth = params.K[i] * params.input_scale[i] * abs(channels.Omega[place, place])
         table.add_row(f"{output} by {name}", f"{bandwidth:.3g}", f"{params.Lambda[i]:.3g}")
-    console.print(table)
+    print_table(console, table)
     if flyable.delay_margin is not None:
         say(
             console,

@@ -40,6 +40,7 @@ from flight_cli.output import (
     new_table,
     parse_numbers,
     print_json,
+    print_table,
     progress_bar,
     say,
 )
@@ -274,7 +275,7 @@ def _print(console: Console, results: Table, first: str) -> None:
     )
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
-    console.print(table)
+    print_table(console, table)
     say(console, results.legend, style="dim")
 
 
@@ -292,7 +293,7 @@ def _show(
     table = new_table(escape(title), ("figure", *FIGURE_HEADINGS))
     for row in figure_rows(tally, units):
         table.add_row(*row)
-    console.print(table)
+    print_table(console, table)
     for word, count in (
         ("diverged", tally.diverged),
         (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost),

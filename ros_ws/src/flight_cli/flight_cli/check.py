@@ -24,7 +24,7 @@ from autopilot_bridge.map_rows import MAVLINK, InputRow, OutputRow
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import log_namespace, warn_of_lacks_in
-from flight_cli.output import new_table, print_json, say
+from flight_cli.output import new_table, print_json, print_table, say
 from flight_cli.words import REQUIRED, argument, json_option, option, warn
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
@@ -124,7 +124,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
                 f"({channel.ratio:.0f}){' ' if channel.ratio >= MIN_RATIO else '?'}"
             )
         table.add_row(*cells)
-    console.print(table)
+    print_table(console, table)
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left_aligned=headings)
     for channel in checked.channels:
@@ -136,7 +136,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
             channel_map.messages[command.message].topic,
         )
         fields.add_row(f"y.{channel.output}", _format_field(output), output.topic)
-    console.print(fields)
+    print_table(console, fields)
     if checked.seconds:
         say(
             console,

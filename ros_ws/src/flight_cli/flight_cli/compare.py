@@ -34,6 +34,7 @@ from flight_cli.output import (
     LICENCE,
     new_table,
     parse_numbers,
+    print_table,
     progress_bar,
     say,
     write_text,
@@ -64,7 +65,6 @@ cost: the least of {seeds} seeds of the tuning, and the difference to the larges
   {slew}, of the nominal and {uncertain} uncertain aircraft at +-{level:g} %, once with u in time and once late:
 {costs}
 """  # noqa: E501 - a text as it is written
-WIDTH = 200  # characters, the least width of the table
 
 
 Gains = dict[str, dict[str, TuningResult]]
@@ -196,7 +196,6 @@ class Compare:
                 results.append(result)
                 bar.advance(task)
         console = Console()
-        console.width = max(console.width, WIDTH)
         self._show(console, contest, results, benchmark, tuned)
         if self.write is not None:
             law, aim = contest.names[0], aims[0]
@@ -237,7 +236,7 @@ class Compare:
         for aim in contest.aims:
             if shown := [result for result in results if result.objective == aim]:
                 title = gain_tuning.OBJECTIVES[aim].title
-                console.print(_table(title, shown, contest.entries, scenario))
+                print_table(console, _table(title, shown, contest.entries, scenario))
         laws = {name: contest.entries[name] for name in tuned if tuned[name]}
         effect = WIND_EFFECTS[scenario.aircraft.uncertainty.wind]
         say(

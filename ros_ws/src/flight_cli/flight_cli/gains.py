@@ -34,7 +34,15 @@ from flight_cli.gains_guarantee import (
     show_guarantee,
     write_unstable,
 )
-from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, say, write_text
+from flight_cli.output import (
+    LICENCE,
+    new_table,
+    parse_numbers,
+    print_json,
+    print_table,
+    say,
+    write_text,
+)
 from flight_cli.words import (
     REQUIRED,
     argument,
@@ -332,7 +340,7 @@ def _show_trade(console: Console, selection: Selection) -> None:
         )
         margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
-    console.print(table)
+    print_table(console, table)
 
 
 def _parse_lags(text: str) -> list[float]:
@@ -348,8 +356,9 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
     outputs = first.controller.outputs
     samples = len(study.A) - 1
     aircraft = f"{study.airframe.name}, A and B +-{100 * study.uncertainty:g} % ({samples} samples)"
-    console.print(
-        _gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft)
+    print_table(
+        console,
+        _gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft),
     )
     for name, answer in answers.items():
         if answer.margins is not None and answer.margins.nominal.stable:
@@ -361,7 +370,7 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
             )
             for row in margin_rows(answer.margins):
                 table.add_row(*row)
-            console.print(table)
+            print_table(console, table)
             say(console, modes_text(answer.margins))
         say(console, f"{name}: {_format_delay_margin(study, answer)}")
     say(console, MARGIN_LEGEND, style="dim")
@@ -369,7 +378,7 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
         if not getattr(first, part):
             continue
-        console.print(_condition_table(answers, part, heading))
+        print_table(console, _condition_table(answers, part, heading))
     if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
         say(console, marginal)
     estimate = (

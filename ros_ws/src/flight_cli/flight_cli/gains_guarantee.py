@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
-from flight_cli.output import LICENCE, new_table, say, write_text
+from flight_cli.output import LICENCE, new_table, print_table, say, write_text
 from flight_core.arguments import as_number
 from flight_core.files import writing
 from flight_core.parameters import require
@@ -73,4 +73,4 @@ def show_guarantee(
         table.add_row(
             name, *(f"{value:{form}}" for value, form in zip((disk, *values), FORMS, strict=True))
         )
-    console.print(table)
+    print_table(console, table)

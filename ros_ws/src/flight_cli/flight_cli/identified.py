@@ -11,7 +11,7 @@ from rich.console import Console
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
 from flight_analysis.report.display_units import display_unit
 from flight_cli.gains import speed_of_margin
-from flight_cli.output import new_table, say
+from flight_cli.output import new_table, print_table, say
 from flight_core.units import si_per_unit
 from flight_design.identification.step_identification import IdentifiedAircraft
 
@@ -85,7 +85,7 @@ def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
         )
         figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
         table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
-    console.print(table)
+    print_table(console, table)
     margin = (
         "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
     )

@@ -40,6 +40,7 @@ from flight_cli.output import (
     entry_table,
     new_table,
     print_json,
+    print_table,
     progress_bar,
     require_yaml,
     say,
@@ -384,7 +385,7 @@ def _show_flights_of_model(
     table = new_table("\nRms of the error", headings)
     for title, rms in (("recorded", again.recorded), ("with the model", again.again)):
         table.add_row(title, *(f"{rms[name] * unit.factor:.3g}" for name, unit in units.items()))
-    console.print(table)
+    print_table(console, table)
     say(console, f"{again.origin}; outcome: {again.outcome}")
 
 
@@ -401,7 +402,9 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
 
 
 def _show_model(console: Console, identification: Identification) -> None:
-    console.print(entry_table(f"A and B of {identification.airframe.name}", identification.entries))
+    print_table(
+        console, entry_table(f"A and B of {identification.airframe.name}", identification.entries)
+    )
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
     table = new_table("\nInnovations of the held-out samples, one of three seconds", headings)
     for i, (name, unit) in enumerate(_units(identification).items()):
@@ -412,7 +415,7 @@ def _show_model(console: Console, identification: Identification) -> None:
         table.add_row(
             f"{name} ({unit.unit})", *(f"{figure:.3g}" for figure in chain.from_iterable(figures))
         )
-    console.print(table)
+    print_table(console, table)
     gain = identification.after.log_likelihood - identification.before.log_likelihood
     say(
         console,

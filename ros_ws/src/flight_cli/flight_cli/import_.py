@@ -15,7 +15,7 @@ from autopilot_bridge.params import find_map, load_map
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import PROVENANCE, attachments_for
-from flight_cli.output import new_table, say
+from flight_cli.output import new_table, print_table, say
 from flight_cli.words import REQUIRED, argument, option, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.outcome import End, Outcome
@@ -119,7 +119,7 @@ def _show_agreement(console: Console, rows: list[Agreement]) -> None:
     for row in rows:
         style = "bold red" if row.differs else None
         table.add_row(row.what, row.logged or "not recorded", row.mapped, style=style)
-    console.print(table)
+    print_table(console, table)
 
 
 def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
@@ -151,7 +151,7 @@ def _show_topics(console: Console, title: str, tape: Tape) -> None:
         rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
         longest = float(gaps.max()) if len(gaps) else 0.0
         table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
-    console.print(table)
+    print_table(console, table)
 
 
 def _numbers(instances: list[str]) -> dict[str, int]:

@@ -22,6 +22,7 @@ from flight_cli.output import (
     entry_table,
     model_table,
     print_json,
+    print_table,
     require_yaml,
     say,
     write_text,
@@ -72,9 +73,11 @@ class Learn:
         over = "" if account is None else account.over("internals")
         part = f", {over}" if over else ""
         if result.entries:
-            console.print(entry_table(f"A and B of the last identification{part}", result.entries))
+            print_table(
+                console, entry_table(f"A and B of the last identification{part}", result.entries)
+            )
         if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
-            console.print(model_table(models, display_units(flown), part))
+            print_table(console, model_table(models, display_units(flown), part))
         if result.model is not None and self.write is not None:
             write_text("--write", self.write, learned_yaml(result, str(self.run)))
             say(console, f"model: {escape(display_path(self.write))}")

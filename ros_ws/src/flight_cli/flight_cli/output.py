@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rich import box
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, RenderableType
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -21,6 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.scenario import Scenario
@@ -73,21 +75,23 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         say(console, busy, style="bold")
     title = f"Tracking error ({summary['error']}), {time_flown(summary)}"
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
-    console.print(
-        grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units))
+    print_table(
+        console,
+        grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)),
     )
     if rows := input_rows(summary, units):
         title = f"Inputs about trim, and mean abs(u_dot) per second{taken_over(summary, 'inputs')}"
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
-        console.print(grouped_table(title, "input", columns, rows))
+        print_table(console, grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
-        console.print(
-            _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance"))
+        print_table(
+            console,
+            _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")),
         )
         if legs := leg_results(summary["guidance"]["legs"]):
             say(console, f"{legs}{taken_over(summary, 'guidance')}")
     if summary["models"]:
-        console.print(model_table(summary["models"], units, taken_over(summary, "errors")))
+        print_table(console, model_table(summary["models"], units, taken_over(summary, "errors")))
     if flight.controllers:
         _show_margins(console, flight, flight.scenario)
     if commands := command_results(summary):
@@ -108,7 +112,7 @@ def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) 
     if not loops:
         return
     margins = margin_figures.flown_margin_table(loops)
-    console.print(grouped_table(margins.caption, "", margins.columns, margins.rows))
+    print_table(console, grouped_table(margins.caption, "", margins.columns, margins.rows))
 
 
 def _show_imported(console: Console, flight: RecordedFlight) -> None:
@@ -117,10 +121,11 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
         caption = f"{title} about trim, {format_seconds(summary['duration'])}"
-        console.print(
+        print_table(
+            console,
             grouped_table(
                 caption, "channel", columns, table_rows(summary[key], columns, flight.units)
-            )
+            ),
         )
     for note in summary["notes"]:
         say(console, f"note: {note}")
@@ -205,6 +210,30 @@ def new_table(
         justify: Literal["left", "right"] = "left" if heading in left else "right"
         table.add_column(heading, justify=justify, no_wrap=heading not in wrapped, overflow="fold")
     return table
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table at the width that its figures need: a narrow terminal folds the lines, and no
+    cell is cut.
+    """
+    for column in table.columns:
+        if column.no_wrap:
+            texts = map(_plain, (column.header, *column.cells))
+            lines = [line for text in texts for line in text.split("\n")]
+            column.min_width = max(map(cell_len, lines), default=0)
+    width = console.width
+    wide = console.options.update(width=WIDEST)
+    console.width = max(width, console.measure(table, options=wide).minimum)
+    console.print(table)
+    console.width = width
+
+
+def _plain(cell: RenderableType) -> str:
+    """The text of a cell as it is printed."""
+    return Text.from_markup(cell).plain if isinstance(cell, str) else str(cell)
+
+
+WIDEST = 10_000  # characters, more than any table has
 
 
 NAME_COLUMN = TextColumn("{task.description}")

@@ -31,7 +31,7 @@ from flight_analysis.metrics import error_metrics
 from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.sample_counts import WHOLE
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, new_table, print_json, stdout_for, write_text
+from flight_cli.output import LATEST, new_table, print_json, print_table, stdout_for, write_text
 from flight_cli.settings import parse_settings, settings_option
 from flight_cli.words import argument, json_option, option
 from flight_core.outcome import STATUS_SHORTFALL
@@ -183,7 +183,7 @@ def _show(shown: Shown, notes: Sequence[str]) -> None:
         table = new_table("u computed minus u recorded", headings)
         for name, figures in _u_figures(result, shown.inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
-        console.print(table)
+        print_table(console, table)
     for note in notes:
         console.print(f"note: {note}")
     if shown.guided is not None:

@@ -16,7 +16,16 @@ from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import RecordedFlight, taken_over
 from flight_analysis.report.summary_rows import ERROR_COLUMNS
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, STDOUT, new_table, print_json, say, show_flight, stdout_for
+from flight_cli.output import (
+    LATEST,
+    STDOUT,
+    new_table,
+    print_json,
+    print_table,
+    say,
+    show_flight,
+    stdout_for,
+)
 from flight_cli.repair import repair_log
 from flight_cli.words import argument, json_option, option, setting, values_of
 from flight_core.files import display_path
@@ -133,4 +142,4 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
                 *cells,
                 end_section=k == len(channel.rows) - 1,
             )
-    console.print(table)
+    print_table(console, table)
