@@ -304,7 +304,7 @@ def test_the_pilot_has_the_aircraft_again(
     record_testsuite_property(f"ArduPlane, {name}", f"{sticks_at - began:.3f}")
     assert event.sticks_act[0] <= sticks_at - began <= event.sticks_act[1]
     (one,) = flown["engagements"]
-    assert event.reason in f"{one['reason']}; {flown['outcome']}"
+    assert event.reason in f"{one['reason']}; {flown['outcome']['sentence']}"
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:

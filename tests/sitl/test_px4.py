@@ -153,7 +153,7 @@ def test_px4_flies_by_its_own_law_again(
     record_testsuite_property(f"PX4, {name}", f"{changed - began:.3f}")
     assert changed - began <= limit + LATE
     (one,) = summary["engagements"]
-    assert event.reason in f"{one['reason']}; {summary['outcome']}"
+    assert event.reason in f"{one['reason']}; {summary['outcome']['sentence']}"
 
 
 def test_lost_transmitter_releases_within_a_second(

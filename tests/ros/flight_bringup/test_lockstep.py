@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import COMPLETED, STATUS_LOST_CONTACT
 from flight_core.parameters import flatten, nest
 from flight_design.gains.gain_selection import with_feedforward
 from flight_log.tape_reader import read_run
@@ -162,7 +162,7 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
         killed = time.time()
         for role, process in processes.items():
             if role != victim:
-                assert process.end() == 3, process.output
+                assert process.end() == STATUS_LOST_CONTACT, process.output
                 # The liveliness lease is 1.8 s; the rest is for a busy host.
                 assert time.time() - killed < 3.0 + host_delays.since(killed), role
                 assert f"lost contact with {victim}" in process.output, role

@@ -107,4 +107,4 @@ def stop(victim: psutil.Process, duration: float) -> None:
 
 
 def outcome(folder: Path) -> str:
-    return str(json.loads((folder / "latest" / "summary.json").read_text())["outcome"])
+    return str(json.loads((folder / "latest" / "summary.json").read_text())["outcome"]["sentence"])
