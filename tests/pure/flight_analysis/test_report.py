@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import comparison, figures, html, plotting
-from flight_analysis.report.display_units import DisplayUnit
+from flight_analysis.report.display_units import DisplayUnit, state_units
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext, SampleStore
 from flight_analysis.report.spectra import spectra
@@ -261,13 +261,13 @@ def test_metrics_of_several_flights_compared_by_channel_name(pair: list[Recorded
         table.caption: {row.name: row for row in table.rows}
         for table in comparison.error_tables(pair)
     }
-    assert list(compared) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
-    whole = compared["q (mrad/s)"]["rms whole"]
-    assert whole.texts == ("200", "100")
+    assert list(compared) == ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
+    whole = compared["q (deg/s)"]["rms whole"]
+    assert whole.texts == ("11.5", "5.73")  # 0.2 and 0.1 rad/s
     assert whole.ratios == pytest.approx((1.0, 0.5))
-    assert compared["p (mrad/s)"]["rms whole"].texts == ("0.00", "-")
-    assert compared["p (mrad/s)"]["rms whole"].ratios == (None, None)  # no ratio to 0
-    assert "rms gust" not in compared["q (mrad/s)"]  # neither flight had one
+    assert compared["p (deg/s)"]["rms whole"].texts == ("0.00", "-")
+    assert compared["p (deg/s)"]["rms whole"].ratios == (None, None)  # no ratio to 0
+    assert "rms gust" not in compared["q (deg/s)"]  # neither flight had one
 
 
 def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> None:
@@ -370,6 +370,39 @@ def test_ticks_of_another_time_are_neither_better_nor_worse(unlike: list[Recorde
     assert comparison.alike(pair) == (True, True)
     assert comparison.alike(pair, timed=True) == (True, False)
     assert [each.key for each in comparison.conditions(pair)] == ["flown"]
+
+
+def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scenario) -> None:
+    """Y of the osprey has the order q, V, p, r, the controller q, p, r, V."""
+    tape = simulate(servo.vary(flight={"duration": 1.0}))
+    one = recorded("run", servo, tape)
+    order = list(servo.controller.outputs)
+    assert list(one.summary["errors"]) == order == ["q", "p", "r", "V"]
+    assert list(one.summary["inputs"]) == list(servo.controller.inputs)
+    shown = figures.plot_context(tape, one.units, {})
+    labels = ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
+    assert titles(figures.tracking_figure(shown)) == labels
+    assert titles(figures.error_figure(shown)) == labels
+    assert titles(figures.integral_figure(shown))[::2] == [f"∫e {name}" for name in order]
+
+
+def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
+    """One degree of alpha is drawn as 1."""
+    truth = held(x__alpha=DEG, x__theta=2.0 * DEG, x__q=3.0 * DEG, x__V=4.0)
+    shown = figures.state_figure(context(flight(truth=truth)), state_units(servo))
+    curves = dict(zip(titles(shown), drawn(shown).data, strict=True))
+    expected = {"V (m/s)": 4.0, "alpha (deg)": 1.0, "q (deg/s)": 3.0, "theta (deg)": 2.0}
+    assert {title: curve.y[0] for title, curve in curves.items()} == pytest.approx(expected)
+
+
+def test_sentence_on_the_sign_stands_at_the_law(tmp_path: Path, servo: Scenario) -> None:
+    """The first line is of the flight: aircraft and time flown."""
+    page = page_of(tmp_path, servo, simulate(servo.vary(flight={"duration": 1.0})))
+    head, _, rest = page.partition("<h2>")
+    assert "softened sign" not in head
+    assert "osprey, 1.0 s flown" in head
+    law = rest.partition("Integrals of the law</h2>")[2].partition("</section>")[0]
+    assert "At 100 Hz with the softened sign" in law
 
 
 def test_curve_is_broken_at_gap_and_u_held() -> None:

@@ -59,7 +59,7 @@ def test_flight_ends_with_table_log_and_report(
         "metadata.yaml", "report.html", "osprey_gust.yaml", "summary.json", f"{run.name}_0.mcap",
         "airframe.yaml", "parameters.yaml", "provenance.yaml",
     }  # fmt: skip
-    assert "q (mrad/s)" in shown.stdout
+    assert "q (deg/s)" in shown.stdout
     assert f"runs/{run.name}/report.html" in shown.stdout
     assert "Traceback" not in shown.stderr
 

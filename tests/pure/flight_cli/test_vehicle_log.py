@@ -603,7 +603,7 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(
     assert "flight.bin, a DataFlash log of ArduPilot, by the map ardupilot" in page
     shown = View(bag)
     shown.update()
-    assert shown.description["units"]["q"]["unit"] == "mrad/s"
+    assert shown.description["units"]["q"]["unit"] == "deg/s"
     for command, sentence in (
         (["replay", str(bag)], "found an imported log, expected a flight of the stack"),
         (

@@ -7,6 +7,7 @@ refuses.
 import asyncio
 import io
 import json
+import math
 import re
 import signal
 import socket
@@ -143,7 +144,7 @@ def test_description_holds_scenario(recorded: Path) -> None:
     flight = Flight(recorded)
     flight.update()
     shown = flight.description
-    assert shown["units"]["q"] == {"unit": "mrad/s", "factor": 1000.0}
+    assert shown["units"]["q"] == {"unit": "deg/s", "factor": pytest.approx(180.0 / math.pi)}
     assert shown["modes"][""]["1"] == "ENGAGED"
     assert [name for name, *_ in shown["gusts"]] == ["vertical", "lateral"]
     assert shown["commands"][0][1] > 0.0

@@ -91,7 +91,7 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
             "V: y over y_m",
             "q: error e",
         ]
-        assert {"elevator", "gust", "altitude", "ticks: lateness"} <= set(titles)
+        assert {"elevator", "wind", "altitude", "ticks: lateness"} <= set(titles)
         for selector in ("#scene", "#horizon", "#timeline", "#charts canvas"):
             assert colours_of(browser, selector) > 5
         hosts = browser.run(

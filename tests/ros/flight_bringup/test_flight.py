@@ -59,7 +59,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     beside.end()
     assert "Traceback" not in flight.output + beside.output
     assert "outcome: interrupted" in flight.output
-    assert "q (mrad/s)" in flight.output
+    assert "q (deg/s)" in flight.output
     run = (tmp_path / "runs" / "latest").resolve()
     assert (run / "metadata.yaml").is_file()
     assert is_closed(run)

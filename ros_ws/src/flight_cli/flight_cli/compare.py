@@ -373,10 +373,12 @@ def _notes(
     return NOTES.strip().format(
         titles="\n".join(f"{name}: {law.title}" for name, law in laws.items()),
         unit=", ".join(
-            f"{error * units[name].factor:g} {units[name].unit} of {name}" for name, error in errors
+            f"{error * units[name].factor:.3g} {units[name].unit} of {name}"
+            for name, error in errors
         ),
         slew=", ".join(
-            f"{slew * units[name].factor:g} {units[name].unit}/s of {name}" for name, slew in slews
+            f"{slew * units[name].factor:.3g} {units[name].unit}/s of {name}"
+            for name, slew in slews
         ),
         costs="\n".join(f"  {cost}" for cost in costs),
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,

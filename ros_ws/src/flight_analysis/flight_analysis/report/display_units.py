@@ -3,9 +3,10 @@
 """Units and numbers of tables and figures."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.guided import UNITS
 from flight_core.units import si_per_unit
@@ -36,23 +37,48 @@ def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
     return f"{name} ({unit})" if unit else name
 
 
+DEGREES = {"rad": "deg", "rad/s": "deg/s"}
+"""Units in which angles and rates are shown, by the unit of the airframe file."""
+
+
 def display_unit(unit: str) -> DisplayUnit:
-    """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same
-    unit.
+    """The display unit of a unit of the airframe file: deg for rad, deg/s for rad/s, otherwise the
+    same unit.
     """
-    return (
-        DisplayUnit("mrad/s", 1e3)
-        if unit == "rad/s"
-        else DisplayUnit(unit, 1.0 / si_per_unit(unit))
-    )
+    shown = DEGREES.get(unit, unit)
+    return DisplayUnit(shown, 1.0 / si_per_unit(shown))
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units of tables and figures by channel of y and u."""
+    """Units of tables and figures by channel of y and u, in the order of the controller."""
     channels = scenario.aircraft.channels()
-    return {
+    units = {
         name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()
     }
+    first = (*scenario.controller.outputs, *scenario.controller.inputs)
+    return {name: units[name] for name in first if name in units} | units
+
+
+STATES = {
+    **dict.fromkeys(("alpha", "beta", "phi", "theta", "psi"), "rad"),
+    **dict.fromkeys(("p", "q", "r"), "rad/s"),
+    **dict.fromkeys(("V", "u", "v", "w", "climb"), "m/s"),
+    **dict.fromkeys(("north", "east", "altitude"), "m"),
+}
+"""SI units of the states of an aircraft without an airframe file."""
+
+
+def state_units(scenario: Scenario) -> dict[str, DisplayUnit]:
+    """Units of the states of a simulated aircraft."""
+    aircraft = scenario.aircraft
+    states = STATES if aircraft.is_jsbsim else load_airframe(aircraft.airframe).states
+    return {name: display_unit(unit) for name, unit in states.items()}
+
+
+def in_order(names: Iterable[str], units: Mapping[str, DisplayUnit]) -> list[str]:
+    """The channels in the order of their units, then the unknown ones as they come."""
+    places = {name: place for place, name in enumerate(units)}
+    return sorted(names, key=lambda name: places.get(name, len(places)))
 
 
 def format_value(value: float | None, factor: float = 1.0) -> str:

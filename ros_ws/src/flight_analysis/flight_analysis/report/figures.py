@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import Windows, known_entries, mask_spans, tracking_error, true_error
-from flight_analysis.report.display_units import NO_UNIT, DisplayUnit
+from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, in_order
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
@@ -138,7 +138,7 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
     if true is not None and _nonzero_group(context.tape, "noise").names:
         curves = {"measured": measured._replace(colour=MEASURED), "true": Curve(true, ERROR)}
     figure = time_series_figure(context, curves, height=110)
-    for index, name in enumerate(measured.signal.names):
+    for index, name in enumerate(in_order(measured.signal.names, context.units)):
         floor = (floors or {}).get(name, 0.0)
         largest = np.max(np.abs(measured.signal[name]), initial=0.0)
         if floor > MIN_VISIBLE_FRACTION * largest > 0.0:
@@ -163,7 +163,7 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
             "actuator": Curve(position, PLANT),
         }
     figure = time_series_figure(context, curves)
-    for index, name in enumerate(tape["u"].names):
+    for index, name in enumerate(in_order(tape["u"].names, context.units)):
         factor = context.units.get(name, NO_UNIT).factor
         values = [
             curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names
@@ -233,7 +233,7 @@ def integral_figure(context: PlotContext) -> Figure | None:
     if "internals" not in context.tape:
         return None
     internals = context.tape["internals"]
-    outputs = internals.group("Pi").names
+    outputs = in_order(internals.group("Pi").names, context.units)
     channels: dict[str, str] = {}
     for name in outputs:
         channels |= {f"{label} {name}": f"{group}.{name}" for group, label in INTEGRALS.items()}
@@ -306,9 +306,8 @@ def spectrum_figure(
     }
     if not runs:
         return None
-    channels = list(
-        dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values()))
-    )
+    names = dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values()))
+    channels = in_order(names, units)
     columns = min(len(channels), 2)
     figure = Figure(len(channels), columns, 190, spacing=0.2)
     for label, (tape, period_ns) in runs.items():
@@ -396,9 +395,10 @@ def wind_figure(context: PlotContext) -> Figure | None:
     )
 
 
-def state_figure(context: PlotContext) -> Figure | None:
-    """The states of a simulated aircraft."""
+def state_figure(context: PlotContext, units: Mapping[str, DisplayUnit]) -> Figure | None:
+    """The states of a simulated aircraft, in these units."""
     x = _truth_group(context.tape, "x")
+    context = context._replace(units=units)
     return (
         time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130)
         if x.names

@@ -13,7 +13,7 @@ import numpy as np
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
-from flight_analysis.report.display_units import QUANTITY_UNITS
+from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit
 from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
 from flight_analysis.report.guided import flown_speed
 from flight_analysis.report.plotting import (
@@ -203,6 +203,9 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
     figure.add_scatter(label, [None], [None], line={"color": WIND})
 
 
+AIRSPEED = "airspeed"  # absolute: V is the deviation from the trim speed
+
+
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
     """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim
     speed V0, m/s.
@@ -213,9 +216,11 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
         log["target.altitude"],
         np.nan,
     )
-    commands = {"altitude": commanded, "V": log["V_c"]}
-    flown = {"altitude": log["pose.altitude"], "V": flown_speed(context.tape, speed)}
-    return _over_commands(context, commands, flown, bounds)
+    commands = {"altitude": commanded, AIRSPEED: log["V_c"]}
+    flown = {"altitude": log["pose.altitude"], AIRSPEED: flown_speed(context.tape, speed)}
+    units = {**context.units, AIRSPEED: DisplayUnit("m/s", 1.0)}
+    limits = {**bounds, AIRSPEED: bounds["V"]} if "V" in bounds else bounds
+    return _over_commands(context._replace(units=units), commands, flown, limits)
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:

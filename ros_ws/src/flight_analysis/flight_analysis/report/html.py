@@ -26,7 +26,12 @@ from flight_analysis.report import (
     plotting,
     tables,
 )
-from flight_analysis.report.display_units import QUANTITY_UNITS, format_seconds, format_value
+from flight_analysis.report.display_units import (
+    QUANTITY_UNITS,
+    format_seconds,
+    format_value,
+    state_units,
+)
 from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay
@@ -243,10 +248,21 @@ def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -
 
 
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:
+    return f"{scenario.aircraft.airframe}, {time_flown(flight.summary)}"
+
+
+def _law(scenario: Scenario) -> str:
+    """The rate of the law, and how the law flies."""
     controller = scenario.controller
-    return (
-        f"{time_flown(flight.summary)}, at {controller.rate:g} Hz with the {controller.summary()}"
-    )
+    return f"At {controller.rate:g} Hz with the {controller.summary()}"
+
+
+def _about_trim(scenario: Scenario) -> str:
+    """What V means in a figure of y."""
+    channels = scenario.aircraft.channels()
+    if "V" not in channels.outputs:
+        return ""
+    return f"V is the airspeed less that of trim, {channels.speed:g} m/s"
 
 
 def _sections(
@@ -257,9 +273,10 @@ def _sections(
     run = (flight.tape, flight.period_ns)
     colour = figures.PLANT
     spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
+    trim = _about_trim(scenario)
     return [
         *_guidance_sections(flight, scenario, context),
-        Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
+        Section("Output y over the reference y_m", trim, figures.tracking_figure(context)),
         Section(
             "Tracking error e = y - y_m",
             "The noise floor is drawn where it is wide enough to see.",
@@ -278,10 +295,11 @@ def _sections(
             figures.learned_figure(context, learned_lines(flight.tape, scenario)),
         ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
-        Section("States", "SI where no unit is given", figures.state_figure(context)),
+        Section("States", trim, figures.state_figure(context, state_units(scenario))),
         Section(
             "Integrals of the law",
-            "of e, in SI times s; Pi, of the sign term, in scaled inputs",
+            f"{_law(scenario)}. Integrals of e, in SI times s; Pi, of the sign term, in scaled "
+            "inputs",
             figures.integral_figure(context),
         ),
         Section("Error of the sensors", "y less the true output", figures.sensor_figure(context)),

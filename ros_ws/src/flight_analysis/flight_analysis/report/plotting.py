@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, channel_label
+from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, channel_label, in_order
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -210,9 +210,8 @@ def time_series_figure(
     """A subplot of `height` pixels per channel, with the curves of the channel; two columns are
     filled row by row.
     """
-    channels = list(
-        dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
-    )
+    names = dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
+    channels = in_order(names, context.units)
     columns = min(columns, len(channels))
     figure = Figure(len(channels), columns, height)
     followed = (figure.rows - 1) * columns

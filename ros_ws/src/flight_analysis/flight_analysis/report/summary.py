@@ -40,6 +40,7 @@ from flight_analysis.report.display_units import (
     display_unit,
     display_units,
     format_seconds,
+    in_order,
 )
 from flight_analysis.report.flown_models import FlownController
 from flight_analysis.report.guided import guidance_notices, guidance_summary
@@ -176,8 +177,8 @@ def summarise(
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
         "air": air,
-        "errors": _errors(tape, events, air),
-        "inputs": _inputs(tape, events, air),
+        "errors": _in_order(_errors(tape, events, air), scenario),
+        "inputs": _in_order(_inputs(tape, events, air), scenario),
         "transients": [
             settling.transient._asdict() | {"until": settling.until, "settling": settling.time}
             for settling in settling_times(tape, events)
@@ -186,7 +187,10 @@ def summarise(
         "latency": _finite(latency_metrics(tape)),
         "age_of_u": _finite(age),
         "guidance": guidance_summary(tape, scenario.guidance),
-        "models": [span._asdict() for span in errors_by_model(tape)],
+        "models": [
+            {**span._asdict(), "rms": _in_order(span.rms, scenario)}
+            for span in errors_by_model(tape)
+        ],
         "account": flight_account.as_json(),
         "notes": [
             *([busy] if busy else []),
@@ -481,6 +485,11 @@ def _errors(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
             "sign_switches": switches.get(channel),
         }
     return figures
+
+
+def _in_order(by_channel: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """Values by channel in the order of the controller."""
+    return {name: by_channel[name] for name in in_order(by_channel, display_units(scenario))}
 
 
 def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import {indexAt} from "./series.js";
 const LEFT = 58, RIGHT = 10, LINE = 15, BOTTOM = 4;
 const NARROW = 500; // px, width below which the readouts have a line of their own
 const NOISE = 1e-4; // of the extent of a chart: a value below reads 0
-const RESOLUTION = {ms: 1e-3, deg: 1e-4, "m/s": 1e-4, m: 1e-3, "mrad/s": 1e-3, "rad/s": 1e-6}; // by unit, the least extent of a chart
+const RESOLUTION = {ms: 1e-3, deg: 1e-4, "m/s": 1e-4, m: 1e-3, "deg/s": 1e-3, "rad/s": 1e-6}; // by unit, the least extent of a chart
 const LIMIT_VIEW_RATIO = 3; // a limit is in view where it is at most this many times the largest value
 
 // Ticks at multiples of 1, 2 or 5 times a power of ten, at most `most` of them.
@@ -119,7 +119,7 @@ export function chartsOf(flight, ghost) {
   const winds = flight.get("truth")?.group("gust") ?? [];
   if (winds.length) {
     const colours = ["--plant", "--ghost", "--error"];
-    charts.push({title: "gust", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
+    charts.push({title: "wind", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
   }
   if (flight.get("pose")?.channels.includes("altitude")) {
     const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];

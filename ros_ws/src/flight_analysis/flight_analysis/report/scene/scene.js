@@ -343,7 +343,7 @@ export class Scene {
     ctx.globalAlpha = 1;
   }
 
-  wind(ctx, see, flight, pose, t, colour) { // the gust along the body axes, from the tip of the arrow at the aircraft
+  wind(ctx, see, flight, pose, t, colour) { // the wind along the body axes, from the tip of the arrow at the aircraft
     const truth = flight.get("truth");
     const gust = ["longitudinal", "lateral", "vertical"].map(name => truth?.at(`gust.${name}`, t)).map(value => (Number.isFinite(value) ? value : 0));
     if (!pose.attitude || Math.hypot(...gust) < 0.05) return;
@@ -357,7 +357,7 @@ export class Scene {
     ctx.fillStyle = colour("--bad");
     ctx.font = "12px system-ui, sans-serif";
     ctx.textAlign = "center";
-    ctx.fillText(`gust ${Math.hypot(...gust).toFixed(1)} m/s`, at[0], at[1] - 6);
+    ctx.fillText(`wind ${Math.hypot(...gust).toFixed(1)} m/s`, at[0], at[1] - 6);
   }
 }
 
