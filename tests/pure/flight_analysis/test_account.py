@@ -479,7 +479,7 @@ def half(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFligh
     run = tmp_path_factory.mktemp("half") / "run"
     flight = read_flight(damage(whole, run / "run_0.mcap", "", DAMAGES["ends in the middle"]))
     rms = dict.fromkeys(flight.summary["errors"], 0.1)
-    models = [{"model": 1, "start": 0.0, "stop": 1.0, "rms": rms}]
+    models = [{"name": "file", "model": 1, "start": 0.0, "stop": 1.0, "rms": rms}]
     return flight._replace(summary=flight.summary | {"models": models})
 
 

@@ -221,8 +221,8 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
     columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
-    parts = set().union(*summary["errors"].values())
-    settling = [kind for kind in SETTLING_COLUMNS if kind in parts]
+    kinds = {transient["kind"] for transient in summary["transients"]}
+    settling = [kind for kind in SETTLING_COLUMNS if kind in kinds]
     rows = table_rows(summary["errors"], columns, units)
     for channel, row in zip(summary["errors"], rows, strict=True):
         row.extend(slowest_settling(summary, channel, kind) for kind in settling)
