@@ -31,6 +31,7 @@ from tests.small_disk import small_disk
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.outcome import INTERRUPTED
 from flight_core.rates import NANOSECONDS, period_ns
+from flight_log.disk import is_locked
 from flight_log.follow import Follower, Messages
 from flight_log.repair import repair
 from flight_log.tape_reader import read_run
@@ -305,6 +306,45 @@ def test_lost_messages_are_counted_and_reported(recorder: Recording) -> None:
     log = recorder.end()
     assert log.metadata["rise_di_lost"] == {"/truth": "12"}
     assert "/truth: the recorder lost 12 messages" in log.tape.notes
+
+
+def test_each_topic_that_loses_messages_has_its_own_line(recorder: Recording) -> None:
+    """After a loss on several topics at once; of one topic a line in two seconds."""
+    names = ("/y", "/y_m", "/u", "/truth", "/pose")
+    publishers = [recorder.world.publisher(JointState, name) for name in names]
+    encoder = Encoder(OUTPUTS, "/aircraft#1")
+
+    def send(first: int) -> None:
+        for k in range(first, first + 50):
+            for publisher in publishers:
+                publisher.publish(encoder.encode(k, np.zeros(4)))
+        recorder.run(0.2)
+
+    send(0)
+    for number, publisher in enumerate(publishers):
+        publisher.lose(7 + number)
+    send(50)
+    for publisher in publishers:
+        publisher.lose(3)
+    send(100)
+    lines = recorder.logged("messages lost")
+    assert len(lines) == len(names)
+    for number, name in enumerate(names):
+        assert recorder.logged(f"{name}: {7 + number} messages lost")
+    recorder.run(2.0)
+    for publisher in publishers:
+        publisher.lose(4)
+    send(150)
+    assert len(recorder.logged(": 4 messages lost")) == len(names)
+
+
+def test_file_is_locked_as_long_as_the_recorder_holds_it(recorder: Recording) -> None:
+    """So no repair touches a log that is written, and a page follows it to its end."""
+    recorder.run(0.5, *LOOP)
+    (path,) = recorder.folder.glob("*.mcap")
+    assert is_locked(path)
+    recorder.end()
+    assert not is_locked(path)
 
 
 def test_second_publisher_of_topic_is_no_loss(recorder: Recording) -> None:

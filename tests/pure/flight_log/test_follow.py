@@ -239,7 +239,7 @@ def test_replaced_file_is_not_read_on(part: float, run: Path) -> None:
     assert follower.fault == f"{path} was replaced by another file, as rise-di report --repair does"
 
 
-def test_file_locked_as_long_as_recorder_holds_it(tmp_path: Path) -> None:
+def test_lock_ends_with_the_stream_that_holds_it(tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
     path.write_bytes(b"")
     assert not is_locked(path)

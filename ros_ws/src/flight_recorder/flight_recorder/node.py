@@ -42,6 +42,7 @@ from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, sender_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
+from flight_ros.throttle import Throttle
 from flight_ros.ticker import HostTime, Tick
 from flight_ros.topics import (
     EXTERNAL,
@@ -63,6 +64,7 @@ from flight_ros.topics import (
 # the longest loss when the recorder is killed; also the period of the graph checks
 FLUSH_PERIOD_NS = nanoseconds(0.1)
 DISK_PERIOD_NS = NANOSECONDS
+LOSS_PERIOD_NS = 2 * NANOSECONDS  # between two lines on lost messages of a topic
 MEGABYTE = 1e6
 
 LOOP = (Y, Y_M, U)  # every flight has these topics
@@ -123,6 +125,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
         self._publish_recorded = self.advertise(RECORDED)
         self.lost: Counter[str] = Counter()
+        self._losses = Throttle(LOSS_PERIOD_NS)
         self.silent: Counter[str] = Counter()  # ns, by topic
         self._ended = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
@@ -310,9 +313,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count
-                    self.get_logger().warning(
-                        f"{topic.name}: {count} messages lost", throttle_duration_sec=2.0
-                    )
+                    if self._losses.due(topic.name):
+                        self.get_logger().warning(f"{topic.name}: {count} messages lost")
                 topic.publisher = publisher
             topic.next_sequence = sequence + 1
 
