@@ -22,6 +22,7 @@ from tests.damaged import DAMAGES, Damage, damage
 from tests.recordings import EPOCH
 
 import rise_di
+from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
@@ -191,6 +192,46 @@ def test_flight_counts_from_its_first_u(
     flight = Tape(late, duration=2.0)
     held = account(flight, osprey_gust)
     assert str(judged(COMPLETED, flight, osprey_gust, held)).startswith(outcome)
+
+
+@pytest.mark.parametrize("share, named", [(0.005, False), (0.02, True), (0.1, True), (0.5, True)])
+def test_clock_that_stands_now_and_then_is_named(
+    share: float, named: bool, tape: Tape, osprey_gust: Scenario
+) -> None:
+    """Each sample has its own instant: more than a hundredth with that of the sample before is a
+    fault of the clock, not of the recorder.
+    """
+    y = tape["y"]
+    stamp_ns = y.stamp_ns.copy()
+    every = round(1.0 / share)
+    stamp_ns[every::every] = stamp_ns[every - 1 :: every][: len(stamp_ns[every::every])]
+    count = int(np.count_nonzero(np.diff(stamp_ns) == 0))
+    stood = replace(tape, signals={**tape.signals, "y": replace(y, stamp_ns=stamp_ns)})
+    sentence = f"{count} samples with the stamp of the sample before"
+    lacks = account(stood, osprey_gust).lacks
+    assert any(sentence in lack for lack in lacks if lack.startswith("y ")) is named
+
+
+@pytest.mark.parametrize("topic", ["y", "u"])
+def test_replay_covers_no_tick_without_its_sample(topic: str, tape: Tape) -> None:
+    """A twentieth of y or of u is missing: 95 % of the ticks are compared."""
+    signal = tape[topic]
+    kept = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
+    result = replay(replace(tape, signals={**tape.signals, topic: signal.where(kept)}))
+    assert result.equal()
+    assert result.compared.mean() == pytest.approx(0.95, abs=0.01)
+    assert result.checked.mean() > 0.98
+    assert any(f"no sample on the topic {topic}" in note for note in result.notes)
+
+
+def test_replay_without_some_y_is_incomplete(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/y", DAMAGES["ends at a third"])
+    with pytest.raises(typer.Exit) as end:
+        Replay(run=log).execute()
+    assert end.value.exit_code == STATUS_SHORTFALL
+    assert "have no sample on the topic y: y taken from internals" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

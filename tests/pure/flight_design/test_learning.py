@@ -524,6 +524,18 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     assert part_checks.weaker(part._replace(entries=near), flown) == ""
 
 
+@pytest.mark.parametrize("whiteness, refused", [(2.9, False), (3.1, True), (3.6, True)])
+def test_part_with_coloured_innovations_is_refused_from_the_limit_on(
+    whiteness: float, refused: bool
+) -> None:
+    """The limit is 3: a factor of 1.2 beyond it is refused as well."""
+    sentence = part_checks.not_white(lateral(whiteness=whiteness))
+    assert bool(sentence) is refused
+    assert not refused or sentence == (
+        f"innovations of r: found a whiteness of {whiteness:g}, expected at most 3, 1 being white"
+    )
+
+
 LATERAL = (
     Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437),
     Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028),

@@ -38,13 +38,14 @@ from flight_guidance.fence import (
     Escape,
     Motion,
     last_safe_turn,
+    room_at_home,
     turn_clearance,
 )
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.modes import holding, motion_of
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.ways import ways
+from flight_guidance.ways import onto_orbit, ways
 from flight_guidance.zones import Fence, Zone, clearance
 
 pytestmark = pytest.mark.slow
@@ -290,6 +291,19 @@ def test_outside_is_a_state_of_its_own() -> None:
     assert float(escape(1280.0, BACK, math.pi).action) == HOME
     # on the way home the clearance of now is enough
     assert float(escape(1290.0, HOME, math.pi).action) == HOME
+
+
+def test_on_the_way_home_no_turn_begins_that_keeps_the_clearance_of_now() -> None:
+    """A quarter of a second of flight from the border, away from it and across the way home: the
+    margin of a first turn would begin one.
+    """
+    fence = Fence((FIELD,), (0.0, 0.0))
+    near = motion(1300.0 - 6.25, 0.0, math.radians(100.0))
+    escape = last_safe_turn(fence, HOME, near)
+    assert float(escape.clearance) == approx(6.25)
+    assert float(escape.predicted) == approx(6.25)
+    assert float(escape.action) == HOME
+    assert float(last_safe_turn(fence, 0.0, near).action) == RIGHT
 
 
 def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
@@ -609,6 +623,41 @@ def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -
     with refusing("with home 423 m inside every turn fits"):
         GuidanceConfig.validate_mapping(square(310.0, 10.0), "guidance")
     GuidanceConfig.validate_mapping(square(423.0, 10.0), "guidance")
+
+
+@pytest.mark.parametrize("wind", [8.0, 10.0])
+def test_room_at_home_is_that_in_the_worst_wind_of_all_sides(wind: float) -> None:
+    """A strip has the same room whichever way it lies, and less than the wind along it leaves."""
+    along = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-450.0, -450.0, 450.0, 450.0))
+    across = Zone(along.east, along.north)
+    of_strip, of_turned = (
+        room_at_home(Fence((zone,), (0.0, 0.0)), motion(0.0, 0.0), wind) for zone in (along, across)
+    )
+    assert of_strip == approx(of_turned, abs=1.0)
+    calm_room = room_at_home(Fence((along,), (0.0, 0.0)), motion(0.0, 0.0), 0.0)
+    # a quarter of the turn towards the border takes 5 s of the wind
+    assert of_strip < calm_room - 5.0 * wind
+
+
+@pytest.mark.parametrize("cells, is_straight", [(0.5, False), (1.5, True)])
+def test_straight_way_home_has_a_cell_of_clearance(cells: float, is_straight: bool) -> None:
+    """A tower beside the line onto the orbit, at half a cell and at one and a half."""
+    field = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-1000.0, -1000.0, 1000.0, 1000.0))
+    home = (0.0, 0.0)
+    empty = ways(Fence((field,), home, 100.0))
+    # the centre of a cell, and the line from there onto the orbit
+    begin = np.array(empty.corner) + empty.cell * np.round(
+        (np.array([-800.0, 0.0]) - empty.corner) / empty.cell
+    )
+    end = np.array([float(value) for value in onto_orbit(Fence((field,), home, 100.0), *begin)])
+    line = (end - begin) / math.dist(begin, end)
+    beside = 0.5 * (begin + end) + (50.0 + cells * empty.cell) * np.array([-line[1], line[0]])
+    tower = Zone((float(beside[0]),), (float(beside[1]),), 50.0, exclude=True)
+    fence = Fence((field, tower), home, 100.0)
+    chart = ways(fence)
+    assert chart.cell == empty.cell
+    assert chart.corner == empty.corner
+    assert bool(chart.aim(fence, *begin)[2]) is is_straight
 
 
 def test_turn_onto_the_orbit_that_fits_to_one_side_is_enough() -> None:

@@ -124,6 +124,22 @@ def test_box_ahead_is_flown_to_and_a_missed_box_goes_around(across: Scenario) ->
     assert [notice.text for notice in notices.take(1.0, around)] == [text]
 
 
+@pytest.mark.parametrize("height, around", [(4.0, True), (1.0, False)])
+def test_no_go_around_below_the_height_of_the_decrab(
+    height: float, around: bool, across: Scenario
+) -> None:
+    """A metre above the ground a drift out of the box ends on the ground beside it, not in a climb
+    from there.
+    """
+    box = {"north": [700.0, 1000.0, 1000.0, 700.0], "east": [5.0, 5.0, 20.0, 20.0]}
+    section = section_with(across, touchdown=box)
+    lander, state, pose, route = low(section, height)
+    landing = section.landing_on(route)
+    assert landing is not None
+    assert 1.0 < landing.decrab < 4.0
+    assert ("leg" in lander.commands(state, pose, route)) is around
+
+
 def test_lander_waits_above_the_flare_and_leaves_to_an_operator(across: Scenario) -> None:
     lander, state, pose, route = low(section_with(across), 20.0)
     assert lander.commands(state, pose, route) == {}

@@ -72,6 +72,19 @@ def test_effectors_stay_inside_stops_and_rates_and_give_what_is_returned(size: f
             u_before = u
 
 
+def test_effectors_beyond_their_stops_leave_the_others_the_whole_demand() -> None:
+    """New stops of 0.5 leave the first effector at 0.6; it moves back to 0.4 to 0.5 in a tick. The
+    change of effect that is asked for counts from there on, not from where it was.
+    """
+    T = np.array([[0.5], [0.5]])
+    limits = Limits(np.full(2, -0.5), np.full(2, 0.5), np.full(2, 0.2 / DT))
+    params = allocation(T, np.ones((1, 2)), range(1), limits)
+    u, v = allocate(np.array([0.6]), np.array([0.6, 0.0]), DT, params)
+    assert_allclose(v, [0.6], rtol=1e-9)
+    assert (u <= [0.5, 0.2]).all()
+    assert (u >= [0.4, -0.2]).all()
+
+
 def most(params: Allocation, v: FloatArray) -> float:
     """The largest s for which some u inside the stops gives s v, by a linear program."""
     m, p = params.effect.shape

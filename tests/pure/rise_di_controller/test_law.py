@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A step of the law against hand-worked numbers and closed forms."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,18 @@ from hypothesis import strategies as st
 from pytest import approx
 from tests.closed_loop import law_params
 
-from flight_core.vectors import FloatArray
-from rise_di_controller.law import LawParams, LawState, Sign, control, engage, gain, retune, step
-from rise_di_controller.saturation import limited_integral
+from rise_di_controller.law import (
+    LawParams,
+    LawState,
+    Sign,
+    control,
+    engage,
+    gain,
+    retune,
+    step,
+    step_with_anti_windup,
+)
+from rise_di_controller.saturation import Limits, limited_integral
 
 DT = 0.1
 
@@ -120,14 +130,19 @@ def test_channels_do_not_mix(e: list[float]) -> None:
     assert u[0] == respond(one_channel(Sign.IMPLICIT), [0.0, e[0]])[0]
 
 
-def test_a_step_changes_none_of_its_arguments() -> None:
+@pytest.mark.parametrize("sign", [*Sign])
+def test_a_step_changes_none_of_its_arguments(sign: Sign) -> None:
+    """State, y, y_m and every parameter: gains are shared by all ticks and all aircraft."""
+    params = one_channel(sign)
     state = LawState(*(np.array([value]) for value in (1.0, 2.0, 3.0, 4.0)))
-    y = np.array([1.5])
-    y_m = np.array([0.5])
-    params = one_channel(Sign.IMPLICIT)
-    step(state, y, y_m, np.array(DT), params)
-    arguments: tuple[FloatArray, ...] = (*state, y, y_m)
-    assert [float(value[0]) for value in arguments] == [1.0, 2.0, 3.0, 4.0, 1.5, 0.5]
+    y, y_m, dt, u_trim, u_before = (np.array([value]) for value in (1.5, 0.5, DT, 0.2, 0.1))
+    limits = Limits(*(np.array([value]) for value in (-0.3, 0.3, 2.0)))
+    arguments = (*state, y, y_m, dt, u_trim, u_before, *limits, *params)
+    before = copy.deepcopy(arguments)
+    step(state, y, y_m, dt, params)
+    step_with_anti_windup(state, y, y_m, dt, u_trim, u_before, params, limits)
+    retune(state, params, params._replace(K=2.0 * params.K))
+    assert all(map(np.array_equal, arguments, before))
 
 
 def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() -> None:

@@ -122,11 +122,42 @@ def test_garbage_in_the_first_second_does_not_open_the_test(kind: str, at: float
     assert (controller.state.u == before).all()
 
 
+@pytest.mark.parametrize("first", [0.0, 20.0])
+def test_one_wrong_sample_in_the_first_second_leaves_no_trace(first: float) -> None:
+    """A glitch of 1 rad/s, twice what full inputs change q by, is lost a second later."""
+    controller = Controller(SERVO)
+    calm = noise()
+    for k in range(1, 200):
+        step(controller, next(calm) + first * (k == 60) * np.eye(4)[0], k)
+    assert "a jump of y" in step(controller, next(calm) + 1.0 * np.eye(4)[0], 200)
+
+
 def test_noise_of_the_first_second_is_learned() -> None:
     """Vibration of five times the noise: no sample is lost, in the first second and after it."""
     controller = Controller(SERVO)
     loud = noise()
     assert [*filter(None, (step(controller, 5.0 * next(loud), k) for k in range(1, 1000)))] == []
+
+
+# The memory of a knock
+
+
+@pytest.mark.parametrize("after, taken", [(1.0, True), (50.0, False), (70.0, False)])
+def test_knock_opens_the_test_of_jumps_for_less_than_a_minute(after: float, taken: bool) -> None:
+    """A change of 0.5 rad/s at 5 s, within the power of the inputs: five times as much is possible
+    then, and less from second to second. After a minute 2 rad/s are as impossible as before.
+    """
+    controller = Controller(SERVO)
+    calm = noise()
+    q = np.eye(4)[0]
+    for k in range(1, 500):
+        step(controller, next(calm), k)
+    assert step(controller, next(calm) + 0.5 * q, 500) == ""
+    last = 500 + round(100 * after)
+    for k in range(501, last):
+        assert step(controller, next(calm), k) == ""
+    lost = step(controller, next(calm) + 2.0 * q, last)
+    assert (lost == "") is taken
 
 
 # Gaps
