@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import POSE, UNKNOWN
 from flight_core.modes import Mode as ControllerMode
+from flight_guidance import guidance as guidance_steps
 from flight_guidance.guidance_state import Lateral, Vertical
 from flight_guidance.node import GuidanceNode
 from flight_guidance.reach import AUTHORITY
@@ -349,3 +350,54 @@ def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
     with_all_sections.write_text(scenario_yaml(find_scenario("osprey_route")))
     with world_of("--params-file", str(with_all_sections)) as world:
         assert world.make(GuidanceNode).get_name() == "guidance"
+
+
+def test_step_that_fails_leaves_the_last_u_m_and_the_node_goes_on(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three steps of a climb fail: u_m goes on, one line says why, and the diagnostics count."""
+    flight.target(climb=1.0)
+    flight.run(0.3)
+    step = guidance_steps.step
+    failing = iter(range(3))
+
+    def raises(*arguments: Any) -> Any:
+        if next(failing, None) is not None:
+            raise IndexError("index 7 is out of bounds")
+        return step(*arguments)
+
+    before = len(flight.world.sent["/u_m"])
+    last = flight.world.last("/u_m")
+    with monkeypatch.context() as patch:
+        patch.setattr(guidance_steps, "step", raises)
+        flight.run(1.5)
+    sent = [sample.channels for sample in flight.world.vectors("/u_m")[before:]]
+    assert sent[:3] == [last] * 3
+    assert sent[3] != last
+    assert len(sent) > 70  # of 75: none is left out
+    lines = [line for line in flight.node.log.lines if "a step of guidance failed" in line]
+    goes_on = "a step of guidance failed, the last u_m goes on"
+    assert lines == [f"[WARNING] {goes_on}: IndexError index 7 is out of bounds"]
+    assert diagnostics(flight.world, "/guidance")[1]["failed steps"] == "3"
+    assert flight.last("failed") == 3.0
+
+
+def test_steps_that_fail_to_the_end_leave_no_u_m_and_say_why(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reference model levels the wings then; with the first good step u_m is back."""
+
+    def raises(*arguments: Any) -> Any:
+        raise IndexError("index 7 is out of bounds")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(guidance_steps, "step", raises)
+        flight.run(MAX_AGE + 0.1)
+        before = len(flight.world.sent["/u_m"])
+        flight.run(3.0)
+        assert len(flight.world.sent["/u_m"]) == before
+        assert flight.logged("no u_m: a step of guidance failed: IndexError index 7")
+        sentence, _ = diagnostics(flight.world, "/guidance")
+        assert sentence == "no u_m: a step of guidance failed: IndexError index 7 is out of bounds"
+    flight.run(0.3)
+    assert len(flight.world.sent["/u_m"]) > before

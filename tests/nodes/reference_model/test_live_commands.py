@@ -16,6 +16,7 @@ from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import ATTITUDE
 from flight_ros.messages import Encoder, instant
+from reference_model import model
 from reference_model.node import ReferenceModelNode
 from reference_model.reference import Reference
 
@@ -103,3 +104,25 @@ def test_in_lockstep_reference_waits_for_u_m_and_repeats_bytes_of_one_process(os
         np.array([[*sample.channels.values()] for sample in received]).tobytes()
         == np.array(expected).tobytes()
     )
+
+
+def test_step_that_fails_leaves_the_last_y_m_and_the_node_goes_on(
+    osprey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with world_of("--params-file", str(osprey)) as world:
+        node = world.start(ReferenceModelNode)
+        world.run(0.5, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
+        before = world.vectors("/y_m")
+        with monkeypatch.context() as patch:
+            patch.setattr(model, "step", lambda x_m, u_m, matrices: np.full_like(x_m, np.nan))
+            world.run(0.1, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
+        held = world.vectors("/y_m")[len(before) :]
+        assert len(held) >= 45  # of 50 at 500 Hz
+        assert all(sample.channels == before[-1].channels for sample in held[1:-1])
+        world.run(1.1, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
+        assert world.last("/y_m")["p"] > before[-1].channels["p"]
+        lines = [line for line in node.log.lines if "a step of the reference model failed" in line]
+        goes_on = "a step of the reference model failed, the last y_m goes on"
+        assert lines == [f"[ERROR] {goes_on}: ArithmeticError a value that is not finite"]
+        _, figures = diagnostics(world, "/reference_model")
+        assert int(figures["failed steps"]) >= 45
