@@ -4,16 +4,22 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 
-from flight_analysis.report.run_folder import write_empty_summary, write_report
+from flight_analysis.report.run_folder import (
+    UnwrittenReportError,
+    write_empty_summary,
+    write_report,
+)
 from flight_analysis.report.summary import taken_over
 from flight_bringup.fleet import Fleet, Flown, fly_fleet, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
+from flight_cli.words import warn
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -80,9 +86,17 @@ def _report(flown: Flown) -> _Result:
     """Write the report of an aircraft."""
     try:
         flight = write_report(flown.run, flown.outcome).flight
+    except UnwrittenReportError as error:
+        flight = error.result.flight
+        warn(f"error: {flown.member.name}: no report: {error}")
     except ParameterError as error:  # before the first sample
         outcome = never_flew(str(error)) if flown.outcome.status == 0 else flown.outcome
-        return _Result(write_empty_summary(flown.run, flown.member.scenario, outcome), None)
+        try:
+            summary = write_empty_summary(flown.run, flown.member.scenario, outcome)
+        except ParameterError as unwritten:
+            warn(f"error: {flown.member.name}: no summary: {unwritten}")
+            return _unreported(replace(flown, outcome=outcome))
+        return _Result(summary, None)
     internals = flight.tape.signals.get("internals")
     return _Result(
         flight.summary,

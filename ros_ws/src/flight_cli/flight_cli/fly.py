@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.report.run_folder import (
+    UnwrittenReportError,
     new_run,
     remove_empty,
     write_empty_summary,
@@ -220,23 +221,31 @@ class Fly(RouteWords):
 
 def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -> int:
     """Write and print the report of a flight. Returns the exit status."""
+    unwritten = ""
     try:
         result = write_report(run, outcome)
+    except UnwrittenReportError as error:  # the flight is over: its outcome comes first
+        result = error.result
+        unwritten = str(error)
     except ParameterError:
         if outcome.status == 0:
             raise
-        write_empty_summary(run, scenario, outcome)
         warn(f"error: {outcome}, before the first sample; see {display_path(run)}")
+        try:
+            write_empty_summary(run, scenario, outcome)
+        except ParameterError as error:
+            warn(f"error: no summary: {error}")
         return outcome.status
     told = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
-        print(
-            f"outcome: {told['sentence']}\nlog:     {display_path(result.mcap)}\nreport:  "
-            f"{display_path(result.report)}"
-        )
+        print(f"outcome: {told['sentence']}\nlog:     {display_path(result.mcap)}")
+        if not unwritten:
+            print(f"report:  {display_path(result.report)}")
+    if unwritten:
+        warn(f"error: no report: {unwritten}")
     return int(told["status"])
 
 

@@ -68,6 +68,14 @@ class FlightResult(NamedTuple):
     report: Path
 
 
+class UnwrittenReportError(ParameterError):
+    """The files of a report cannot be written, as on a full disk. `result` has the flight."""
+
+    def __init__(self, sentence: str, result: FlightResult) -> None:
+        super().__init__(sentence)
+        self.result = result
+
+
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for
     a failure.
@@ -328,22 +336,28 @@ def write_report(
 
     The files go beside the log, or into the new folder `output`. Without an outcome the report of
     an old run is written again and runs/latest stays. A `scenario` in place of the scenario in the
-    log is not written. Raises ParameterError as `read_flight` does, before any file is written.
+    log is not written. Raises ParameterError as `read_flight` does, before any file is written,
+    and UnwrittenReportError where a file cannot be written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
     recorded = read_run(run, namespace, scenario, remaps)
     flight = _flight(recorded, run, outcome)
     folder = output or _folder(run)
-    with writing("", folder, "a folder that can"):
-        folder.mkdir(parents=True, exist_ok=True)
-        if scenario is None and flight.scenario is not None:
-            _write_scenario(recorded, folder / flight.scenario.path.name)
-        write_file(folder / SUMMARY, json.dumps(flight.summary, indent=2, allow_nan=False) + "\n")
-        write_page(folder / REPORT, [flight])
-    if outcome is not None:
-        link_latest(folder)
-    return FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
+    result = FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
+    summary = json.dumps(flight.summary, indent=2, allow_nan=False) + "\n"
+    try:
+        with writing("", folder, "a folder that can"):
+            folder.mkdir(parents=True, exist_ok=True)
+            if scenario is None and flight.scenario is not None:
+                _write_scenario(recorded, folder / flight.scenario.path.name)
+            write_file(folder / SUMMARY, summary)
+            write_page(folder / REPORT, [flight])
+        if outcome is not None:
+            link_latest(folder)
+    except ParameterError as error:
+        raise UnwrittenReportError(str(error), result) from None
+    return result
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
