@@ -37,8 +37,8 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
 from flight_campaign import batch_matrices, device, engines
 from flight_campaign.batch_schedule import without_branches
-from flight_campaign.benchmark_course import build_course
 from flight_campaign.campaign import Campaign, define, fly_chunk, fly_chunk_figures
+from flight_campaign.campaign_course import build_course
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, the reference for the integration error

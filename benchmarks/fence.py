@@ -43,7 +43,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, batch_matrices, missions
-from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign_course import build_course
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_guidance.zones import Fence, Zone

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule, missions
 from flight_campaign.batch_loop import FleetResult
-from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign_course import build_course
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.gain_selection import with_feedforward
 from rise_di_controller.allocation import allocate, allocation

@@ -161,7 +161,7 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
     assert "Traceback" not in shown.stderr
 
 
-@pytest.mark.parametrize("command", ["campaign", "compare", "benchmark"])
+@pytest.mark.parametrize("command", ["campaign", "compare"])
 def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
     command: str, tmp_path: Path
 ) -> None:

@@ -23,7 +23,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import guidance_notices, unflown_legs
 from flight_campaign import batch, batch_matrices, missions
-from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign_course import build_course
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape

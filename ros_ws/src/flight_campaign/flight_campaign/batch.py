@@ -32,7 +32,7 @@ from flight_campaign.batch_loop import (
 )
 from flight_campaign.batch_matrices import Fleet, remainder_rows
 from flight_campaign.batch_schedule import Schedule
-from flight_campaign.benchmark_course import Course, Segments
+from flight_campaign.campaign_course import Course, Segments
 from flight_campaign.device import schedule_of_device
 from flight_campaign.missions import Mission
 from flight_core.parameters import require

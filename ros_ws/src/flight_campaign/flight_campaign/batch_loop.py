@@ -25,7 +25,7 @@ from flight_campaign import missions
 from flight_campaign.batch_allocation import allocate
 from flight_campaign.batch_matrices import Fleet, StateBlock, at
 from flight_campaign.batch_schedule import ASKED, Kind, Run
-from flight_campaign.benchmark_course import Segments
+from flight_campaign.campaign_course import Segments
 from flight_campaign.missions import Mission
 from flight_core.arithmetic import product
 from flight_core.vectors import Array

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import PlantParams, share
-from flight_campaign.benchmark_course import Course
+from flight_campaign.campaign_course import Course
 from flight_campaign.device import is_cpu
 from flight_core.integrators import rk4
 from flight_core.rates import seconds

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_campaign.benchmark_course import ENGAGE, HOLD, Course
+from flight_campaign.campaign_course import ENGAGE, HOLD, Course
 
 RUN = 120
 """Ticks of a run, a multiple of most periods of guidance. A run is forced if a tick of it is."""

@@ -30,7 +30,7 @@ from flight_analysis.closed_loop.kept_guarantee import kept
 from flight_analysis.closed_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign import equipment, learning_flights
-from flight_campaign.benchmark_course import Course, build_course
+from flight_campaign.campaign_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
 from flight_campaign.learning_flights import MakeLearner

@@ -11,7 +11,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import batch, batch_matrices, equipment
 from flight_campaign.batch_loop import Vehicle
 from flight_campaign.batch_matrices import Fleet
-from flight_campaign.benchmark_course import Course
+from flight_campaign.campaign_course import Course
 from flight_core.vectors import FloatArray
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from flight_campaign import batch_loop
 from flight_campaign.batch_loop import Constants, FleetResult, LoopState, Timing, Vehicle
 from flight_campaign.batch_matrices import Fleet
 from flight_campaign.batch_schedule import ASKED
-from flight_campaign.benchmark_course import ENGAGE, STEP, Course, Segments
+from flight_campaign.campaign_course import ENGAGE, STEP, Course, Segments
 from flight_core.modes import Mode
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import Array, FloatArray, StampedVector

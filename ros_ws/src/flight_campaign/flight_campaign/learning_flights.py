@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, inputs_by_part, true_error
-from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign_course import build_course
 from flight_campaign.engines import Job
 from flight_campaign.rows import Chunk
 from flight_core.outcome import COMPLETED

@@ -23,7 +23,7 @@ from aircraft_sim.sections import StartConfig
 from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
-from flight_campaign.benchmark_course import ENGAGE, HOLD, STEP, Course, Segments
+from flight_campaign.campaign_course import ENGAGE, HOLD, STEP, Course, Segments
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require

@@ -14,7 +14,7 @@ import numpy as np
 from control_laws.catalogue import LAWS, NONE, Gains, Law
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign.benchmark_course import build_course
+from flight_campaign.campaign_course import build_course
 from flight_campaign.tuning import Benchmark
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import batch, batch_matrices, statistics
 from flight_campaign.batch_loop import FleetResult, Vehicle
 from flight_campaign.batch_matrices import Fleet
-from flight_campaign.benchmark_course import Course, build_course, require_flyable
+from flight_campaign.campaign_course import Course, build_course, require_flyable
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray

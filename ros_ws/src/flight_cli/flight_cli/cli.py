@@ -75,8 +75,6 @@ GROUPS = MappingProxyType(
         "Study": {
             "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
             "compare": "Compare RISE-DI with other control laws on the same aircraft.",
-            "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file "
-            "of scores.",
         },
     }
 )

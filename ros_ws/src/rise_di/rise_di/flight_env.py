@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.closed_loop.stations import AircraftStation, Loop, ReferenceStation, Topics
-from flight_campaign.benchmark_course import HOLD, build_course
+from flight_campaign.campaign_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
 from flight_core.installation import require_package

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark course of the aircraft, tick by tick: reference, wind, errors of the sensors,
+"""The course of the aircraft of a campaign, tick by tick: reference, wind, errors of the sensors,
 feedforward.
 
 The course does not depend on the aircraft and is computed once, with the functions of the
