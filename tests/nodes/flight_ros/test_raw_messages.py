@@ -26,7 +26,6 @@ from autopilot_bridge.client import EngagementClient
 from autopilot_bridge.node import BridgeNode
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
-from flight_bringup.client import FlightGearClient
 from flight_bringup.graph import ON_START, ONE_PROCESS, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 from flight_core.vectors import ChannelError
@@ -113,13 +112,12 @@ def nodes_in_real_time(folder: Path, *, use_sim_time: bool = False) -> Iterator[
     with world_of(*words) as world, clients_of(world):
         nodes = [world.make(node) for node in FLIGHT]
         monitor = FlightMonitor(OUTPUTS, lockstep=False, use_sim_time=use_sim_time, learns=True)
-        flight_gear = FlightGearClient("")
         operator = TargetClient()
         engagement = EngagementClient()
 
         def take() -> None:
             monitor.newest(), monitor.learned(), monitor.recorded(), monitor.has_time()
-            flight_gear._take(), operator._received(), engagement._received_u()
+            operator._received(), engagement._received_u()
             for node in nodes:
                 waits = node not in world.loops and node.has_time()
                 if waits and (start_ns := node.start_ns()) is not None:

@@ -47,8 +47,7 @@ GROUPS = MappingProxyType(
         "Look": {
             "report": "Write the report page of a run again, compare several, export figures "
             "and data, repair a log.",
-            "watch": "See a flight on a page, in the terminal, in Foxglove or in FlightGear, "
-            "live or recorded.",
+            "watch": "See a flight on a page, in the terminal or in Foxglove, live or recorded.",
             "replay": "Compute every tick of a recorded flight again and compare it with the "
             "log bit by bit.",
             "play": "Publish the topics of a recorded flight again with their timing.",

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flight_bringup.processes import end_with_parent
-from flight_cli.flightgear import show_in_flightgear
 from flight_cli.log_options import REMAP, log_scenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
 from flight_cli.words import argument, option, setting, warn
@@ -59,11 +58,6 @@ class Watch:
     foxglove: bool = option(
         "Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.", default=False
     )
-    flightgear: str | None = option(
-        "Send the pose of a flight in progress to FlightGear instead, as to "
-        "127.0.0.1:5500, with --set origin.",
-        metavar="HOST:PORT",
-    )
     control: bool = option(
         "Let the page command the flight, with a key that this command prints.", default=False
     )
@@ -79,20 +73,12 @@ class Watch:
         "GeoJSON of lines, polygons and points for the map, with --set origin.", metavar="FILE"
     )
     origin: str | None = setting(
-        "Where north and east are 0, for the background and FlightGear.", metavar="LAT,LON"
+        "Where north and east are 0, for the background.", metavar="LAT,LON"
     )
-    altitude: float = setting(
-        "Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim.",
-        default=0.0,
-    )
-    rate: float = setting("Packets a second to FlightGear.", default=30.0, min=1.0, max=100.0)
     runs: Path = setting("Folder of the runs.", default=Path("runs"))
 
     def execute(self) -> None:
         """Serve the page, or show the flight elsewhere, until its end."""
-        if self.flightgear is not None:
-            self._show_in_flightgear(self.flightgear)
-            return
         self._require_one_view()
         remaps = remaps_of(self.remap)
         file = scenario_file(self.scenario)
@@ -121,14 +107,6 @@ class Watch:
             _serve_with_control(flights, ports, self.namespace or "", real=self.real)
         else:
             serve(flights, ports, _announce, fleet=self.fleet)
-
-    def _show_in_flightgear(self, to: str) -> None:
-        if self.origin is None:
-            raise ParameterError(
-                "flightgear: found no origin, expected --set origin=LAT,LON beside it, where north "
-                "and east are 0"
-            )
-        show_in_flightgear(to, self.origin, self.altitude, self.namespace or "", self.rate)
 
     def _require_one_view(self) -> None:
         """Raise ParameterError for contradictory words."""
