@@ -19,7 +19,6 @@ from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.closed_loop.scenario import SCHEMAS
 from flight_analysis.closed_loop.scenario_library import LIBRARY as SCENARIOS
-from flight_analysis.report.paper import _tabular
 from flight_core.files import comment, dump_yaml, parse_yaml
 from flight_core.parameters import Config
 from flight_design.gains.gain_yaml import yaml_flow, yaml_template
@@ -173,9 +172,3 @@ def test_text_stays_in_its_comment_of_yaml(write: Callable[[str], str], text: st
 @pytest.mark.parametrize("text", TEXTS)
 def test_text_in_a_yaml_template_reads_back(text: str) -> None:
     assert parse_yaml(f"value: {yaml_flow(text)}\n", "", "") == {"value": text}
-
-
-def test_title_stays_in_its_comment_of_latex() -> None:
-    first, second, *_ = _tabular("a\n\\input{x}", ["channel"], []).splitlines()
-    assert first.startswith("% a")
-    assert second.startswith(r"\begin{tabular}")

@@ -28,7 +28,6 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import Account, account
 from flight_analysis.report.html import write_page
-from flight_analysis.report.paper import write_latex
 from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.sample_counts import TopicAccount
 from flight_analysis.report.shortfalls import judged
@@ -551,14 +550,7 @@ def test_comparison_says_the_share_of_each_flight(
 ) -> None:
     flights = [half, read_flight(whole)]
     write_page(tmp_path / "page.html", flights)
-    write_latex(tmp_path / "tables.tex", flights)
     assert "flown, over 49 % of truth" in (tmp_path / "page.html").read_text()
-    titles = [
-        line
-        for line in (tmp_path / "tables.tex").read_text().splitlines()
-        if line.startswith(("% Tracking", "% Inputs"))
-    ]
-    assert ["over 49 % of" in title for title in titles] == [True, True, False, False]
 
 
 def test_fleet_says_the_share_of_the_ticks_engaged(

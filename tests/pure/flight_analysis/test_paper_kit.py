@@ -1,21 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures, MAT-files, tables and LaTeX for a paper, read back with independent readers."""
+"""Figures for a paper, read back with independent readers."""
 
-import csv
 import re
 import xml.etree.ElementTree as ET
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pytest
-import scipy.io
 import yaml
-from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import REPOSITORY, refusing
 
-from flight_analysis.report.paper import write_figure, write_mat, write_tables
+from flight_analysis.report.paper import write_figure
 from flight_analysis.report.summary import RecordedFlight
 
 
@@ -70,34 +66,6 @@ def test_wrong_figure_is_told(
     with refusing(re.escape(words)):
         write_figure(tmp_path / name, [flight], width, channels)
     assert not list(tmp_path.iterdir())
-
-
-def test_mat_file_has_a_structure_a_topic(flight: RecordedFlight, tmp_path: Path) -> None:
-    write_mat(tmp_path / "run.mat", [flight])
-    read = scipy.io.loadmat(tmp_path / "run.mat", simplify_cells=True)
-    assert_array_equal(read["y"]["q"], flight.tape["y"]["q"])
-    assert_array_equal(read["u"]["stamp_ns"], flight.tape["u"].stamp_ns)
-    assert_allclose(np.diff(read["u"]["t"]), 0.01, atol=1e-9)
-    assert_array_equal(read["internals"]["Pi_q"], flight.tape["internals"]["Pi.q"])
-    assert read["info"]["channels"]["internals"]["Pi_q"] == "Pi.q"
-    assert read["info"]["outcome"] == "completed"
-    names = [
-        *(key for key in read if not key.startswith("__")),
-        *(name for topic in ("y", "u", "internals") for name in read[topic]),
-    ]
-    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", name) for name in names)
-
-
-def test_table_a_topic_has_no_empty_cell(flight: RecordedFlight, tmp_path: Path) -> None:
-    write_tables(tmp_path / "tables", [flight])
-    assert {path.stem for path in (tmp_path / "tables").iterdir()} == set(flight.tape.signals)
-    for topic in ("y", "u"):
-        with (tmp_path / "tables" / f"{topic}.csv").open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        assert len(rows) == len(flight.tape[topic].stamp_ns)
-        assert all(value for row in rows for value in row.values())
-        name = flight.tape[topic].names[0]
-        assert [float(row[name]) for row in rows] == flight.tape[topic][name].tolist()
 
 
 def test_citation_names_the_paper_and_invents_nothing() -> None:

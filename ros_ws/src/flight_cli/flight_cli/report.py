@@ -31,7 +31,7 @@ from flight_cli.words import argument, json_option, option, setting, values_of
 from flight_core.files import display_path
 from flight_core.outcome import SEVEREST
 
-FILES = ("html", "output", "png", "parquet", "figure", "mat", "tables", "latex")
+FILES = ("html", "output", "png", "parquet", "figure")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,9 +72,6 @@ class Report:
         "default each output.",
         default="",
     )
-    mat: Path | None = setting("Write all signals as a MAT-file, a structure a topic.")
-    tables: Path | None = setting("Folder for a CSV a topic.")
-    latex: Path | None = setting("Write the tables of errors and inputs as LaTeX.")
     as_json: bool = json_option()
 
     def execute(self) -> None:

@@ -1,29 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a paper needs of flights: a figure as vectors in the width of a column, a MAT-file, a table
-a topic, LaTeX.
-"""
+"""A figure of flights for a paper: vectors in the width of a column."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from io import BytesIO
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from flight_analysis.metrics import best_error
 from flight_analysis.report import comparison
 from flight_analysis.report.display_units import NO_UNIT, channel_label
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
-from flight_analysis.report.summary import RecordedFlight, taken_over
-from flight_analysis.report.summary_rows import ERROR_COLUMNS, INPUT_COLUMNS, columns_of, table_rows
+from flight_analysis.report.summary import RecordedFlight
 from flight_core.arguments import as_names
-from flight_core.files import replacing, write_file
+from flight_core.files import replacing
 from flight_core.parameters import one_of, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
-from flight_core.text import printable
 from flight_core.units import FOOT, in_si
 
 if TYPE_CHECKING:  # it loads in some tenths of a second
@@ -50,11 +42,6 @@ STYLE: Any = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "rise-di",  # the same file for the same flight
 }
-MATLAB_NAME = 63  # characters of a name at most
-MATLAB_KEYWORDS = (
-    "break case catch classdef continue else elseif end for function global if otherwise parfor "
-    "persistent return spmd switch try while"
-)
 
 
 def write_figure(
@@ -162,141 +149,3 @@ def draw_channel(
     axes.set_ylabel(("e of " if is_error else "") + channel_label(plain, units))
     axes.grid(alpha=0.3, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def write_mat(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a MAT-file of version 5: a structure a topic with stamp_ns, t in s and a column a
-    channel, SI.
-
-    Several flights are structures run_1, run_2, ... with the name of the run in `name`. Names are
-    those that MATLAB permits: "Pi.q" is Pi_q. `channels` has the names of the log by the names of
-    MATLAB.
-    """
-    from scipy.io import savemat  # noqa: PLC0415
-
-    require(path.suffix == ".mat", "mat", f"{path.name}", "a name that ends in .mat")
-    runs = [_mat_structure(flight) for flight in flights]
-    content = (
-        runs[0] if len(runs) == 1 else {f"run_{k}": run for k, run in enumerate(runs, start=1)}
-    )
-    buffer: Any = BytesIO()
-    savemat(buffer, content, do_compression=True, long_field_names=True, oned_as="column")
-    write_file(path, buffer.getvalue())
-
-
-def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
-    """Structures by topic of a flight."""
-    structure: dict[str, Any] = {}
-    topics = matlab_names(flight.tape.signals)
-    original: dict[str, dict[str, str]] = {}
-    for topic, signal in flight.tape.signals.items():
-        names = matlab_names(signal.names, used_names=("stamp_ns", "t"))
-        columns = {names[name]: np.asarray(signal[name], dtype=np.float64) for name in signal.names}
-        t = (signal.stamp_ns - flight.tape.start_ns) / NANOSECONDS
-        structure[topics[topic]] = {"stamp_ns": signal.stamp_ns.astype(np.int64), "t": t, **columns}
-        original[topics[topic]] = {permitted: name for name, permitted in names.items()}
-    units = {name: unit.unit for name, unit in flight.units.items()}
-    notes: dict[str, Any] = {
-        "name": flight.name,
-        "outcome": str(flight.summary["outcome"]["sentence"]),
-    }
-    notes |= {"scenario": flight.summary["scenario"] or ""}
-    free = matlab_names(("info",), used_names=structure)
-    notes |= {
-        "units_of_report": {matlab_names((name,))[name]: unit for name, unit in units.items()},
-        "channels": original,
-    }
-    return structure | {free["info"]: notes}
-
-
-def matlab_names(names: Iterable[str], used_names: Iterable[str] = ()) -> dict[str, str]:
-    """Names that MATLAB permits by name: letters, digits and _, a letter first, 63 characters, no
-    keyword, each once.
-    """
-    used = set(used_names)
-    permitted = {}
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
-        plain = (
-            plain
-            if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS.split()
-            else f"x_{plain}"
-        )
-        plain = plain[:MATLAB_NAME]
-        count = 1
-        while plain in used:
-            count += 1
-            plain = f"{plain[: MATLAB_NAME - 4].removesuffix(f'_{count - 1}')}_{count}"
-        used.add(plain)
-        permitted[name] = plain
-    return permitted
-
-
-def write_tables(folder: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a CSV a topic, RUN_TOPIC.csv of several flights and TOPIC.csv of one: stamp_ns, t in s
-    and the channels, SI.
-
-    A table has the rows of its own topic, so no cell is empty.
-    """
-    import polars as pl  # noqa: PLC0415
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for label, flight in zip(comparison.labels(flights), flights, strict=True):
-        for topic, signal in flight.tape.signals.items():
-            t = (signal.stamp_ns - flight.tape.start_ns) / NANOSECONDS
-            columns = {
-                "stamp_ns": signal.stamp_ns,
-                "t": t,
-                **{name: signal[name] for name in signal.names},
-            }
-            stem = topic if len(flights) == 1 else f"{label}_{topic}"
-            with replacing(folder / f"{re.sub(r'[^A-Za-z0-9_.() -]', '_', stem)}.csv") as stream:
-                pl.DataFrame(columns).write_csv(stream)
-
-
-def write_latex(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the tables of errors and of inputs as LaTeX, a tabular each, with the rules of
-    booktabs.
-    """
-    parts = []
-    for label, flight in zip(comparison.labels(flights), flights, strict=True):
-        units = flight.units
-        for title, key, known in (
-            ("Tracking error", "errors", ERROR_COLUMNS),
-            ("Inputs about trim", "inputs", INPUT_COLUMNS),
-        ):
-            if not flight.summary[key]:
-                continue
-            columns = columns_of(known, flight.summary[key])
-            heads = [" ".join(filter(None, (column.group, column.head))) for column in columns]
-            rows = table_rows(flight.summary[key], columns, units)
-            caption = f"{title}, {label}{taken_over(flight.summary, key)}"
-            parts.append(_tabular(caption, ["channel", *heads], rows))
-    write_file(path, "% needs \\usepackage{booktabs}\n" + "\n".join(parts))
-
-
-def _tabular(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (heads, *rows)]
-    body = [
-        f"% {printable(title)}",
-        rf"\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}",
-        r"\toprule",
-        lines[0],
-        r"\midrule",
-        *lines[1:],
-    ]
-    return "\n".join([*body, r"\bottomrule", r"\end{tabular}", ""])
-
-
-LATEX: Mapping[str, str] = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-}
-"""What stands for the characters that LaTeX reads as commands."""
-
-
-def latex_text(text: str) -> str:
-    """A text as LaTeX prints it."""
-    return "".join(LATEX.get(sign, sign) for sign in text)

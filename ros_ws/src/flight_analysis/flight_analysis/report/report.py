@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.html import write_page
-from flight_analysis.report.paper import WIDTH, write_figure, write_latex, write_mat, write_tables
+from flight_analysis.report.paper import WIDTH, write_figure
 from flight_analysis.report.run_folder import read_flight, write_report
 from flight_analysis.report.summary import RecordedFlight
 from flight_core.arguments import FilePath, as_path
@@ -52,9 +52,6 @@ def report(
     figure: FilePath | None = None,
     width: str | float = WIDTH,
     channels: str | Sequence[str] = (),
-    mat: FilePath | None = None,
-    tables: FilePath | None = None,
-    latex: FilePath | None = None,
     namespace: str | None = None,
     remaps: Mapping[str, str] = {},
     scenario: FilePath | None = None,
@@ -74,9 +71,6 @@ def report(
         width: Width of the figure, with a unit ("88mm") or in m.
         channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output;
             empty: each output.
-        mat: File for the signals as a MAT-file, a structure a topic.
-        tables: Folder for a CSV a topic.
-        latex: File for the tables of errors and inputs as LaTeX.
         namespace: Namespace of the aircraft, for logs with several aircraft.
         remaps: Topics of the log by names of the stack, for logs of remapped nodes, as {"y":
             "/sensors/y"}.
@@ -108,9 +102,6 @@ def report(
             ("csv", csv, write_csv),
             ("parquet", parquet, write_parquet),
             ("figure", figure, partial(write_figure, width=width, channels=channels)),
-            ("mat", mat, write_mat),
-            ("tables", tables, write_tables),
-            ("latex", latex, write_latex),
         )
         if path is not None
     ]
