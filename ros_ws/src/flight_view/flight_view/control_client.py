@@ -7,7 +7,7 @@ from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from autopilot_bridge.client import EngagementClient
@@ -41,13 +41,17 @@ class ControlClient(Client):
         return [name for name in self.NODES if name in running]
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Values of a node's parameters, without the parameters that are not set."""
+        """Values of a node's parameters and groups of parameters, without those not set."""
+        everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
+        declared = self._call(ListParameters, f"{node}/list_parameters", everything).result.names
+        # an undeclared name among others empties the answer
+        asked = [name for name in declared if name in names or name.split(".")[0] in names]
         values = self._call(
-            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=list(names))
+            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=asked)
         ).values
         read = {
             name: parameter_value_to_python(value)
-            for name, value in zip(names, values, strict=False)
+            for name, value in zip(asked, values, strict=True)
         }
         return {
             name: value.tolist() if hasattr(value, "tolist") else value
