@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_core.outcome import COMPLETED, STATUS_LOST_CONTACT
+from flight_core.outcome import COMPLETED, STATUS_LOST_CONTACT, STATUS_SHORTFALL
 from flight_core.parameters import flatten, nest
 from flight_design.gains.gain_selection import with_feedforward
 from flight_log.tape_reader import read_run
@@ -107,8 +107,9 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
         )
     runs = [
         busy,
-        fly(start, scenario, "idle"),
-        fly(start, scenario, "together", "--set", "composed"),
+        # with its gust at the limits q is off by more than the linear loop
+        fly(start, scenario, "idle", status=STATUS_SHORTFALL),
+        fly(start, scenario, "together", "--set", "composed", status=STATUS_SHORTFALL),
     ]
     first, *others = map(payloads, runs)
     for topic in TOPICS:
