@@ -22,10 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.params import AircraftConfig
+from flight_analysis.report.display_units import STATES, DisplayUnit, display_unit
 from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
 from flight_core.outcome import Aim, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
+from flight_core.units import SPEED, quantity
 from flight_core.vectors import FloatArray
 from rise_di_controller.divergence import HARMLESS, LEAST, LEAST_RATE, WINDOW, period
 from rise_di_controller.internals import Saturation
@@ -68,16 +70,17 @@ def tracking_shortfalls(
     units = {} if aircraft is None else aircraft.channels().outputs
     shortfalls = []
     for i, name in enumerate(pair.names):
-        unit = units.get(name, "")
+        unit = units.get(name, STATES.get(name, "rad/s"))
         worst = _worst(pair, i, _floor(pair, i, speed, unit))
         if worst is not None:
-            shortfalls.append(_shortfall(worst, pair, i, unit))
+            shortfalls.append(_shortfall(worst, pair, i, display_unit(unit)))
     return shortfalls
 
 
 def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
     """The floor of an output, SI; `speed`: V0, m/s; `unit`: of the output."""
-    smallest = LEAST[AIRSPEED] if unit == "m/s" else LEAST.get(pair.names[i], LEAST_RATE)
+    is_speed = quantity(unit).dimension == SPEED
+    smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
         smallest = HARMLESS * smallest
     if pair.names[i] == AIRSPEED and not pair.knowledge.has_model:
@@ -124,11 +127,13 @@ def _sums(values: FloatArray, count: int) -> FloatArray:
     return np.asarray(total[count:] - total[:-count])
 
 
-def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: str) -> Shortfall:
+def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
     """The shortfall of an excess, with the period of a limit cycle."""
+    rms = excess.rms * unit.factor
+    allowed = excess.allowed * unit.factor
     sentence = (
-        f"{excess.output} off by {excess.rms:.2g} {unit} rms from t = {excess.start:.1f} to "
-        f"{excess.stop:.1f} s, {excess.allowed:.2g} allowed"
+        f"{excess.output} off by {rms:.2g} {unit.unit} rms from t = {excess.start:.1f} to "
+        f"{excess.stop:.1f} s, {allowed:.2g} allowed"
     )
     rows = (pair.t >= excess.start) & (pair.t <= excess.stop)
     samples = period(pair.e[rows, i])
