@@ -242,6 +242,59 @@ def test_flight_below_its_ground_is_told() -> None:
     assert rise_di.simulate(with_ground).outcome.end is End.LANDED
 
 
+def test_error_before_a_late_engagement_hides_nothing() -> None:
+    """The law engages 0.2 s late, and the flight is hardly longer than the part that is judged."""
+
+    class Late(Controller):
+        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+            t = seconds(now_ns)
+            if t < 0.2:
+                return ""
+            if 2.0 <= t < 6.0:
+                wrong = sample.value * np.array([1.0, 1.0, -1.0, 1.0]) + 0.5
+                sample = sample._replace(value=wrong)
+            return super().take_y(sample, now_ns)
+
+    short = servo().vary(flight={"duration": 10.1})
+    assert rise_di.simulate(short, control=Late).outcome.status == 4
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        {"bias": [0.0, 5.0, 0.0, 0.0]},
+        {"bias": [0.3, 0.0, 0.0, 0.0]},
+        {"drift": [0.0, 2.0, 0.0, 0.0]},
+    ],
+    ids=["bias of V", "bias of q", "drift of V"],
+)
+def test_bias_of_a_sensor_is_no_noise(section: dict[str, list[float]]) -> None:
+    assert rise_di.simulate(servo().vary(aircraft={"sensors": section})).outcome.status == 4
+
+
+def test_lost_samples_of_a_sensor_are_no_shortfall() -> None:
+    lossy = find_scenario("osprey_servo", duration=10.0).vary(
+        aircraft={"sensors": {"dropout": 0.2}}
+    )
+    assert rise_di.simulate(lossy).outcome == COMPLETED
+
+
+def test_law_that_is_too_weak_for_its_commands_is_told() -> None:
+    """A thousandth of the gain: the linear loop does not follow the commands either."""
+    scale = np.array(servo().controller.input_scale) / 1000.0
+    weak = servo().vary(controller={"input_scale": scale.tolist()})
+    assert rise_di.simulate(weak).outcome.status == 4
+
+
+def test_error_that_is_not_a_number_is_told() -> None:
+    truth = healthy()["truth"]
+    values = truth.values.copy()
+    values[500:503] = np.nan
+    signals = dict(healthy().signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
+    (lack,) = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).shortfalls
+    assert (lack.aim, "not a number" in lack.sentence) == (Aim.LOG, True)
+
+
 STAMPS = np.arange(4000, dtype=np.int64) * 10_000_000  # 40 s at 100 Hz
 TIME = STAMPS / 1e9
 

@@ -50,7 +50,7 @@ def test_flight_whose_report_cannot_be_written_tells_its_outcome_and_then_so(
     result = flown(tmp_path, monkeypatch)
     assert result.exit_code == 0, "that of the flight"
     assert "outcome: completed\n" in result.stdout
-    assert "q (mrad/s)" in result.stdout
+    assert "q (deg/s)" in result.stdout
     assert "report: " not in result.stdout
     assert "error: no report: " in result.stderr
     assert "cannot be written (No space left on device)" in result.stderr

@@ -30,7 +30,7 @@ def learning() -> dict[str, Any]:
 
 
 REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
-    "`rise-di compare`, `benchmark`": (
+    "`rise-di compare`": (
         lambda: tuning.build_benchmark(find_scenario("osprey_learn")),
         r"controller\.learn: found a section, expected none: only rise-di fly and",
     ),

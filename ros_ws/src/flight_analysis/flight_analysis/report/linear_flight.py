@@ -46,6 +46,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 AIRSPEED = "V"
 
+NOISE_TIME = 1.0
+"""s, over which the mean error of a sensor is a bias or a drift: white noise at 100 Hz loses a
+hundredth of its variance."""
+
 
 class Knowledge(NamedTuple):
     """What is known of a flight."""
@@ -61,7 +65,10 @@ class ErrorPair(NamedTuple):
     names: tuple[str, ...]
     e: FloatArray  # (N, m) of the flight, SI
     linear: FloatArray  # (N, m) of the linear loop, 0 where no linear loop is stable
-    is_flown: NDArray[np.bool_]  # (N,) the law had engaged, and the log has samples beside
+    undisturbed: FloatArray  # (N, m) y_m, the error of an aircraft that does not move
+    disturbed: FloatArray  # (N, m) of the linear loop without commands: noise and wind alone
+    is_flown: NDArray[np.bool_]  # (N,) the law had engaged, and the log has the error
+    not_numbers: int  # ticks with an error that is not finite
     noise: FloatArray  # (m,) rms of the noise in e: 0 of a true error
     knowledge: Knowledge
 
@@ -81,6 +88,9 @@ def error_pair(
     seconds_of = (error.stamp_ns - tape.start_ns) / NANOSECONDS
     ticks = np.arange(seconds_of[0], seconds_of[-1], 1.0 / controller.rate)
     e = np.stack([np.interp(ticks, seconds_of, error[name]) for name in names], axis=1)
+    is_finite = np.isfinite(e).all(axis=1)
+    e[~is_finite] = 0.0
+    y_m = np.stack([_at(tape, "y_m", name, ticks) for name in names], axis=1)
     airframes = _airframes(tape, aircraft)
     knowledge = Knowledge(bool(airframes), _has_wind(tape, aircraft))
     floor = noise_floor(tape)
@@ -89,8 +99,13 @@ def error_pair(
         t=ticks,
         names=names,
         e=e,
-        linear=_linear_error(tape, controller, aircraft, airframes, ticks, e),
-        is_flown=_engaged_since(tape, ticks) & _sampled(seconds_of, ticks),
+        linear=_linear_error(tape, controller, aircraft, airframes, ticks, y_m, e[0]),
+        undisturbed=y_m,
+        disturbed=_linear_error(
+            tape, controller, aircraft, airframes, ticks, 0.0 * y_m, 0.0 * e[0]
+        ),
+        is_flown=_engaged_since(tape, ticks) & _sampled(seconds_of, ticks) & is_finite,
+        not_numbers=int(np.count_nonzero(~is_finite)),
         noise=np.array([0.0 if is_true else floor.get(name, 0.0) for name in names]),
         knowledge=knowledge,
     )
@@ -127,16 +142,19 @@ def _linear_error(
     aircraft: AircraftConfig | None,
     airframes: list[Airframe],
     ticks: FloatArray,
-    e: FloatArray,
+    y_m: FloatArray,
+    e_0: FloatArray,
 ) -> FloatArray:
-    """The larger error of the linear loops around the aircraft, (N, m)."""
+    """The error of the linear loop around the aircraft, (N, m): from the drift on the larger error
+    of the loops before and after.
+    """
     config = controller
     if is_literal(controller):
         # the literal sign is the limit of the implicit one
         config = controller.model_copy(update={"sign": "implicit"})
     loops = [_known_loop(config, airframe) for airframe in airframes] or [_bare_loop(config)]
-    errors = [np.zeros_like(e)]
-    for plant, law, loop in loops:
+    largest = np.zeros_like(y_m)
+    for number, (plant, law, loop) in enumerate(loops):
         matrix = closed_loop(plant, law, loop, np.zeros(len(loop.lag)))
         if spectral_radius(matrix) > 1.0 + SPECTRAL_RADIUS_TOLERANCE:
             continue
@@ -144,8 +162,10 @@ def _linear_error(
             d = _disturbance(tape, aircraft, ticks, len(plant.A))
         else:
             d = _disturbance_of_speed(tape, controller, ticks)
-        errors.append(_flight(tape, controller, (plant, law, loop), ticks, d, e[0]))
-    largest: FloatArray = np.max(np.abs(errors), axis=0)
+        error = np.abs(_flight(tape, controller, (plant, law, loop), ticks, d, y_m, e_0))
+        if number and aircraft is not None and aircraft.drift is not None:
+            error[ticks < aircraft.drift.start] = 0.0
+        largest = np.maximum(largest, error)
     return largest
 
 
@@ -178,6 +198,7 @@ def _flight(
     parts: tuple[LinearPlant, LinearLaw, Loop],
     ticks: FloatArray,
     d: FloatArray,
+    y_m: FloatArray,
     e_0: FloatArray,
 ) -> FloatArray:
     """E of the linear loop at the ticks, (N, m), with x_dot = A x + B u + d; d: (N, n)."""
@@ -187,7 +208,6 @@ def _flight(
     _, held = zero_order_hold(plant.A, np.eye(n), loop.period)
     drive = np.zeros((len(ticks), len(sampled.A)))
     drive[:, :n] = d @ held.T
-    y_m = np.stack([_at(tape, "y_m", name, ticks) for name in controller.outputs], axis=1)
     # vanes add columns to y, which see the motion alone
     vanes = len(sampled.C) - m
     noise = _noise(tape, controller, ticks)
@@ -216,12 +236,20 @@ def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
 
 
 def _noise(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
-    """The errors of the sensors in the log, (N, m), units of y; 0 where the log has none."""
+    """The errors of the sensors in the log less the mean over NOISE_TIME, (N, m), units of y; 0
+    where the log has none.
+
+    A bias and a drift are no noise: the law follows them, and the aircraft is off by as much.
+    """
+    from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - loads SciPy, which few flights need
+
+    count = max(round(NOISE_TIME * controller.rate), 1)
     noise = np.zeros((len(ticks), len(controller.outputs)))
     truth = tape.signals.get("truth")
     for i, name in enumerate(controller.outputs):
         if truth is not None and f"noise.{name}" in truth.names:
-            noise[:, i] = _at(tape, "truth", f"noise.{name}", ticks)
+            errors = _at(tape, "truth", f"noise.{name}", ticks)
+            noise[:, i] = errors - uniform_filter1d(errors, count, mode="nearest")
     return noise
 
 

@@ -187,7 +187,8 @@ def _is_of_stack(tape: Tape, name: str) -> bool:
     if tape.processes:
         node = re.compile(rf"/{SENDERS[name]}(#\d+)?$")
         return any(node.search(process) for process in tape.processes)
-    return tape.duration is not None or "truth" in tape.recording
+    is_in_memory = not tape.recording and "truth" in tape.signals
+    return is_in_memory or tape.duration is not None or "truth" in tape.recording
 
 
 def is_simulated(tape: Tape) -> bool:

@@ -158,13 +158,16 @@ def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
     log = tape["guidance"]
     if "y.V" not in log.names:
         return []
+    t = tape.time("guidance")
     V = section.speed + log["y.V"]
+    if "truth" in tape and "x.V" in tape["truth"].names:
+        V = section.speed + np.interp(t, tape.time("truth"), tape["truth"]["x.V"])
     is_stalled = section.stall_speed > V
     if section.landing is not None:
         landing = section.landing_on(section.plan(section.waypoints()))
         if landing is not None:
             is_stalled &= log["pose.altitude"] > landing.ground + landing.flare
-    spans = mask_spans(tape.time("guidance"), is_stalled)
+    spans = mask_spans(t, is_stalled)
     lasted = math.fsum(stop - start for start, stop in spans)
     if not lasted:
         return []

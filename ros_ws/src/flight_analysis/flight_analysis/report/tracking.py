@@ -4,9 +4,10 @@
 
 The rms error over WINDOW, and over END at the end, may be
 
-    FACTOR rms(e of the linear loop) + floor
+    FACTOR rms(e) + floor,  of an output with a command of its own at most
+    COMMAND_PART rms(y_m) + FACTOR rms(e without commands) + floor
 
-by `linear_flight.error_pair`. The floor is
+with e of the linear loop by `linear_flight.error_pair`. The floor is
 
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
   error;
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from aircraft_sim.params import AircraftConfig
 from flight_analysis.report.display_units import STATES, DisplayUnit, display_unit
 from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
+from flight_core.modes import Mode
 from flight_core.outcome import Aim, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
@@ -36,6 +38,10 @@ from rise_di_controller.params import ControllerConfig
 FACTOR = 2.0
 """Of the error of the linear loop: an input of half the effect doubles the error. Healthy flights
 have at most 1.3."""
+
+COMMAND_PART = 0.5
+"""Of a command: a weak law, whose linear loop does not follow it either, is no success. An output
+has a command of its own where no other one of its unit has twice as much."""
 
 END = 1.0
 """s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
@@ -66,15 +72,31 @@ def tracking_shortfalls(
     pair = error_pair(tape, controller, aircraft)
     if pair is None:
         return []
+    if not _has_engaged(tape):
+        return []
+    if not pair.is_flown.any():
+        sentence = "no error in the log while the law was engaged"
+        return [Shortfall(aim=Aim.LOG, sentence=sentence)]
     speed = 0.0 if aircraft is None else aircraft.channels().speed
     units = {} if aircraft is None else aircraft.channels().outputs
     shortfalls = []
+    if pair.not_numbers:
+        sentence = f"{pair.not_numbers} ticks with an error that is not a number"
+        shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
     for i, name in enumerate(pair.names):
         unit = units.get(name, STATES.get(name, "rad/s"))
-        worst = _worst(pair, i, _floor(pair, i, speed, unit))
+        alike = [
+            k for k, output in enumerate(pair.names) if (output == AIRSPEED) is (name == AIRSPEED)
+        ]
+        worst = _worst(pair, i, alike, _floor(pair, i, speed, unit))
         if worst is not None:
             shortfalls.append(_shortfall(worst, pair, i, display_unit(unit)))
     return shortfalls
+
+
+def _has_engaged(tape: Tape) -> bool:
+    """Whether the law engaged."""
+    return "internals" in tape and bool((tape["internals"]["mode"] == Mode.ENGAGED).any())
 
 
 def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
@@ -88,37 +110,56 @@ def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
     return smallest + FACTOR * float(pair.noise[i])
 
 
-def _worst(pair: ErrorPair, i: int, floor: float) -> Excess | None:
-    """The part of a flight with the largest error over the allowed error; None within."""
-    excesses = [_largest_excess(pair, i, floor, WINDOW), _largest_excess(pair, i, floor, END)]
-    beyond = [excess for excess in excesses if excess is not None and excess.rms > excess.allowed]
+def _worst(pair: ErrorPair, i: int, alike: list[int], floor: float) -> Excess | None:
+    """The part of a flight with the largest error over the allowed error; None within. `alike`:
+    the outputs of the same kind.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
+    spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    longest = max(stop - start for start, stop in spans)
+    shortest = min(_ticks(pair, END), longest)
+    spans = [(start, stop) for start, stop in spans if stop - start >= shortest]
+    excesses = [_largest_excess(pair, i, alike, floor, span) for span in spans]
+    start, stop = spans[-1]
+    end = (max(start, stop - _ticks(pair, END)), stop)
+    excesses.append(_largest_excess(pair, i, alike, floor, end))
+    beyond = [excess for excess in excesses if excess.rms > excess.allowed]
     return max(beyond, key=lambda excess: excess.rms / excess.allowed, default=None)
 
 
-def _largest_excess(pair: ErrorPair, i: int, floor: float, length: float) -> Excess | None:
-    """The part of a length, s, with the largest rms error over the allowed error; of END the last
-    part. A shorter flight is a single part. None without a part without a gap.
+def _largest_excess(
+    pair: ErrorPair, i: int, alike: list[int], floor: float, span: tuple[int, int]
+) -> Excess:
+    """The part of WINDOW in a span of ticks with the largest rms error over the allowed error; a
+    shorter span is a single part.
     """
-    t = pair.t
-    if len(t) < 2:
-        return None
-    count = min(round(length / (t[1] - t[0])), len(t))
-    is_whole = _sums(pair.is_flown.astype(np.float64), count) == count
-    starts = np.flatnonzero(is_whole)
-    starts = starts[-1:] if length == END else starts
-    if not len(starts):
-        return None
-    rms = np.sqrt(np.maximum(_sums(pair.e[:, i] ** 2, count), 0.0) / count)[starts]
-    linear = np.sqrt(np.maximum(_sums(pair.linear[:, i] ** 2, count), 0.0) / count)[starts]
-    allowed = FACTOR * linear + floor
-    k = int(np.argmax(rms / allowed))
+    start, stop = span
+    count = min(_ticks(pair, WINDOW), stop - start)
+
+    def rms(values: FloatArray, output: int = i) -> FloatArray:
+        squares = _sums(values[start:stop, output] ** 2, count)
+        return np.sqrt(np.maximum(squares, 0.0) / count)
+
+    command = rms(pair.undisturbed)
+    others = np.max([rms(pair.undisturbed, output) for output in alike], axis=0)
+    has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
+    by_command = COMMAND_PART * command + FACTOR * rms(pair.disturbed)
+    linear = FACTOR * rms(pair.linear)
+    allowed = np.where(has_command, np.minimum(linear, by_command), linear) + floor
+    error = rms(pair.e)
+    k = int(np.argmax(error / allowed))
     return Excess(
         output=pair.names[i],
-        start=float(t[starts[k]]),
-        stop=float(t[starts[k] + count - 1]),
-        rms=float(rms[k]),
+        start=float(pair.t[start + k]),
+        stop=float(pair.t[start + k + count - 1]),
+        rms=float(error[k]),
         allowed=float(allowed[k]),
     )
+
+
+def _ticks(pair: ErrorPair, length: float) -> int:
+    """The ticks of a length, s."""
+    return max(round(length / (pair.t[1] - pair.t[0])), 1) if len(pair.t) > 1 else 1
 
 
 def _sums(values: FloatArray, count: int) -> FloatArray:
