@@ -36,7 +36,15 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenar
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.environment import PROFILE_VARIABLE
-from flight_core.outcome import COMPLETED, INTERRUPTED, ended_early, never_flew, parsed_outcome
+from flight_core.outcome import (
+    COMPLETED,
+    INTERRUPTED,
+    STATUS_LANDED,
+    End,
+    ended_early,
+    never_flew,
+    parsed_outcome,
+)
 from flight_core.parameters import Config
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import LogAttachments
@@ -278,6 +286,22 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
                 assert parsed_outcome(text) == told
             context.is_shutdown = True
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
+
+
+def test_landing_of_the_aircraft_ends_launch_without_error(case: Case, tmp_path: Path) -> None:
+    actions, context, first, _ = case
+    started = {**nodes(actions), **nodes(all_ready(actions, context))}
+    if "aircraft" not in started:
+        pytest.skip("this launch file starts no aircraft")
+    context.is_shutdown = False
+    on_exit = started["aircraft"].on_exit
+    assert on_exit is not None
+    done = on_exit(ProcessExited("aircraft-1", STATUS_LANDED), context)
+    assert ends(done)
+    (leave,) = every(OpaqueFunction, done)
+    leave.function(context)
+    left = [parsed_outcome(file.read_text()).end for file in tmp_path.glob("runs/*/outcome")]
+    assert left == ([End.LANDED] if "recorder" in first else [])
 
 
 def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_path: Path) -> None:
