@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import best_error
 from flight_analysis.report.account import Account
+from flight_analysis.report.linear_flight import error_pair
 from flight_analysis.report.shortfalls import judged
 from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
@@ -286,6 +287,35 @@ def test_law_that_is_too_weak_for_its_commands_is_told() -> None:
     assert rise_di.simulate(weak).outcome.status == 4
 
 
+def test_error_of_an_inactive_controller_is_no_shortfall() -> None:
+    """A user deactivates the controller for 4 s, and the aircraft drifts off."""
+    internals = healthy()["internals"]
+    values = internals.values.copy()
+    values[800:1200, internals.names.index("mode")] = Mode.INACTIVE
+    truth = healthy()["truth"]
+    off = truth.values.copy()
+    off[800:1200, truth.names.index("x.p")] += 1.0
+    signals = dict(healthy().signals)
+    signals["truth"] = Signal(truth.stamp_ns, truth.names, off)
+    assert judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).status == 4
+    signals["internals"] = Signal(internals.stamp_ns, internals.names, values)
+    outcome = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
+    assert outcome == COMPLETED
+
+
+def test_truth_of_another_simulator_tells_no_wind() -> None:
+    """It has the outputs alone: the floor is that of an unknown wind."""
+    truth = healthy()["truth"]
+    names = tuple(f"x.{name}" for name in servo().controller.outputs)
+    values = np.stack([truth[name] for name in names], axis=1)
+    signals = dict(healthy().signals) | {"truth": Signal(truth.stamp_ns, names, values)}
+    flight = replace(healthy(), signals=signals)
+    assert judged(COMPLETED, flight, servo(), WHOLE) == COMPLETED
+    pair = error_pair(flight, servo().controller, servo().aircraft)
+    assert pair is not None
+    assert pair.knowledge == (False, False)
+
+
 def test_error_that_is_not_a_number_is_told() -> None:
     truth = healthy()["truth"]
     values = truth.values.copy()
@@ -293,6 +323,9 @@ def test_error_that_is_not_a_number_is_told() -> None:
     signals = dict(healthy().signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
     (lack,) = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).shortfalls
     assert (lack.aim, "not a number" in lack.sentence) == (Aim.LOG, True)
+    values[1200:, truth.names.index("x.p")] += 1.0  # what comes later is told as well
+    told = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
+    assert [each.aim for each in told.shortfalls] == [Aim.LOG, Aim.ERROR]
 
 
 STAMPS = np.arange(4000, dtype=np.int64) * 10_000_000  # 40 s at 100 Hz

@@ -45,6 +45,7 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 AIRSPEED = "V"
+WIND = "gust.longitudinal"  # of `truth`: the wind along the axis of the aircraft, m/s
 
 NOISE_TIME = 1.0
 """s, over which the mean error of a sensor is a bias or a drift: white noise at 100 Hz loses a
@@ -65,9 +66,9 @@ class ErrorPair(NamedTuple):
     names: tuple[str, ...]
     e: FloatArray  # (N, m) of the flight, SI
     linear: FloatArray  # (N, m) of the linear loop, 0 where no linear loop is stable
-    undisturbed: FloatArray  # (N, m) y_m, the error of an aircraft that does not move
-    disturbed: FloatArray  # (N, m) of the linear loop without commands: noise and wind alone
-    is_flown: NDArray[np.bool_]  # (N,) the law had engaged, and the log has the error
+    y_m: FloatArray  # (N, m)
+    wind_error: FloatArray  # (N, m) of the linear loop without commands: by noise and wind
+    is_flown: NDArray[np.bool_]  # (N,) the law was to fly, and the log has the error
     not_numbers: int  # ticks with an error that is not finite
     noise: FloatArray  # (m,) rms of the noise in e: 0 of a true error
     knowledge: Knowledge
@@ -100,11 +101,11 @@ def error_pair(
         names=names,
         e=e,
         linear=_linear_error(tape, controller, aircraft, airframes, ticks, y_m, e[0]),
-        undisturbed=y_m,
-        disturbed=_linear_error(
+        y_m=y_m,
+        wind_error=_linear_error(
             tape, controller, aircraft, airframes, ticks, 0.0 * y_m, 0.0 * e[0]
         ),
-        is_flown=_engaged_since(tape, ticks) & _sampled(seconds_of, ticks) & is_finite,
+        is_flown=_active(tape, ticks) & _sampled(seconds_of, ticks) & is_finite,
         not_numbers=int(np.count_nonzero(~is_finite)),
         noise=np.array([0.0 if is_true else floor.get(name, 0.0) for name in names]),
         knowledge=knowledge,
@@ -128,12 +129,17 @@ def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
     """The simulated aircraft, before and after a drift; empty for an unknown aircraft."""
     if aircraft is None or aircraft.is_jsbsim or "truth" not in tape:
         return []
+    names = {f"{group}.{state}" for group in "xf" for state in aircraft.sampled_airframe().states}
+    if not names <= set(tape["truth"].names):
+        return []
     return [aircraft.sampled_airframe(), *([aircraft.drifted_airframe()] if aircraft.drift else [])]
 
 
 def _has_wind(tape: Tape, aircraft: AircraftConfig | None) -> bool:
     """Whether the log is of a simulation and holds the wind."""
-    return aircraft is not None and "truth" in tape
+    if aircraft is None or "truth" not in tape:
+        return False
+    return bool(_airframes(tape, aircraft)) or {"x.theta", WIND} <= set(tape["truth"].names)
 
 
 def _linear_error(
@@ -201,7 +207,7 @@ def _flight(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> FloatArray:
-    """E of the linear loop at the ticks, (N, m), with x_dot = A x + B u + d; d: (N, n)."""
+    """The error e of the linear loop at the ticks, (N, m), x_dot = A x + B u + d; d: (N, n)."""
     plant, law, loop = parts
     n, m = plant.B.shape
     sampled = sampled_plant(plant, loop, np.zeros(m))
@@ -230,9 +236,19 @@ def _flight(
 
 
 def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
-    """A channel of a topic at the ticks, (N,)."""
-    signal = tape[topic]
-    return np.interp(ticks, (signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[name])
+    """A channel of a topic at the ticks, (N,), between its finite samples."""
+    return _between(tape, tape[topic], tape[topic][name], ticks)
+
+
+def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) -> FloatArray:
+    """Values at the samples of a signal, (K,), at the ticks, (N,), between the finite ones; 0
+    without any.
+    """
+    is_finite = np.isfinite(values)
+    if not is_finite.any():
+        return np.zeros(len(ticks))
+    t = (signal.stamp_ns[is_finite] - tape.start_ns) / NANOSECONDS
+    return np.interp(ticks, t, values[is_finite])
 
 
 def _noise(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
@@ -256,47 +272,54 @@ def _noise(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> Float
 def _disturbance(
     tape: Tape, aircraft: AircraftConfig | None, ticks: FloatArray, n: int
 ) -> FloatArray:
-    """D = f(x, t) less the part that depends on x, (N, n), by `truth`."""
+    """The disturbance d = f(x, t) less the part that depends on x, (N, n), by `truth`."""
     truth: Signal = tape["truth"]
     d = np.zeros((len(ticks), n))
-    if aircraft is None or not any(name.startswith("f.") for name in truth.names):
+    if aircraft is None:
         return d
     airframe, arrays = aircraft.load()
     x = np.stack([truth[f"x.{state}"] for state in airframe.states])
     f = np.stack([truth[f"f.{state}"] for state in airframe.states])
-    t = (truth.stamp_ns - tape.start_ns) / NANOSECONDS
     for i, row in enumerate(f - dynamics.f_state(x, arrays)):
-        d[:, i] = np.interp(ticks, t, row)
+        d[:, i] = _between(tape, truth, row, ticks)
     return d
 
 
 def _disturbance_of_speed(
     tape: Tape, controller: ControllerConfig, ticks: FloatArray
 ) -> FloatArray:
-    """D of y_dot = Omega u + d, (N, m): weight along the flight path and wind on the airspeed, by
-    `truth` of JSBSim; 0 of the rates, and where the log has none.
+    """The disturbance d of y_dot = Omega u + d, (N, m), by `truth` of JSBSim: weight along the
+    flight path and wind on the airspeed; 0 of the rates, and where the log has none.
 
         V_dot = -g sin(theta) - W_dot
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     truth = tape.signals.get("truth")
-    if truth is None or AIRSPEED not in controller.outputs or "x.theta" not in truth.names:
+    if truth is None or AIRSPEED not in controller.outputs:
         return d
-    wind = _at(tape, "truth", "gust.longitudinal", ticks)
+    if not {"x.theta", WIND} <= set(truth.names):
+        return d
+    wind = _at(tape, "truth", WIND, ticks)
     theta = _at(tape, "truth", "x.theta", ticks)
     slope = np.gradient(wind, ticks) if len(ticks) > 1 else np.zeros_like(wind)
     d[:, controller.outputs.index(AIRSPEED)] = -GRAVITY * np.sin(theta) - slope
     return d
 
 
-def _engaged_since(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the ticks from the first engagement of the law on; none without `internals`."""
+def _active(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
+    """Mask of the ticks from the first engagement on without those of an inactive controller; none
+    without `internals`.
+    """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)
-    engaged = tape["internals"]["mode"] == Mode.ENGAGED
+    mode = tape["internals"]["mode"]
+    t = tape.time("internals")
+    engaged = mode == Mode.ENGAGED
     if not engaged.any():
         return np.zeros(len(ticks), dtype=bool)
-    return ticks >= float(tape.time("internals")[np.argmax(engaged)])
+    before = np.maximum(np.searchsorted(t, ticks, side="right") - 1, 0)
+    is_active: NDArray[np.bool_] = mode[before] != Mode.INACTIVE
+    return is_active & (ticks >= float(t[np.argmax(engaged)]))
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:

@@ -41,7 +41,7 @@ have at most 1.3."""
 
 COMMAND_PART = 0.5
 """Of a command: a weak law, whose linear loop does not follow it either, is no success. An output
-has a command of its own where no other one of its unit has twice as much."""
+has a command of its own where no other one of its kind has twice as much."""
 
 END = 1.0
 """s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
@@ -85,10 +85,10 @@ def tracking_shortfalls(
         shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
     for i, name in enumerate(pair.names):
         unit = units.get(name, STATES.get(name, "rad/s"))
-        alike = [
+        group = [
             k for k, output in enumerate(pair.names) if (output == AIRSPEED) is (name == AIRSPEED)
         ]
-        worst = _worst(pair, i, alike, _floor(pair, i, speed, unit))
+        worst = _worst(pair, i, group, _floor(pair, i, speed, unit))
         if worst is not None:
             shortfalls.append(_shortfall(worst, pair, i, display_unit(unit)))
     return shortfalls
@@ -110,25 +110,25 @@ def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
     return smallest + FACTOR * float(pair.noise[i])
 
 
-def _worst(pair: ErrorPair, i: int, alike: list[int], floor: float) -> Excess | None:
-    """The part of a flight with the largest error over the allowed error; None within. `alike`:
-    the outputs of the same kind.
+def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | None:
+    """The part of a flight with the largest error over the allowed error; None within. `group`:
+    the airspeed, or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
     longest = max(stop - start for start, stop in spans)
     shortest = min(_ticks(pair, END), longest)
     spans = [(start, stop) for start, stop in spans if stop - start >= shortest]
-    excesses = [_largest_excess(pair, i, alike, floor, span) for span in spans]
+    excesses = [_largest_excess(pair, i, group, floor, span) for span in spans]
     start, stop = spans[-1]
     end = (max(start, stop - _ticks(pair, END)), stop)
-    excesses.append(_largest_excess(pair, i, alike, floor, end))
+    excesses.append(_largest_excess(pair, i, group, floor, end))
     beyond = [excess for excess in excesses if excess.rms > excess.allowed]
     return max(beyond, key=lambda excess: excess.rms / excess.allowed, default=None)
 
 
 def _largest_excess(
-    pair: ErrorPair, i: int, alike: list[int], floor: float, span: tuple[int, int]
+    pair: ErrorPair, i: int, group: list[int], floor: float, span: tuple[int, int]
 ) -> Excess:
     """The part of WINDOW in a span of ticks with the largest rms error over the allowed error; a
     shorter span is a single part.
@@ -140,10 +140,10 @@ def _largest_excess(
         squares = _sums(values[start:stop, output] ** 2, count)
         return np.sqrt(np.maximum(squares, 0.0) / count)
 
-    command = rms(pair.undisturbed)
-    others = np.max([rms(pair.undisturbed, output) for output in alike], axis=0)
+    command = rms(pair.y_m)
+    others = np.max([rms(pair.y_m, output) for output in group], axis=0)
     has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
-    by_command = COMMAND_PART * command + FACTOR * rms(pair.disturbed)
+    by_command = COMMAND_PART * command + FACTOR * rms(pair.wind_error)
     linear = FACTOR * rms(pair.linear)
     allowed = np.where(has_command, np.minimum(linear, by_command), linear) + floor
     error = rms(pair.e)
